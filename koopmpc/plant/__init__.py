@@ -1,0 +1,1 @@
+"""Plants: dynamics, integrators, step maps."""

@@ -1,0 +1,141 @@
+"""From ẋ = f(x, u) to x⁺ = F(x, u) over one sample dt, u held."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+
+
+class Integrator(ABC):
+    """A one-step method."""
+
+    @abstractmethod
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u) from f of ẋ = f(x, u), dt [s]."""
+
+
+@dataclass(frozen=True)
+class Euler(Integrator):
+    """x⁺ = x + dt f(x, u): order 1."""
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        x, u = _symbols(f)
+        return _function([x, u], x + dt * f(x, u))
+
+
+@dataclass(frozen=True)
+class RK4(Integrator):
+    """The classical Runge–Kutta method: order 4, `substeps` equal steps a sample."""
+
+    substeps: int = 1
+
+    def __post_init__(self) -> None:
+        checks.count(self.substeps, "substeps")
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        x, u = _symbols(f)
+        x_next, h = x, dt / self.substeps
+        for _ in range(self.substeps):
+            k1 = f(x_next, u)
+            k2 = f(x_next + h / 2 * k1, u)
+            k3 = f(x_next + h / 2 * k2, u)
+            k4 = f(x_next + h * k3, u)
+            x_next = x_next + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return _function([x, u], x_next)
+
+
+@dataclass(frozen=True)
+class ImplicitMidpoint(Integrator):
+    """x⁺ = x + dt f((x + x⁺)/2, u): order 2, symplectic (Hairer, Lubich & Wanner 2006, VI.4)."""
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        return _gauss(f, dt, 1)
+
+
+@dataclass(frozen=True)
+class Collocation(Integrator):
+    """Collocation at `degree` Gauss–Legendre points: order 2·degree, A-stable (Hairer & Wanner 1996, IV.5)."""
+
+    degree: int = 3
+
+    def __post_init__(self) -> None:
+        checks.count(self.degree, "degree")
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        return _gauss(f, dt, self.degree)
+
+
+@dataclass(frozen=True)
+class CVODES(Integrator):
+    """Variable order and step to the stated local tolerances, for stiff plants (Hindmarsh et al. 2005)."""
+
+    rtol: float = 1e-9
+    atol: float = 1e-9
+
+    def __post_init__(self) -> None:
+        checks.positive(self.rtol, "rtol")
+        checks.positive(self.atol, "atol")
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        if not ca.has_integrator("cvodes"):
+            raise DataError("this CasADi has no CVODES; use Collocation or RK4 with substeps")
+        x, u = _symbols(f)
+        options = {"reltol": self.rtol, "abstol": self.atol, "disable_internal_warnings": True}
+        flow = ca.integrator("flow", "cvodes", {"x": x, "u": u, "ode": f(x, u)}, 0, dt, options)
+        X, U = ca.MX.sym("x", x.size1()), ca.MX.sym("u", u.size1())
+        return _function([X, U], flow(x0=X, u=U)["xf"])
+
+
+def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
+    """x⁺ = x + Σ bⱼ kⱼ with kᵢ = dt f(x + Σ aᵢⱼ kⱼ, u), solved by Newton and differentiated implicitly.
+
+    Each row of the residual is measured against 1 + |x| + |dt f(x, u)|, so that one tolerance fits all units;
+    at a root the scale has no part in the derivatives.
+    """
+    a, b = gauss_legendre(stages)
+    x, u = _symbols(f)
+    nx = x.size1()
+    K = ca.SX.sym("K", nx, stages)
+    slope = dt * f(x, u)
+    scale = 1 + ca.fabs(x) + ca.fabs(slope)
+    rows = [(K[:, i] - dt * f(x + K @ ca.DM(a[i]), u)) / scale for i in range(stages)]
+    residual = ca.Function("residual", [ca.vec(K), x, u], [ca.vertcat(*rows)])
+    newton = ca.rootfinder(
+        "newton", "fast_newton", residual, {"max_iter": 50, "abstol": 1e-13, "abstolStep": 1e-13}
+    )
+    guess = ca.Function("guess", [x, u], [ca.repmat(slope, stages, 1)])
+    X, U = ca.MX.sym("x", nx), ca.MX.sym("u", u.size1())
+    stage = ca.reshape(newton(guess(X, U), X, U), nx, stages)
+    return _function([X, U], X + stage @ ca.DM(b))
+
+
+def gauss_legendre(stages: int) -> tuple[Float[np.ndarray, "s s"], Float[np.ndarray, " s"]]:
+    """Return Butcher's a (s, s) and b (s,) of Gauss–Legendre collocation.
+
+    aᵢⱼ = bⱼ (cᵢ + ½ Σ_{k=1}^{s−1} P_k(σⱼ) (P_{k+1}(σᵢ) − P_{k−1}(σᵢ))) with σ = 2c − 1: the Lagrange basis written in
+    Legendre polynomials, whose integrals are known.
+    """
+    sigma, weight = np.polynomial.legendre.leggauss(stages)
+    P = np.polynomial.legendre.legvander(sigma, stages)
+    k = np.arange(1, stages)
+    b = weight / 2
+    a = b * ((sigma[:, None] + 1) / 2 + 0.5 * (P[:, k + 1] - P[:, k - 1]) @ P[:, k].T)
+    return a, b
+
+
+def _symbols(f: ca.Function) -> tuple[ca.SX, ca.SX]:
+    return ca.SX.sym("x", f.size1_in(0)), ca.SX.sym("u", f.size1_in(1))
+
+
+def _function(arguments: list[ca.SX] | list[ca.MX], x_next: ca.SX | ca.MX) -> ca.Function:
+    return ca.Function("F", arguments, [x_next], ["x", "u"], ["x_next"], {"cse": True})
