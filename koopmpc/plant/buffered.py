@@ -18,9 +18,9 @@ class Slot(NamedTuple):
 
 
 class Buffered:
-    """`function` over float64 vectors one memory a thread: columns in, matrices out, flat, column after column.
+    """`function` of float64 vectors; matrices come out flat, column after column.
 
-    CasADi's FunctionBuffer writes into arrays that we own; calling a `Buffered` returns fresh copies of them.
+    CasADi's FunctionBuffer writes into arrays that we own, one set a thread; a call returns fresh copies.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -53,20 +53,20 @@ def _allocate(function: ca.Function) -> Slot:
     results = tuple(np.zeros(function.nnz_out(i)) for i in range(function.n_out()))
     for i, place in enumerate(arguments):
         if place.size:
-            buffer.set_arg(i, memoryview(place))
+            buffer.set_arg(i, place.data)
     for i, place in enumerate(results):
         if place.size:
-            buffer.set_res(i, memoryview(place))
+            buffer.set_res(i, place.data)
     return Slot(arguments, results, evaluate, buffer)
 
 
 def dense(function: ca.Function) -> ca.Function:
-    """Return `function` with dense inputs and outputs; the buffer of a sparse one holds its nonzeros alone."""
+    """Return `function` with dense inputs and outputs; a buffer of a sparse one holds nonzeros alone."""
     sparsities = [function.sparsity_in(i) for i in range(function.n_in())]
     sparsities += [function.sparsity_out(i) for i in range(function.n_out())]
     if all(sparsity.is_dense() for sparsity in sparsities):
         return function
-    kind = ca.SX if function.is_a("SXFunction") else ca.MX
-    arguments = [kind.sym(function.name_in(i), *function.size_in(i)) for i in range(function.n_in())]
+    arguments = [ca.MX.sym(function.name_in(i), *function.size_in(i)) for i in range(function.n_in())]
     results = [ca.densify(result) for result in function.call(arguments)]
-    return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
+    result = ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
+    return result.expand() if function.is_a("SXFunction") else result

@@ -9,7 +9,7 @@ from koopmpc.errors import DataError, ShapeError
 
 
 class Dynamics(ABC):
-    """A plant ẋ = f(x, u), y = h(x): subclass as a frozen dataclass whose fields are the parameters, with units.
+    """A plant ẋ = f(x, u), y = h(x): a frozen dataclass whose fields are the parameters, with units.
 
     `states` and `inputs` name the rows of x and u, unit included: ``("theta [rad]", "omega [rad/s]")``.
     """
@@ -32,7 +32,7 @@ class Dynamics(ABC):
         """ẋ = f(x, u): (nx, 1) from x (nx, 1) and u (nu, 1)."""
 
     def measure(self, x: ca.SX) -> ca.SX:
-        """y = h(x): (ny, 1) from x (nx, 1); the whole state unless overridden."""
+        """Return y = h(x): (ny, 1) from x (nx, 1); the whole state unless overridden."""
         return x
 
 
@@ -89,7 +89,7 @@ def _check_names(dynamics: Dynamics) -> None:
         names = cast("object", getattr(dynamics, field, None))
         if not isinstance(names, tuple) or not all(isinstance(n, str) for n in cast("tuple[object]", names)):
             raise DataError(
-                f"{type(dynamics).__name__}.{field} is {names!r}; pass a tuple of names, one a row: ('theta [rad]',)"
+                f"{type(dynamics).__name__}.{field} is {names!r}; pass a tuple of names: ('theta [rad]',)"
             )
     if not dynamics.states:
         raise DataError(f"{type(dynamics).__name__}.states is empty; name at least one state")

@@ -26,7 +26,7 @@ class Euler(Integrator):
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
         x, u = _symbols(f)
-        return _function([x, u], x + dt * f(x, u))
+        return _explicit(x, u, x + dt * f(x, u))
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class RK4(Integrator):
             k3 = f(x_next + h / 2 * k2, u)
             k4 = f(x_next + h * k3, u)
             x_next = x_next + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return _function([x, u], x_next)
+        return _explicit(x, u, x_next)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ImplicitMidpoint(Integrator):
 
 @dataclass(frozen=True)
 class Collocation(Integrator):
-    """Collocation at `degree` Gauss–Legendre points: order 2·degree, A-stable (Hairer & Wanner 1996, IV.5)."""
+    """Collocation at `degree` Gauss points: order 2·degree, A-stable (Hairer & Wanner 1996, IV.5)."""
 
     degree: int = 3
 
@@ -93,7 +93,7 @@ class CVODES(Integrator):
         options = {"reltol": self.rtol, "abstol": self.atol, "disable_internal_warnings": True}
         flow = ca.integrator("flow", "cvodes", {"x": x, "u": u, "ode": f(x, u)}, 0, dt, options)
         X, U = ca.MX.sym("x", x.size1()), ca.MX.sym("u", u.size1())
-        return _function([X, U], flow(x0=X, u=U)["xf"])
+        return _implicit(X, U, flow(x0=X, u=U)["xf"])
 
 
 def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
@@ -116,14 +116,14 @@ def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
     guess = ca.Function("guess", [x, u], [ca.repmat(slope, stages, 1)])
     X, U = ca.MX.sym("x", nx), ca.MX.sym("u", u.size1())
     stage = ca.reshape(newton(guess(X, U), X, U), nx, stages)
-    return _function([X, U], X + stage @ ca.DM(b))
+    return _implicit(X, U, X + stage @ ca.DM(b))
 
 
 def gauss_legendre(stages: int) -> tuple[Float[np.ndarray, "s s"], Float[np.ndarray, " s"]]:
     """Return Butcher's a (s, s) and b (s,) of Gauss–Legendre collocation.
 
-    aᵢⱼ = bⱼ (cᵢ + ½ Σ_{k=1}^{s−1} P_k(σⱼ) (P_{k+1}(σᵢ) − P_{k−1}(σᵢ))) with σ = 2c − 1: the Lagrange basis written in
-    Legendre polynomials, whose integrals are known.
+    aᵢⱼ = bⱼ (cᵢ + ½ Σ_{k=1}^{s−1} P_k(σⱼ) (P_{k+1}(σᵢ) − P_{k−1}(σᵢ))) with σ = 2c − 1: the Lagrange
+    basis written in Legendre polynomials, whose integrals are known.
     """
     sigma, weight = np.polynomial.legendre.leggauss(stages)
     P = np.polynomial.legendre.legvander(sigma, stages)
@@ -137,5 +137,9 @@ def _symbols(f: ca.Function) -> tuple[ca.SX, ca.SX]:
     return ca.SX.sym("x", f.size1_in(0)), ca.SX.sym("u", f.size1_in(1))
 
 
-def _function(arguments: list[ca.SX] | list[ca.MX], x_next: ca.SX | ca.MX) -> ca.Function:
-    return ca.Function("F", arguments, [x_next], ["x", "u"], ["x_next"], {"cse": True})
+def _explicit(x: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.Function:
+    return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"], {"cse": True})
+
+
+def _implicit(x: ca.MX, u: ca.MX, x_next: ca.MX) -> ca.Function:
+    return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"])

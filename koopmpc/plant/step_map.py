@@ -35,7 +35,7 @@ class StepMap:
     Parameters
     ----------
     F
-        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). Made of SX it runs in fast batches.
+        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). Made of SX it runs in batches.
     dt
         Sample time [s].
     h
@@ -114,7 +114,7 @@ class StepMap:
             return np.full(self.nx, np.nan)
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
-        """y = h(x): (ny,) from x (nx,)."""
+        """Return y = h(x): (ny,) from x (nx,)."""
         return self._output(_vector(x, "x", len(self.states)))[0]
 
     def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
@@ -169,11 +169,13 @@ class StepMap:
 
     @cached_property
     def _jacobians(self) -> Buffered:
-        kind = ca.SX if self.F.is_a("SXFunction") else ca.MX
-        x, u = kind.sym("x", self.nx), kind.sym("u", self.nu)
+        x, u = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu)
         x_next = self.F(x, u)
-        A, B = ca.jacobian(x_next, x), ca.jacobian(x_next, u)
-        return Buffered(dense(ca.Function("linearize", [x, u], [x_next, A, B])))
+        A, B = ca.densify(ca.jacobian(x_next, x)), ca.densify(ca.jacobian(x_next, u))
+        together = ca.Function("linearize", [x, u], [x_next, A, B])
+        return Buffered(
+            together.expand("linearize", {"cse": True}) if self.F.is_a("SXFunction") else together
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -196,7 +198,7 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
 
 
 def _vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:
-    """Return `value` as float64 (length,): at no cost where it is one already, for this is the control path."""
+    """Return `value` as float64 (length,): itself where it is one, for this is the control path."""
     if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (length,):
         return value
     result = checks.array(value, name, finite=False)
@@ -220,7 +222,8 @@ def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
     wanted = "(x, u)" if arguments == 2 else "(x)"
     if function.n_in() != arguments or function.n_out() != 1:
         raise ShapeError(
-            f"{name} has {function.n_in()} arguments and {function.n_out()} results, expected {name}{wanted} with one result"
+            f"{name} has {function.n_in()} arguments and {function.n_out()} results, "
+            f"expected {name}{wanted} with one result"
         )
     sizes = [function.size2_in(i) for i in range(arguments) if function.size1_in(i)] + [function.size2_out(0)]
     if any(columns != 1 for columns in sizes):
