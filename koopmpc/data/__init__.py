@@ -1,0 +1,1 @@
+"""Episodes: excitation, collection, files."""

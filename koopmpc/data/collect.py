@@ -1,0 +1,173 @@
+"""Excite a plant and keep what it does."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.policy import Excitation, OpenLoop, Policy
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.plant.simulated import Plant
+from koopmpc.plant.step_map import StepMap
+from koopmpc.values import Value
+
+# u = function(k, y, rng): a user's own excitation
+InputFunction = Callable[[int, Float[np.ndarray, " ny"], np.random.Generator], ArrayLike]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Uniform(Value):
+    """Initial states uniform in the box from `low` to `high`, (nx,) each."""
+
+    low: Float[np.ndarray, " nx"]
+    high: Float[np.ndarray, " nx"]
+
+    def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
+        lows = np.atleast_1d(checks.array(low, "low"))
+        object.__setattr__(self, "low", checks.array(lows, "low", (None,)))
+        object.__setattr__(self, "high", checks.vector(high, "high", len(lows)))
+        checks.crossed(self.low, self.high, "initial state")
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count nx"]:
+        """Return `count` draws, a row each."""
+        return rng.uniform(self.low, self.high, (count, len(self.low)))
+
+
+def collect(
+    plant: StepMap | Plant,
+    x0: Uniform | ArrayLike,
+    excitation: Excitation | InputFunction,
+    *,
+    episodes: int,
+    steps: int,
+    rng: np.random.Generator | int = 0,
+) -> Episodes:
+    """Run x_{k+1} = F(x_k, u_k) from x0 under the excitation, and return the episodes as measured.
+
+    Parameters
+    ----------
+    plant
+        A step map, or a plant that holds its state; then X holds y.
+    x0
+        `Uniform`, or (E, nx), or one (nx,) for all episodes.
+    excitation
+        An `Excitation`, or a function ``(k, y, rng) -> u``, called in the order of k.
+    episodes, steps
+        How many, and how long: X is (steps+1, ny).
+    rng
+        Generator or seed; the same seed gives the same data, whichever way the plant is run.
+
+    Raises
+    ------
+    ShapeError
+        x0 or the excitation does not fit the plant.
+    DataError
+        An episode left the finite numbers.
+    """
+    count, length = checks.count(episodes, "episodes"), checks.count(steps, "steps")
+    source = checks.generator(rng)
+    nu = len(plant.inputs)
+    starts = _starts(x0, len(plant.states), count, source)
+    streams = source.spawn(count)
+    if isinstance(excitation, Excitation) and excitation.nu != nu:
+        raise ShapeError(
+            f"the excitation gives {excitation.nu} inputs, the plant takes {nu} ({', '.join(plant.inputs)}); "
+            "pass one level for each input"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):  # what diverges is reported by `_finite`
+        if not isinstance(plant, StepMap):
+            policies = [_start(excitation, length, plant.dt, nu, own) for own in streams]
+            runs = [
+                _drive(plant, *each, length)
+                for each in zip(range(count), starts, policies, streams, strict=True)
+            ]
+        else:
+            X, U = _batch(plant, starts, excitation, length, streams)
+            Y = _measured(plant, X)
+            for e, run in enumerate(Y):
+                _finite(run, e, 0)
+            runs = [Episode(X=y, U=u) for y, u in zip(Y, U, strict=True)]
+    return Episodes(runs, plant.dt, plant.outputs, plant.inputs)
+
+
+def _drive(
+    plant: Plant, e: int, x0: Float[np.ndarray, " nx"], policy: Policy, rng: np.random.Generator, steps: int
+) -> Episode:
+    """Run one episode of a plant that holds its state."""
+    Y, U = [plant.reset(x0, rng)], [np.empty(0)] * steps
+    for k in range(steps):
+        U[k] = policy(k, Y[k])
+        Y.append(plant.step(U[k]))
+        _finite(Y[k + 1][None], e, k + 1)
+    return Episode(X=np.stack(Y), U=np.stack(U))
+
+
+def _batch(
+    plant: StepMap,
+    starts: Float[np.ndarray, "E nx"],
+    excitation: Excitation | InputFunction,
+    steps: int,
+    streams: list[np.random.Generator],
+) -> tuple[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]]:
+    """Run all episodes at once; inputs that look at y are asked step by step."""
+    if isinstance(excitation, OpenLoop):
+        U = np.stack([excitation.sequence(steps, plant.dt, own) for own in streams])
+        return plant.rollouts(starts, U), U
+    policies = [_start(excitation, steps, plant.dt, plant.nu, own) for own in streams]
+    X = np.empty((len(starts), steps + 1, plant.nx))
+    moves = np.empty((len(starts), steps, plant.nu))
+    X[:, 0] = starts
+    for k in range(steps):
+        Y = _measured(plant, X[:, k : k + 1])
+        for e, policy in enumerate(policies):
+            _finite(Y[e], e, k)
+            moves[e, k] = policy(k, Y[e, 0])
+        X[:, k + 1] = plant.rollouts(X[:, k], moves[:, k : k + 1])[:, 1]
+    return X, moves
+
+
+def _measured(plant: StepMap, X: Float[np.ndarray, "E rows nx"]) -> Float[np.ndarray, "E rows ny"]:
+    """Return y = h(x) for each row; X itself where all is measured."""
+    x = ca.SX.sym("x", plant.nx)
+    if plant.ny == plant.nx and ca.is_equal(plant.h(x), x):
+        return X
+    return np.stack([plant.measure(row) for row in X.reshape(-1, plant.nx)]).reshape(*X.shape[:2], plant.ny)
+
+
+def _start(
+    excitation: Excitation | InputFunction, steps: int, dt: float, nu: int, rng: np.random.Generator
+) -> Policy:
+    """Return the policy of one episode."""
+    if isinstance(excitation, Excitation):
+        return excitation.start(steps, dt, rng)
+    return lambda k, y: checks.vector(excitation(k, y, rng), "the excitation's u", nu)
+
+
+def _starts(
+    x0: Uniform | ArrayLike, nx: int, count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "count nx"]:
+    """Return one initial state for each episode."""
+    rows = x0.sample(count, rng) if isinstance(x0, Uniform) else checks.array(x0, "x0")
+    if rows.ndim == 1:
+        rows = np.tile(rows, (count, 1))
+    if rows.shape != (count, nx):
+        raise ShapeError(
+            f"x0 gives shape {rows.shape}, expected ({count}, {nx}): an episode a row, a state a column; "
+            "pass Uniform(low, high), one state, or one for each episode"
+        )
+    return rows
+
+
+def _finite(rows: Float[np.ndarray, "rows ny"], episode: int, first: int) -> None:
+    """Raise if a row is not finite; the rows start at step `first`."""
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if bad.size:
+        raise DataError(
+            f"episode {episode} is NaN or infinite from step {first + int(bad[0])} on: the plant diverged; "
+            "start nearer, excite less, take fewer steps, or hold it with Feedback"
+        )

@@ -1,0 +1,218 @@
+"""Episodes: what a plant did, run by run, and the snapshots that a fit reads from them."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import overload
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Episode(Value):
+    """One uninterrupted run: x_0 … x_T as measured and the u_0 … u_{T−1} that were applied.
+
+    Parameters
+    ----------
+    X
+        (T+1, nx), time down.
+    U
+        (T, nu); without it the plant is autonomous and nu is 0.
+
+    Raises
+    ------
+    ShapeError
+        X has not one row more than U.
+    DataError
+        There is NaN or inf.
+    """
+
+    U: Float[np.ndarray, "T nu"]
+    X: Float[np.ndarray, "T+1 nx"]
+
+    def __init__(self, *, X: ArrayLike, U: ArrayLike | None = None) -> None:
+        states = checks.array(X, "X", (None, None))
+        if len(states) == 0:
+            raise ShapeError("X has no row; an episode holds x_0 at least")
+        inputs = np.empty((len(states) - 1, 0)) if U is None else checks.array(U, "U", (None, None))
+        if len(states) != len(inputs) + 1:
+            raise ShapeError(
+                f"U has {len(inputs)} rows and X {len(states)}: X must have one row more than U; "
+                "x_0 … x_T, u_0 … u_{T-1}"
+            )
+        object.__setattr__(self, "U", inputs)
+        object.__setattr__(self, "X", states)
+
+    def __len__(self) -> int:
+        """Return the number of steps T."""
+        return len(self.U)
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshots(Value):
+    """Rows (x_k, u_k, x_{k+1}), M in all, each from within one episode."""
+
+    X: Float[np.ndarray, "M nx"]
+    U: Float[np.ndarray, "M nu"]
+    X_next: Float[np.ndarray, "M nx"]
+
+    def __len__(self) -> int:
+        """Return the number of rows M."""
+        return len(self.X)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Episodes(Value):
+    """Episodes of one plant at one sample time; a sequence of `Episode`.
+
+    Parameters
+    ----------
+    episodes
+        At least one, each of at least one step, all with the same nx and nu.
+    dt
+        Sample time [s].
+    states, inputs
+        Names with units; ``x0, x1, …`` and ``u0, u1, …`` by default.
+
+    Raises
+    ------
+    ShapeError
+        The episodes, or the names, differ in nx or nu.
+    DataError
+        There is no episode, one is too short, dt is not above zero, or a name is used twice.
+    """
+
+    episodes: tuple[Episode, ...]
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        dt: float,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+    ) -> None:
+        if not episodes:
+            raise DataError("there is no episode; pass at least one")
+        nx, nu = episodes[0].X.shape[1], episodes[0].U.shape[1]
+        for i, episode in enumerate(episodes):
+            if len(episode) < 1:
+                raise DataError(
+                    f"episode {i} is too short: X has {len(episode.X)} row and so no step; "
+                    "an episode needs at least 2 rows, drop it"
+                )
+            own = episode.X.shape[1], episode.U.shape[1]
+            if own != (nx, nu):
+                raise ShapeError(
+                    f"episode {i} has {own[0]} states and {own[1]} inputs, episode 0 has {nx} and {nu}; "
+                    "episodes of one set come from one plant"
+                )
+        object.__setattr__(self, "episodes", tuple(episodes))
+        object.__setattr__(self, "dt", checks.positive(dt, "dt", "s"))
+        object.__setattr__(self, "states", _names(states, "states", "x", nx))
+        object.__setattr__(self, "inputs", _names(inputs, "inputs", "u", nu))
+        repeated = [name for name, n in Counter(self.states + self.inputs).items() if n > 1]
+        if repeated:
+            raise DataError(f"two states or inputs are named {repeated[0]!r}; rename one")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self.episodes)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.episodes)
+
+    @overload
+    def __getitem__(self, index: int) -> Episode: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Episodes": ...
+    def __getitem__(self, index: int | slice) -> "Episode | Episodes":
+        return self._of(self.episodes[index]) if isinstance(index, slice) else self.episodes[index]
+
+    def __add__(self, other: "Episodes") -> "Episodes":
+        """Return both sets as one; they must agree in dt and in names."""
+        if self.dt != other.dt:
+            raise DataError(
+                f"the episodes have unequal dt: {self.dt!r} s and {other.dt!r} s; resample one of them"
+            )
+        for mine, theirs, what in (
+            (self.states, other.states, "states"),
+            (self.inputs, other.inputs, "inputs"),
+        ):
+            if mine != theirs:
+                raise DataError(
+                    f"the episodes differ in {what}: {', '.join(mine)} and {', '.join(theirs)}; rename one"
+                )
+        return self._of(self.episodes + other.episodes)
+
+    def snapshots(self) -> Snapshots:
+        """Return all rows (x_k, u_k, x_{k+1}); none pairs the end of an episode with the start of another."""
+        return Snapshots(
+            X=np.concatenate([episode.X[:-1] for episode in self.episodes]),
+            U=np.concatenate([episode.U for episode in self.episodes]),
+            X_next=np.concatenate([episode.X[1:] for episode in self.episodes]),
+        )
+
+    def split(self, fraction: float, rng: np.random.Generator | int = 0) -> "tuple[Episodes, Episodes]":
+        """Return (train, held_out): whole episodes drawn at random, of which `fraction` trains.
+
+        Raises
+        ------
+        DataError
+            One side would be empty.
+        """
+        total = len(self)
+        count = round(fraction * total)
+        if not 0 < count < total:
+            raise DataError(
+                f"a split of {total} episodes at fraction {fraction:g} leaves {count} to train and "
+                f"{total - count} held out; both need at least one"
+            )
+        order = checks.generator(rng).permutation(total)
+        train: list[int] = np.sort(order[:count]).tolist()
+        held_out: list[int] = np.sort(order[count:]).tolist()
+        return self._of([self.episodes[i] for i in train]), self._of([self.episodes[i] for i in held_out])
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a .npz or .parquet file, which `load_episodes` reads back to the bit.
+
+        Raises
+        ------
+        DataError
+            The suffix is another, or a .parquet column would be named twice.
+        """
+        from koopmpc.data.storage import save_episodes  # storage builds Episodes, so it imports this file
+
+        save_episodes(self, path)
+
+    def _of(self, episodes: Sequence[Episode]) -> "Episodes":
+        return Episodes(episodes, self.dt, self.states, self.inputs)
+
+
+def _names(names: Sequence[str] | None, what: str, letter: str, count: int) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"{letter}{i}" for i in range(count))
+    if isinstance(names, str):
+        raise DataError(f"{what} is {names!r}; pass a tuple of names")
+    if len(names) != count:
+        raise ShapeError(f"{what} has {len(names)} names and the data {count} columns; give one name each")
+    return tuple(names)

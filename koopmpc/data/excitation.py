@@ -1,0 +1,259 @@
+"""Inputs that make a plant show what it does: noise, PRBS, sines, a sweep, and feedback with noise."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.policy import Excitation, OpenLoop, Policy
+from koopmpc.data.shift_register import ORDERS, maximal_length
+from koopmpc.errors import DataError, ShapeError
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Noise(OpenLoop):
+    """u uniform between `low` and `high`, drawn anew every `hold` steps."""
+
+    low: Float[np.ndarray, " nu"]
+    high: Float[np.ndarray, " nu"]
+    hold: int
+
+    def __init__(self, low: ArrayLike, high: ArrayLike, hold: int = 1) -> None:
+        _freeze_levels(self, low, high, hold)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.low)
+
+    def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
+        """Return the draws, each held."""
+        draws = rng.uniform(self.low, self.high, (-(-steps // self.hold), self.nu))
+        return np.repeat(draws, self.hold, axis=0)[:steps]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class PRBS(OpenLoop):
+    """u switches between `low` and `high` as a maximal-length shift register does, with a flat spectrum.
+
+    Parameters
+    ----------
+    low, high
+        The two levels, scalars or (nu,).
+    hold
+        Steps between two bits.
+    order
+        Length of the register; it repeats after 2^order − 1 bits. Each episode starts at a random bit, and
+        the inputs run nu-th parts of the period apart, so that they are hardly correlated.
+    """
+
+    low: Float[np.ndarray, " nu"]
+    high: Float[np.ndarray, " nu"]
+    hold: int
+    order: int
+
+    def __init__(self, low: ArrayLike, high: ArrayLike, hold: int = 1, order: int = 10) -> None:
+        _freeze_levels(self, low, high, hold)
+        if order not in ORDERS:
+            raise DataError(f"order is {order}; choose {ORDERS[0]} … {ORDERS[-1]}")
+        object.__setattr__(self, "order", order)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.low)
+
+    def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
+        """Return the two levels from a random bit on."""
+        bits = maximal_length(self.order)
+        lag = np.arange(self.nu) * (len(bits) // self.nu)
+        place = (np.arange(steps) // self.hold)[:, None] + lag + rng.integers(len(bits))
+        return np.where(bits[place % len(bits)], self.high, self.low)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Multisine(OpenLoop):
+    """u = offset + Σ_j a sin(2π j t / period + φ_j) with random φ_j, scaled to the peak `amplitude`.
+
+    Parameters
+    ----------
+    amplitude
+        Largest |u − offset| in the period, scalar or (nu,).
+    period
+        [s], a whole number of samples.
+    harmonics
+        The multiples j: a number n for 1 … n, or the list of them; below half the samples of a period.
+    offset
+        Mean, scalar or (nu,).
+    """
+
+    amplitude: Float[np.ndarray, " nu"]
+    period: float
+    harmonics: tuple[int, ...]
+    offset: Float[np.ndarray, " nu"]
+
+    def __init__(
+        self, amplitude: ArrayLike, period: float, harmonics: int | Sequence[int], offset: ArrayLike = 0.0
+    ) -> None:
+        chosen = (
+            range(1, checks.count(harmonics, "harmonics") + 1) if isinstance(harmonics, int) else harmonics
+        )
+        object.__setattr__(self, "amplitude", _inputs(amplitude, "amplitude"))
+        object.__setattr__(self, "period", checks.positive(period, "period", "s"))
+        object.__setattr__(self, "harmonics", tuple(checks.count(j, "harmonic") for j in chosen))
+        object.__setattr__(self, "offset", checks.vector(offset, "offset", self.nu))
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.amplitude)
+
+    def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
+        """Return the periods, all alike, with phases of this episode."""
+        samples = round(self.period / dt)
+        if samples < 1 or abs(samples * dt - self.period) > 1e-9 * self.period:
+            raise DataError(
+                f"period is {self.period:g} s, no multiple of dt {dt:g} s; choose {max(samples, 1) * dt:g}"
+            )
+        if 2 * max(self.harmonics) >= samples:
+            raise DataError(
+                f"harmonic {max(self.harmonics)} of {samples} samples a period is not below the Nyquist "
+                "frequency; lengthen the period or drop it"
+            )
+        angle = 2 * np.pi / samples * np.outer(np.arange(samples), self.harmonics)
+        phases = rng.uniform(0, 2 * np.pi, (self.nu, 1, len(self.harmonics)))
+        one = np.sin(angle + phases).sum(axis=2).T
+        one = self.offset + self.amplitude * (one / np.abs(one).max(axis=0))
+        return one[np.arange(steps) % samples]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Chirp(OpenLoop):
+    """u = offset + amplitude sin 2π (f0 t + (f1 − f0) t² / (2 duration)): from f0 to f1 [Hz], then again.
+
+    Parameters
+    ----------
+    amplitude, offset
+        Scalars or (nu,).
+    f0, f1
+        First and last frequency [Hz], below half the sample rate.
+    duration
+        Length of the sweep [s].
+    """
+
+    amplitude: Float[np.ndarray, " nu"]
+    f0: float
+    f1: float
+    duration: float
+    offset: Float[np.ndarray, " nu"]
+
+    def __init__(
+        self, amplitude: ArrayLike, f0: float, f1: float, duration: float, offset: ArrayLike = 0.0
+    ) -> None:
+        object.__setattr__(self, "amplitude", _inputs(amplitude, "amplitude"))
+        object.__setattr__(self, "f0", checks.positive(f0, "f0", "Hz"))
+        object.__setattr__(self, "f1", checks.positive(f1, "f1", "Hz"))
+        object.__setattr__(self, "duration", checks.positive(duration, "duration", "s"))
+        object.__setattr__(self, "offset", checks.vector(offset, "offset", self.nu))
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.amplitude)
+
+    def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
+        """Return the sweep; nothing in it is random."""
+        if 2 * dt * max(self.f0, self.f1) >= 1:
+            raise DataError(
+                f"a chirp up to {max(self.f0, self.f1):g} Hz needs dt below "
+                f"{0.5 / max(self.f0, self.f1):g} s, dt is {dt:g} s; lower the frequency"
+            )
+        t = np.mod(dt * np.arange(steps), self.duration)
+        wave = np.sin(2 * np.pi * (self.f0 * t + (self.f1 - self.f0) * t**2 / (2 * self.duration)))
+        return self.offset + self.amplitude * wave[:, None]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Feedback(Excitation):
+    """u = u_ref − K (y − x_ref) + noise, clipped to [u_min, u_max]: excites an unstable plant and holds it.
+
+    Parameters
+    ----------
+    K
+        Gain (nu, ny).
+    noise
+        Any excitation of nu inputs, or None.
+    x_ref, u_ref
+        Where to hold, scalars or (ny,) and (nu,); zero by default.
+    u_min, u_max
+        Limits on u, scalars or (nu,).
+    """
+
+    K: Float[np.ndarray, "nu ny"]
+    noise: Excitation | None
+    x_ref: Float[np.ndarray, " ny"]
+    u_ref: Float[np.ndarray, " nu"]
+    u_min: Float[np.ndarray, " nu"]
+    u_max: Float[np.ndarray, " nu"]
+
+    def __init__(
+        self,
+        K: ArrayLike,
+        noise: Excitation | None = None,
+        x_ref: ArrayLike = 0.0,
+        u_ref: ArrayLike = 0.0,
+        u_min: ArrayLike = -np.inf,
+        u_max: ArrayLike = np.inf,
+    ) -> None:
+        gain = checks.array(K, "K", (None, None))
+        if noise is not None and noise.nu != len(gain):
+            raise ShapeError(
+                f"noise has {noise.nu} inputs and K {len(gain)} rows; pass one level for each input"
+            )
+        object.__setattr__(self, "K", gain)
+        object.__setattr__(self, "noise", noise)
+        object.__setattr__(self, "x_ref", checks.vector(x_ref, "x_ref", gain.shape[1]))
+        object.__setattr__(self, "u_ref", checks.vector(u_ref, "u_ref", len(gain)))
+        object.__setattr__(self, "u_min", checks.vector(u_min, "u_min", len(gain), infinite=True))
+        object.__setattr__(self, "u_max", checks.vector(u_max, "u_max", len(gain), infinite=True))
+        checks.crossed(self.u_min, self.u_max, "u")
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.K)
+
+    def start(self, steps: int, dt: float, rng: np.random.Generator) -> Policy:
+        """Return the policy, with the noise of this episode."""
+        noise = None if self.noise is None else self.noise.start(steps, dt, rng)
+
+        def policy(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " nu"]:
+            if y.shape != self.x_ref.shape:
+                raise ShapeError(
+                    f"K has {self.K.shape[1]} columns, the plant measures {len(y)}; "
+                    f"pass K of shape ({self.nu}, {len(y)})"
+                )
+            u = self.u_ref - self.K @ (y - self.x_ref)
+            return np.clip(u if noise is None else u + noise(k, y), self.u_min, self.u_max)
+
+        return policy
+
+
+def _inputs(value: ArrayLike, name: str) -> Float[np.ndarray, " nu"]:
+    """Return a scalar or a vector as one entry for each input."""
+    levels = np.atleast_1d(checks.array(value, name))
+    return levels if levels.ndim == 1 else checks.array(levels, name, (None,))
+
+
+def _freeze_levels(excitation: Noise | PRBS, low: ArrayLike, high: ArrayLike, hold: int) -> None:
+    lows, highs = _inputs(low, "low"), _inputs(high, "high")
+    nu = max(len(lows), len(highs))
+    lows = checks.vector(lows[0] if len(lows) == 1 else lows, "low", nu)
+    highs = checks.vector(highs[0] if len(highs) == 1 else highs, "high", nu)
+    checks.crossed(lows, highs, "excitation")
+    object.__setattr__(excitation, "low", lows)
+    object.__setattr__(excitation, "high", highs)
+    object.__setattr__(excitation, "hold", checks.count(hold, "hold"))

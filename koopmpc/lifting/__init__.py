@@ -1,0 +1,1 @@
+"""Observables ψ(x): one family a file."""

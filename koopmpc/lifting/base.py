@@ -1,0 +1,236 @@
+"""Lifting z = ψ(x), its sum, and the traced form that a file holds.
+
+A lifting is a frozen rule ("all monomials up to degree 3"). `bind` gives it the names of the states and so
+its size; from then on it evaluates arrays (`lifting(X)`) and CasADi symbols (`lifting.symbolic(x)`), the
+same function twice.
+"""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import accumulate
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ObservableError, ShapeError
+from koopmpc.plant.graph import Graph
+from koopmpc.values import Value
+
+Indices = Int[np.ndarray, " n"]
+_BLOCK = 1024  # rows evaluated at once: a block of observables stays in the cache
+
+
+def short(state: str) -> str:
+    """Return the name of a state without its unit: ``"theta [rad]"`` is ``"theta"``."""
+    return state.split(" [")[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Lifting(Value, ABC):
+    """Observables z = ψ(x), x in R^nx, z in R^nz.
+
+    A family of one's own is a frozen dataclass with `observables` and `formula`; arrays then go through the
+    traced formula, and so do files.
+    """
+
+    bound: tuple[str, ...] | None = field(default=None, kw_only=True)  # names of the states, once known
+
+    @abstractmethod
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of the observables on states of these names; raise where they do not fit."""
+
+    @abstractmethod
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return ψ(x) as a column, in CasADi operations."""
+
+    def bind(self, states: Sequence[str]) -> "Lifting":
+        """Return the sized copy, on states of these names.
+
+        Raises
+        ------
+        DataError
+            Two states or two observables have one name.
+        ShapeError
+            The lifting is made for another number of states.
+        """
+        bound = replace(self, bound=tuple(states))
+        _ = bound.names
+        return bound
+
+    @property
+    def _states(self) -> tuple[str, ...]:
+        """Names of the states that the lifting is bound to."""
+        if self.bound is None:
+            raise DataError(
+                f"{type(self).__name__} does not know its states yet; call .bind(states) or pass it to edmd"
+            )
+        return self.bound
+
+    @property
+    def nz(self) -> int:
+        """Number of observables."""
+        return len(self.names)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the observables, each once."""
+        return self._names
+
+    def __call__(self, X: ArrayLike) -> Float[np.ndarray, "..."]:
+        """Return Z = ψ(X), row by row.
+
+        Parameters
+        ----------
+        X
+            States, (M, nx) or (nx,).
+
+        Returns
+        -------
+        Z
+            Observables, (M, nz) or (nz,).
+        """
+        rows = checks.array(X, "x", finite=False)
+        nx = len(self._states)
+        if rows.ndim not in (1, 2) or rows.shape[-1] != nx:
+            raise ShapeError(self._misfit(rows.shape[-1] if rows.ndim in (1, 2) else rows.shape))
+        table = rows.reshape(-1, nx)
+        Z = np.empty((len(table), self.nz))
+        for first in range(0, len(table), _BLOCK):
+            block = slice(first, first + _BLOCK)
+            self._fill(np.ascontiguousarray(table[block].T), Z[block])
+        return Z if rows.ndim == 2 else Z[0]
+
+    def symbolic(self, x: ca.SX) -> ca.SX:
+        """Return ψ(x), (nz, 1), for a symbolic column x, (nx, 1)."""
+        if x.shape != (len(self._states), 1):
+            raise ShapeError(self._misfit(x.shape[0] if x.shape[1] == 1 else x.shape))
+        z = self.formula(x)
+        if z.shape != (self.nz, 1):
+            raise ShapeError(
+                f"{type(self).__name__}.formula returns shape {z.shape}, but names {self.nz} observables; "
+                f"return a column of {self.nz}"
+            )
+        return z
+
+    def __add__(self, other: "Lifting") -> "Lifting":
+        """Return both liftings one under the other; an observable that both name is held once."""
+        parts = [
+            part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))
+        ]
+        bound = self.bound if other.bound is None else other.bound
+        if bound is None:
+            return Sum(tuple(parts))
+        if self.bound is not None and self.bound != bound:
+            raise DataError(f"the liftings are bound to other states: {self.bound} and {other.bound}")
+        return Sum(tuple(parts)).bind(bound)
+
+    def as_saved(self) -> Value:
+        """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
+        if Value._kinds.get(type(self).__name__) is type(self):
+            return self
+        return Traced(self._graph, self.names, bound=self._states)
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        """Write ψ of the columns of x into the rows of Z."""
+        self._graph.run(x, Z.T, self._graph.scratch(x.shape[1]))
+
+    @cached_property
+    def _graph(self) -> Graph:
+        x = ca.SX.sym("x", len(self._states))
+        return Graph.trace(ca.Function("lifting", [x], [self.symbolic(x)]))
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
+        for names, what in ((self._states, "states"), (self.observables(self._states), "observables")):
+            repeated = [name for name, n in Counter(names).items() if n > 1]
+            if repeated:
+                raise DataError(f"{type(self).__name__}: two {what} are named {repeated[0]!r}; rename one")
+        return self.observables(self._states)
+
+    def _misfit(self, got: object) -> str:
+        what = f"has {got} states" if isinstance(got, int) else f"has shape {got}"
+        return f"x {what}, the lifting was bound to {len(self._states)} ({', '.join(self._states)})"
+
+
+@dataclass(frozen=True, eq=False)
+class Sum(Lifting):
+    """ψ(x) = [ψ₁(x); ψ₂(x); …] without what an earlier part names already; written ``a + b``."""
+
+    parts: tuple[Lifting, ...]
+
+    def bind(self, states: Sequence[str]) -> "Sum":
+        """Return the sum of the bound parts."""
+        return Sum(tuple(part.bind(states) for part in self.parts), bound=tuple(states))
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of all parts, each once."""
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the new observables of each part, one under the other."""
+        columns = [part.formula(x) for part in self.parts]
+        return ca.vertcat(*(z[[int(i) for i in new]] for z, new in zip(columns, self._new, strict=True)))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        ends = accumulate(len(new) for new in self._new)
+        for part, new, end in zip(self.parts, self._new, ends, strict=True):
+            own = Z[:, end - len(new) : end]
+            if len(new) == part.nz:
+                part._fill(x, own)
+            elif len(new):
+                whole = np.empty((len(Z), part.nz))
+                part._fill(x, whole)
+                own[:] = whole[:, new]
+
+    @cached_property
+    def _new(self) -> tuple[Indices, ...]:
+        """For each part the indices of the observables that no earlier part names."""
+        held: set[str] = set()
+        new: list[Indices] = []
+        for part in self.parts:
+            new.append(np.array([i for i, name in enumerate(part.names) if name not in held], dtype=np.intp))
+            held.update(part.names)
+        return tuple(new)
+
+
+@dataclass(frozen=True, eq=False)
+class Traced(Lifting):
+    """ψ as a list of plain operations: what is left of a user's own function in a file."""
+
+    graph: Graph
+    labels: tuple[str, ...]
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names given when it was traced."""
+        return self.labels
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the operations, done on symbols."""
+        return self.graph.symbolic(x)
+
+    @cached_property
+    def _graph(self) -> Graph:
+        return self.graph
+
+
+def rows(lifting: Lifting, wanted: Lifting) -> Indices:
+    """Return where the bound `lifting` holds the observables of the bound `wanted`, found by name.
+
+    Raises
+    ------
+    ObservableError
+        The lifting lacks one of them.
+    """
+    place = {name: i for i, name in enumerate(lifting.names)}
+    for name in wanted.names:
+        if name not in place:
+            raise ObservableError(
+                f"the lifting lacks {name!r}; add it to the lifting: it holds {', '.join(lifting.names)}"
+            )
+    return np.array([place[name] for name in wanted.names], dtype=np.intp)

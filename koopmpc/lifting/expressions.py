@@ -1,0 +1,53 @@
+"""Observables that the user writes in CasADi operations."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from koopmpc.errors import DataError
+from koopmpc.lifting.base import Lifting, Traced
+from koopmpc.plant.graph import Graph
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Expressions(Lifting):
+    """ψ(x) = fn(x), traced once when it is bound.
+
+    Parameters
+    ----------
+    fn
+        Takes the column x and returns a list of expressions: ``lambda x: [x[1] * ca.sin(x[0])]``.
+    names
+        One name each; whoever asks for an observable finds it by this name.
+    """
+
+    fn: Callable[[ca.SX], Sequence[ca.SX]]
+    labels: tuple[str, ...]
+
+    def __init__(self, fn: Callable[[ca.SX], Sequence[ca.SX]], names: Sequence[str]) -> None:
+        object.__setattr__(self, "fn", fn)
+        object.__setattr__(self, "labels", (names,) if isinstance(names, str) else tuple(names))
+        object.__setattr__(self, "bound", None)
+
+    def bind(self, states: Sequence[str]) -> Traced:
+        """Return the traced list of operations, which needs `fn` no more."""
+        x = ca.SX.sym("x", len(states))
+        z = self.formula(x)
+        if z.shape != (len(self.labels), 1):
+            raise DataError(
+                f"Expressions: fn returns shape {z.shape} and names has {len(self.labels)}; "
+                "return one expression for each name"
+            )
+        graph = Graph.trace(ca.Function("expressions", [x], [z]))
+        traced = Traced(graph, self.labels, bound=tuple(states))
+        _ = traced.names
+        return traced
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names given."""
+        return self.labels
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return what `fn` returns, as a column."""
+        return ca.SX(ca.vertcat(*self.fn(x)))
