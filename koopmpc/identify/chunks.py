@@ -1,0 +1,54 @@
+"""Snapshot pairs in chunks of fixed size, cut from episodes and never across two of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.lifting.base import Lifting
+
+ROWS = 4096  # snapshot pairs lifted at once
+
+
+class Piece(NamedTuple):
+    """The pairs x_k → x_{k+1}, first ≤ k < last, of one episode."""
+
+    episode: int
+    first: int
+    last: int
+
+
+def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
+    """Return all pairs in order, in lists of pieces of `rows` pairs (the last may hold fewer)."""
+    result: list[list[Piece]] = [[]]
+    room = rows
+    for i, episode in enumerate(episodes):
+        first = 0
+        while first < len(episode):
+            if room == 0:
+                result.append([])
+                room = rows
+            last = min(first + room, len(episode))
+            result[-1].append(Piece(i, first, last))
+            room -= last - first
+            first = last
+    return result
+
+
+def table(episodes: Episodes, lifting: Lifting, chunk: list[Piece]) -> Float[np.ndarray, "M nd"]:
+    """Return the rows [ψ(x) u ψ(x⁺)] of one chunk; each state is lifted once."""
+    of = episodes.episodes
+    states = [of[i].X[first : last + 1] for i, first, last in chunk]
+    Z = lifting(states[0] if len(states) == 1 else np.concatenate(states))
+    nz, nu = lifting.nz, episodes.nu
+    D = np.empty((len(Z) - len(chunk), 2 * nz + nu))
+    if len(chunk) == 1:
+        D[:, :nz], D[:, nz + nu :] = Z[:-1], Z[1:]
+    else:
+        ends = np.cumsum([len(X) for X in states]) - 1
+        now = np.delete(np.arange(len(Z)), ends)
+        D[:, :nz], D[:, nz + nu :] = Z[now], Z[now + 1]
+    if nu:
+        D[:, nz : nz + nu] = np.concatenate([of[i].U[first:last] for i, first, last in chunk])
+    return D

@@ -1,0 +1,86 @@
+"""What makes a fit doubtful, in sentences."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import qr, solve_triangular
+
+from koopmpc.identify.solve import Rows, norms, scaled_rank, unit
+
+_ILL_CONDITIONED = 1e10
+_NAMED = 3  # dependent columns that a message names
+
+
+def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, regular: bool) -> list[str]:
+    """Return one sentence for each reason to doubt a regression on [ψ(x) u], P of `rows`.
+
+    Parameters
+    ----------
+    rows
+        Their P holds the observables, then the inputs.
+    observables, inputs
+        Names of the columns of P.
+    regular
+        The user asked for a ridge or a rank: dependent or ill-conditioned observables are no surprise then.
+    """
+    nz, nu = len(observables), len(inputs)
+    names = [*observables, *inputs]
+    size = norms(rows.P)
+    zero = np.flatnonzero(size == 0)
+    found: list[str] = []
+    if zero.size:
+        found.append(
+            f"{_listed([names[j] for j in zero])} was 0 in all snapshots, so its coefficients are set to 0; "
+            "excite it or drop it"
+        )
+    live = np.flatnonzero(size > 0)
+    Z, U = rows.P[:, live[live < nz]], rows.P[:, live[live >= nz]]
+    rank, condition = scaled_rank(rows, rows.P[:, live])
+    if rows.samples < nz + nu:
+        if not regular:
+            found.append(
+                f"rank-deficient: {rows.samples} snapshot pairs cannot determine {nz + nu} coefficients a row; "
+                "the minimum-norm solution is taken; collect more, or lift to fewer observables"
+            )
+        return found
+    if rank == len(live):
+        if condition > _ILL_CONDITIONED and not regular:
+            found.append(
+                f"ill-conditioned: the observables have condition number {condition:.1e} on unit-norm columns; "
+                "pass a ridge, or drop observables that are almost functions of others"
+            )
+        return found
+    rank_z, rank_u = scaled_rank(rows, Z)[0], scaled_rank(rows, U)[0]
+    for P, own, part, what in (
+        (Z, rank_z, live[live < nz], "observables"),
+        (U, rank_u, live[live >= nz], "inputs"),
+    ):
+        if own < P.shape[1] and not (regular and what == "observables"):
+            found.append(
+                f"rank-deficient: {P.shape[1] - own} of {P.shape[1]} {what} are linear functions of others on these "
+                f"data ({_dependent(P, own, [names[j] for j in part])}); the minimum-norm solution is taken; "
+                "drop them, or collect richer data"
+            )
+    if rank < rank_z + rank_u:
+        found.append(
+            "feedback made A and B inseparable: on these data inputs are linear functions of ψ(x) (rank [Z U] = "
+            f"{rank}, rank Z + rank U = {rank_z + rank_u}); the minimum-norm split is taken; "
+            "add noise to the input, or pass a known B to dmdc"
+        )
+    return found
+
+
+def _dependent(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:
+    """Return for the columns beyond `rank` which others they depend on."""
+    R, order = qr(unit(P), mode="r", pivoting=True)
+    weights = np.abs(solve_triangular(R[:rank, :rank], R[:rank, rank:]))
+    said: list[str] = []
+    for j, column in zip(order[rank : rank + _NAMED], weights.T, strict=False):
+        sources = [names[order[i]] for i in np.argsort(-column, kind="stable") if column[i] > 1e-6]
+        said.append(f"{names[j]!r} of {_listed(sources)}")
+    return ", ".join(said) + (", …" if P.shape[1] - rank > _NAMED else "")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(repr(name) for name in names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

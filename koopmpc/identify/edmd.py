@@ -1,0 +1,88 @@
+"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x)."""
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.identify.fit import Regression, fit
+from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.solve import solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.predict.linear import LinearPredictor
+
+
+def edmd(
+    episodes: Episodes, lifting: Lifting, *, ridge: float = 0.0, rank: int | None = None
+) -> LinearPredictor:
+    """Fit ψ(x⁺) = A ψ(x) + B u by least squares on M snapshot pairs, with inputs where the data have them.
+
+    Nothing is added to the lifting: no state, no constant. C picks the states where the lifting holds them, by
+    name, else it is the least-squares fit of x by ψ(x), its residual in ``report.state_residual``.
+
+    Parameters
+    ----------
+    episodes
+        No pair spans two of them.
+    lifting
+        ψ: R^nx → R^nz.
+    ridge
+        Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz) of the largest, on
+        unit-norm columns, are cut; the report's route says so.
+    rank
+        With rank=r the columns are unscaled, and the predictor is reduced to z = U_rᵀ ψ(x), A = Ã (r, r),
+        C = C U_r, with the exact modes X′ V Σ⁻¹ W. A truncated SVD depends on the units of the data.
+
+    Raises
+    ------
+    DataError
+        ridge is negative, rank too large, or an observable not finite on the data.
+
+    Warns
+    -----
+    FitWarning
+        Rank-deficient, ill-conditioned, or inputs that are functions of ψ(x); each is also in the report.
+
+    References
+    ----------
+    Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci. 25,
+    2015; with inputs: Korda & Mezić, Automatica 93, 2018.
+    """
+    total = moments(episodes, lifting)
+    return fit(regression(total, "edmd"), ridge=ridge, rank=rank)
+
+
+def regression(total: Moments, method: str) -> Regression:
+    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included."""
+    states = total.lifting._states
+    place = {name: i for i, name in enumerate(total.full.names)}
+    where = np.array([place[name] for name in states])
+    C, residual = _decoder(total, where)
+    return Regression(
+        method=method,
+        route=total.route,
+        rows=total.rows(total.regressors, total.targets),
+        x_next=where,
+        lifting=total.lifting,
+        states=states,
+        inputs=total.inputs,
+        dt=total.dt,
+        C=C,
+        state_residual=residual,
+    )
+
+
+def _decoder(
+    total: Moments, where: np.ndarray
+) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
+    """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked."""
+    nz = total.nz
+    C = np.zeros((len(where), nz))
+    residual = np.zeros(len(where))
+    held = where < nz
+    C[held, where[held]] = 1.0
+    if not held.all():
+        rows = total.rows(np.arange(nz), where[~held])
+        K = solve(rows).K
+        C[~held] = K.T
+        residual[~held] = rows.residual(np.arange(K.shape[1]), K)
+    return C, residual

@@ -1,0 +1,197 @@
+"""Second moments of the rows [ψ(x) u ψ(x⁺)]: all that the linear regressions need of the snapshots."""
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg.lapack import dtpqrt
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, FitWarning
+from koopmpc.identify.chunks import chunks, table
+from koopmpc.identify.solve import Rows, norms
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import State
+from koopmpc.values import Value
+
+Route = Literal["gram", "qr"]
+_WELL_CONDITIONED = 1e6  # scaled cond(Z) up to which normal equations lose nothing
+_PILOT = 4  # chunks that choose the route
+_PANEL = 16  # columns that dtpqrt eliminates at once
+
+
+@dataclass(frozen=True, eq=False)
+class Moments(Value):
+    """Second moments of the rows d = [ψ(x) u ψ(x⁺)] of M snapshot pairs: G = Σ dᵀd, or R with RᵀR = Σ dᵀd.
+
+    They add: ``a + b`` are the moments of both data sets, in any grouping, to rounding. Where ψ lacks a state,
+    the state is appended to it in these rows, so that C and the residuals need no second pass.
+
+    Attributes
+    ----------
+    lifting
+        ψ, bound to the states.
+    inputs
+        Names with units; none for an autonomous system.
+    dt
+        Sample time [s].
+    samples
+        M.
+    route
+        "gram" for raw sums of products, "qr" for the triangular factor: twice the digits at six times the cost.
+    sums
+        G or R, (nd, nd).
+    """
+
+    lifting: Lifting
+    inputs: tuple[str, ...]
+    dt: float
+    samples: int
+    route: str
+    sums: Float[np.ndarray, "nd nd"]
+
+    @cached_property
+    def full(self) -> Lifting:
+        """The lifting, then the states that it lacks."""
+        return _with_states(self.lifting)
+
+    @property
+    def nz(self) -> int:
+        """Number of observables in ψ."""
+        return self.lifting.nz
+
+    @property
+    def regressors(self) -> Int[np.ndarray, " n"]:
+        """Columns of ψ(x) and u."""
+        full = self.full.nz
+        return np.concatenate([np.arange(self.nz), np.arange(full, full + len(self.inputs))])
+
+    @property
+    def targets(self) -> Int[np.ndarray, " n"]:
+        """Columns of ψ(x⁺), the appended states last."""
+        first = self.full.nz + len(self.inputs)
+        return np.arange(first, first + self.full.nz)
+
+    @property
+    def condition(self) -> float:
+        """Condition number of [ψ(x) u] on unit-norm columns, those that are 0 throughout left out."""
+        columns = self.rows(self.regressors, self.targets[:0]).P
+        size = norms(columns)
+        s = np.linalg.svd(columns[:, size > 0] / size[size > 0], compute_uv=False)
+        if self.samples < len(s):
+            return np.inf
+        return float(s[0] / s[-1]) if s.size and s[-1] > 0 else (np.inf if s.size else 1.0)
+
+    def __add__(self, other: "Moments") -> "Moments":
+        """Return the moments of both data sets; R + G becomes G and warns, for it loses R's digits."""
+        if (self.lifting, self.inputs, self.dt) != (other.lifting, other.inputs, other.dt):
+            raise DataError(
+                "the moments differ in lifting, inputs or dt; add moments of one plant in one lifting only"
+            )
+        samples = self.samples + other.samples
+        if self.route == other.route == "qr":
+            return replace(self, samples=samples, sums=_absorbed(self.sums, other.sums))
+        if self.route != other.route:
+            warnings.warn(
+                "a triangular factor was added to Gram sums: the result is Gram sums, with half the digits; "
+                'read both with route="qr"',
+                FitWarning,
+                stacklevel=2,
+            )
+        return replace(self, samples=samples, route="gram", sums=self._gram() + other._gram())
+
+    def rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> Rows:
+        """Return a few rows [P T] with the same second moments as these columns of all M rows."""
+        n = len(regressors)
+        if self.route == "qr":
+            R = np.linalg.qr(self.sums[:, np.concatenate([regressors, targets])], mode="r")
+            return Rows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
+        G = self.sums
+        size = np.sqrt(G.diagonal()[regressors])
+        size[size == 0] = 1.0
+        values, vectors = np.linalg.eigh(G[np.ix_(regressors, regressors)] / np.outer(size, size))
+        # an eigenvalue below this is rounding of the sums
+        held = values > np.finfo(float).eps * max(self.samples, n) * values.max(initial=0.0)
+        root = np.sqrt(np.where(held, values, 0.0))
+        P = root[:, None] * vectors.T * size
+        T = vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None])
+        T = np.where(held[:, None], T, 0.0) / np.where(held, root, 1.0)[:, None]
+        rest = np.maximum(G.diagonal()[targets] - np.sum(T**2, axis=0), 0.0)
+        return Rows(P, T, rest, self.samples)
+
+    def _gram(self) -> Float[np.ndarray, "nd nd"]:
+        return self.sums if self.route == "gram" else self.sums.T @ self.sums
+
+
+def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None) -> Moments:
+    """Return Σ dᵀd, or its triangular factor, over the rows d = [ψ(x) u ψ(x⁺)] of all snapshot pairs.
+
+    Chunks of fixed size are lifted, added in order and forgotten: memory does not grow with the data, and one
+    BLAS build and thread count gives one result to the bit. Data too large for memory, or a stream, are fed part
+    by part and added: ``moments(part, lifting, route="qr") + …``.
+
+    Parameters
+    ----------
+    episodes
+        At least one step in all.
+    lifting
+        ψ; it is bound to the episodes' states.
+    route
+        "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a pilot
+        of sampled chunks chooses: Gram up to 1e6, else QR; if the whole turns out worse, it is read again.
+
+    Raises
+    ------
+    DataError
+        An observable is not finite on the data.
+    """
+    bound = lifting.bind(episodes.states)
+    pieces = chunks(episodes)
+    if route is not None:
+        return _read(episodes, bound, range(len(pieces)), route)
+    pilot = sorted(set(np.linspace(0, len(pieces) - 1, _PILOT).round().astype(int).tolist()))
+    first = _read(episodes, bound, pilot, "gram")
+    if first.condition <= _WELL_CONDITIONED:
+        total = first if len(pilot) == len(pieces) else _read(episodes, bound, range(len(pieces)), "gram")
+        if total.condition <= _WELL_CONDITIONED:
+            return total
+    return _read(episodes, bound, range(len(pieces)), "qr")
+
+
+def _read(episodes: Episodes, lifting: Lifting, which: "range | list[int]", route: Route) -> Moments:
+    full, pieces, nu = _with_states(lifting), chunks(episodes), episodes.nu
+    width = 2 * full.nz + nu
+    sums, samples = np.zeros((width, width)), 0
+    for i in which:
+        D = table(episodes, full, pieces[i])
+        sums = sums + D.T @ D if route == "gram" else _absorbed(sums, D)
+        samples += len(D)
+        _require_finite(sums.diagonal() if route == "gram" else np.abs(D).max(axis=0), full, episodes.inputs)
+    return Moments(lifting, episodes.inputs, episodes.dt, samples, route, sums)
+
+
+def _absorbed(R: Float[np.ndarray, "nd nd"], rows: Float[np.ndarray, "m nd"]) -> Float[np.ndarray, "nd nd"]:
+    """Return the triangular factor of [R; rows]."""
+    if not np.isfinite(rows).all():
+        return np.full_like(R, np.nan)
+    result, _, _, info = dtpqrt(0, min(_PANEL, len(R)), R, rows)
+    assert info == 0, f"dtpqrt refused argument {-info}"
+    return np.ascontiguousarray(np.triu(result))
+
+
+def _require_finite(size: Float[np.ndarray, " nd"], full: Lifting, inputs: tuple[str, ...]) -> None:
+    bad = np.flatnonzero(~np.isfinite(size))
+    if bad.size:
+        name = (*full.names, *inputs, *full.names)[int(bad[0])]
+        raise DataError(
+            f"the observable {name!r} is NaN, infinite or above 1e154 on these data; "
+            "drop it, or the episodes where it is"
+        )
+
+
+def _with_states(lifting: Lifting) -> Lifting:
+    states = State().bind(lifting._states)
+    return lifting if set(states.names) <= set(lifting.names) else lifting + states

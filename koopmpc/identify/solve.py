@@ -1,0 +1,83 @@
+"""Least squares min ‖T − P K‖ on a few rows that stand for all snapshots."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows [P T] with the second moments of M snapshots.
+
+    Attributes
+    ----------
+    P
+        (m, n) regressors.
+    T
+        (m, nt) targets, as far as they lie in these rows.
+    rest
+        (nt,) the energy Σt² of each target outside these rows, where no P can reach.
+    samples
+        M.
+    """
+
+    P: Float[np.ndarray, "m n"]
+    T: Float[np.ndarray, "m nt"]
+    rest: Float[np.ndarray, " nt"]
+    samples: int
+
+    def residual(
+        self, columns: Int[np.ndarray, " c"], K: Float[np.ndarray, "n c"]
+    ) -> Float[np.ndarray, " c"]:
+        """Return the root-mean-square of T − P K for these columns of T."""
+        error = self.T[:, columns] - self.P @ K
+        return np.sqrt((np.sum(error**2, axis=0) + self.rest[columns]) / self.samples)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """K (n, nt), and how many singular directions of P it uses."""
+
+    K: Float[np.ndarray, "n nt"]
+    rank: int
+
+
+def norms(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
+    """Return the Euclidean norm of each column."""
+    return np.sqrt(np.sum(P**2, axis=0))
+
+
+def unit(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+    """Return P with columns of norm 1; a column of zeros stays."""
+    size = norms(P)
+    return P / np.where(size > 0, size, 1.0)
+
+
+def cutoff(rows: Rows) -> float:
+    """Return eps · max(M, n): below it, relative to the largest, a singular value is rounding."""
+    return float(np.finfo(float).eps * max(rows.samples, rows.P.shape[1]))
+
+
+def solve(rows: Rows, *, ridge: float = 0.0, scaled: bool = True) -> Solution:
+    """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag of the columns' norms.
+
+    With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
+    takes norm and cut on columns of unit norm, where units of the data mean nothing.
+    """
+    size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
+    size[size == 0] = 1.0
+    U, s, Vt = np.linalg.svd(rows.P / size, full_matrices=False)
+    held = s > cutoff(rows) * s.max(initial=0.0)
+    gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
+    K = (Vt.T * gain) @ (U.T @ rows.T) / size[:, None]
+    return Solution(K, int(held.sum()))
+
+
+def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
+    """Return rank and condition number of the columns P of `rows`, scaled to unit norm; inf if dependent."""
+    if P.shape[1] == 0:
+        return 0, 1.0
+    s = np.linalg.svd(unit(P), compute_uv=False)
+    rank = int(np.sum(s > cutoff(rows) * s[0]))
+    return rank, float(s[0] / s[-1]) if rank == P.shape[1] else np.inf

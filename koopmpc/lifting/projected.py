@@ -1,0 +1,59 @@
+"""A lifting seen through a few directions of its own space."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.errors import ShapeError
+from koopmpc.lifting.base import Lifting
+
+
+@dataclass(frozen=True, eq=False)
+class Projected(Lifting):
+    """z = basisᵀ ψ(x): r coordinates of another lifting, as a rank-truncated fit uses them.
+
+    Parameters
+    ----------
+    lifting
+        ψ, of nz observables.
+    basis
+        (nz, r), a direction a column.
+
+    Raises
+    ------
+    ShapeError
+        The basis has not one row for each observable.
+    """
+
+    lifting: Lifting
+    basis: Float[np.ndarray, "nz r"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "basis", checks.array(self.basis, "basis", (None, None)))
+
+    def bind(self, states: Sequence[str]) -> "Projected":
+        """Return the copy on the bound lifting."""
+        bound = replace(self, lifting=self.lifting.bind(states), bound=tuple(states))
+        if bound.lifting.nz != len(self.basis):
+            raise ShapeError(
+                f"basis has {len(self.basis)} rows, the lifting returns {bound.lifting.nz} observables; "
+                "pass the lifting that the basis was made for"
+            )
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return ``"z0", "z1", …``."""
+        return tuple(f"z{j}" for j in range(self.basis.shape[1]))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return basisᵀ ψ(x)."""
+        return ca.DM(np.ascontiguousarray(self.basis.T)) @ self.lifting.formula(x)
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M r"]) -> None:
+        whole = np.empty((len(Z), len(self.basis)))
+        self.lifting._fill(x, whole)
+        np.matmul(whole, self.basis, out=Z)

@@ -1,0 +1,1 @@
+"""Lifted predictors, their spectrum and their score."""

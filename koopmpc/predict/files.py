@@ -1,0 +1,48 @@
+"""A Value in one .npz file: its arrays, and one JSON text that holds the rest."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from koopmpc.errors import LogError
+from koopmpc.values import Arrays, Value, from_data, to_data
+
+V = TypeVar("V", bound=Value)
+_FORMAT = "koopmpc-1"
+
+
+def save_value(value: Value, path: str | Path) -> None:
+    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled."""
+    arrays: Arrays = {}
+    tree = {"format": _FORMAT, "value": to_data(value, arrays)}
+    text = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, tree=text, **arrays)
+
+
+def load_value(path: str | Path, kind: type[V]) -> V:
+    """Read a `kind` that `save_value` wrote.
+
+    Raises
+    ------
+    LogError
+        The file is missing, damaged, or holds something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        tree = json.loads(arrays.pop("tree").tobytes().decode())
+        known = isinstance(tree, dict) and tree.get("format") == _FORMAT
+    except FileNotFoundError as error:
+        raise LogError(f"{path} does not exist") from error
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, UnicodeDecodeError) as error:
+        raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}") from error
+    if not known:
+        raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")
+    value = from_data(tree["value"], arrays)
+    if not isinstance(value, kind):
+        raise LogError(f"{path} holds a {type(value).__name__}, not a {kind.__name__}")
+    return value

@@ -1,0 +1,200 @@
+"""LinearPredictor: z⁺ = A z + B u, x ≈ C z, z₀ = ψ(x₀)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Complex, Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import ShapeError
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.projected import Projected
+from koopmpc.lifting.state import State
+from koopmpc.plant.step_map import StepMap
+from koopmpc.predict.files import load_value, save_value
+from koopmpc.predict.report import FitReport
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPredictor(Value):
+    """A lifted linear predictor z⁺ = A z + B u, x ≈ C z, z₀ = ψ(x₀).
+
+    Attributes
+    ----------
+    A
+        (nz, nz), one step of `dt`.
+    B
+        (nz, nu); (nz, 0) for an autonomous system.
+    C
+        (nx, nz), back to the state.
+    lifting
+        ψ, bound to `states`.
+    dt
+        Sampling time [s].
+    states, inputs
+        Names with units.
+    report
+        How it was fitted; None for a model that was not.
+    exact_modes
+        (nl, nz) exact DMD modes X′ V Σ⁻¹ W in the observables of the unreduced lifting, one a column, where a
+        rank-truncated fit computed them; its `lifting` is then a Projected one.
+
+    Raises
+    ------
+    ShapeError
+        A, B, C, the lifting and the names do not fit together.
+
+    References
+    ----------
+    Korda & Mezić, "Linear predictors for nonlinear dynamical systems: Koopman operator meets model predictive
+    control", Automatica 93, 2018.
+    """
+
+    A: Float[np.ndarray, "nz nz"]
+    B: Float[np.ndarray, "nz nu"]
+    C: Float[np.ndarray, "nx nz"]
+    lifting: Lifting
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    report: FitReport | None = None
+    exact_modes: Complex[np.ndarray, "nl nz"] | None = None
+
+    def __post_init__(self) -> None:
+        states, inputs = tuple(self.states), tuple(self.inputs)
+        lifting = self.lifting.bind(states)
+        nz, nx, nu = lifting.nz, len(states), len(inputs)
+        set_ = object.__setattr__
+        set_(self, "states", states)
+        set_(self, "inputs", inputs)
+        set_(self, "lifting", lifting)
+        set_(self, "dt", checks.positive(self.dt, "dt", "s"))
+        A = checks.array(self.A, "A")
+        if A.shape != (nz, nz):
+            raise ShapeError(
+                f"A has shape {A.shape}, but the lifting returns {nz} observables; pass the lifting used in the fit"
+            )
+        set_(self, "A", A)
+        set_(self, "B", checks.array(self.B, "B", (nz, nu)))
+        set_(self, "C", checks.array(self.C, "C", (nx, nz)))
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return self.C.shape[0]
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[1]
+
+    @property
+    def nz(self) -> int:
+        """Number of lifted coordinates."""
+        return self.A.shape[0]
+
+    def lift(self, x: ArrayLike) -> Float[np.ndarray, "*batch nz"]:
+        """Return z = ψ(x) for one state (nx,) or rows of states (M, nx)."""
+        return self.lifting(checks.array(x, "x"))
+
+    def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "T+1 nx"]:
+        """Return x_k ≈ C z_k of z_{k+1} = A z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
+
+        Parameters
+        ----------
+        x0
+            (nx,) initial state.
+        U
+            (T, nu) inputs; (T, 0) for an autonomous predictor.
+        """
+        inputs = checks.array(U, "U", (None, self.nu))
+        start = checks.array(x0, "x0", (self.nx,))
+        Z = np.empty((len(inputs) + 1, self.nz))
+        Z[0] = self.lift(start)
+        forced = inputs @ self.B.T
+        for k in range(len(inputs)):
+            np.dot(self.A, Z[k], out=Z[k + 1])
+            Z[k + 1] += forced[k]
+        X = Z @ self.C.T
+        X[0] = start
+        return X
+
+    def step_map(self) -> StepMap:
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC."""
+        x, u = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu)
+        CA, CB = ca.DM(self.C @ self.A), ca.DM(self.C @ self.B)
+        x_next = CA @ self.lifting.symbolic(x) + CB @ u
+        F = ca.Function("F", [x, u], [ca.densify(x_next)], ["x", "u"], ["x_next"])
+        return StepMap(F, self.dt, states=self.states, inputs=self.inputs)
+
+    @cached_property
+    def eigenvalues(self) -> Complex[np.ndarray, " nz"]:
+        """Eigenvalues of A, the largest magnitude first."""
+        return self._eigen[0]
+
+    @cached_property
+    def modes(self) -> Complex[np.ndarray, "nx nz"]:
+        """Koopman modes in the state's coordinates, one a column: the exact DMD modes, or C times A's eigenvectors."""
+        if self.exact_modes is None or not isinstance(self.lifting, Projected):
+            return self.C @ self._eigen[1]
+        whole = self.lifting.lifting
+        place = {name: i for i, name in enumerate(whole.names)}
+        if set(self.states) <= set(place):
+            return self.exact_modes[[place[name] for name in self.states]]
+        return self.C @ (self.lifting.basis.T @ self.exact_modes)
+
+    def eigenfunctions(self, X: ArrayLike) -> Complex[np.ndarray, "M nz"]:
+        """Return φ_j(x) = ξ_jᴴ ψ(x) with ξ_jᴴ A = λ_j ξ_jᴴ at rows of states: φ_j(x⁺) = λ_j φ_j(x) without input.
+
+        The order is that of `eigenvalues`; each is scaled so that ξ_jᴴ v_j = 1 with the right eigenvector v_j.
+        """
+        Z = self.lifting(checks.array(X, "X", (None, self.nx)))
+        return np.linalg.solve(self._eigen[1], Z.T.astype(complex)).T
+
+    @cached_property
+    def _eigen(self) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
+        return eigen(self.A)
+
+    def save(self, path: str | Path) -> None:
+        """Write the predictor as data (.npz: arrays and one JSON text); `load_predictor` reads it."""
+        save_value(self, path)
+
+    @classmethod
+    def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike) -> "LinearPredictor":
+        """Return the linearisation x⁺ = A x + B u + c at (x, u) as a predictor on State() + Constant().
+
+        Exact Jacobians of `step_map`; c = F(x, u) − A x − B u, so (x, u) need not be an equilibrium.
+        """
+        affine = step_map.linearize(x, u)
+        nx, nu = affine.B.shape
+        A = np.eye(nx + 1)
+        A[:nx, :nx], A[:nx, nx] = affine.A, affine.c
+        B = np.vstack([affine.B, np.zeros((1, nu))])
+        C = np.eye(nx, nx + 1)
+        return cls(A, B, C, State() + Constant(), step_map.dt, step_map.states, step_map.inputs)
+
+
+def eigen(
+    A: Float[np.ndarray, "nz nz"],
+) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
+    """Return eigenvalues of A, the largest magnitude first, and its right eigenvectors, one a column."""
+    values, vectors = np.linalg.eig(A)
+    order = np.lexsort((values.imag, -np.abs(values)))
+    return values[order].astype(complex), vectors[:, order].astype(complex)
+
+
+def load_predictor(path: str | Path) -> LinearPredictor:
+    """Read a predictor that `LinearPredictor.save` wrote; runs no code of the file.
+
+    Raises
+    ------
+    LogError
+        The file is missing, damaged, or no predictor.
+    """
+    return load_value(path, LinearPredictor)
