@@ -99,12 +99,14 @@ def _drive(
     plant: Plant, e: int, x0: Float[np.ndarray, " nx"], policy: Policy, rng: np.random.Generator, steps: int
 ) -> Episode:
     """Run one episode of a plant that holds its state."""
-    Y, U = [plant.reset(x0, rng)], [np.empty(0)] * steps
+    Y = np.empty((steps + 1, len(plant.outputs)))
+    U = np.empty((steps, len(plant.inputs)))
+    Y[0] = plant.reset(x0, rng)
     for k in range(steps):
         U[k] = policy(k, Y[k])
-        Y.append(plant.step(U[k]))
-        _finite(Y[k + 1][None], e, k + 1)
-    return Episode(X=np.stack(Y), U=np.stack(U))
+        Y[k + 1] = plant.step(U[k])
+        _finite(Y[k + 1 : k + 2], e, k + 1)
+    return Episode(X=Y, U=U)
 
 
 def _batch(

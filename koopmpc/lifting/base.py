@@ -175,7 +175,7 @@ class Sum(Lifting):
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the new observables of each part, one under the other."""
         columns = [part.formula(x) for part in self.parts]
-        return ca.vertcat(*(z[[int(i) for i in new]] for z, new in zip(columns, self._new, strict=True)))
+        return ca.vertcat(*(z[int(i)] for z, new in zip(columns, self._new, strict=True) for i in new))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         ends = accumulate(len(new) for new in self._new)

@@ -8,6 +8,7 @@ import casadi as ca
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, Traced
 from koopmpc.plant.graph import Graph
+from koopmpc.values import Value
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -43,6 +44,12 @@ class Expressions(Lifting):
         traced = Traced(graph, self.labels, bound=tuple(states))
         _ = traced.names
         return traced
+
+    def as_saved(self) -> Value:
+        """Refuse: a file holds the traced operations, never `fn`."""
+        raise DataError(
+            "Expressions holds a Python function; call .bind(states), which traces it, and save that"
+        )
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names given."""

@@ -1,0 +1,61 @@
+"""Random liftings and states for the property tests."""
+
+import casadi as ca
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.gaussian import Gaussian
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from koopmpc.lifting.thin_plate import ThinPlate
+
+NAMES = ("theta [rad]", "omega [rad/s]", "p [m]")
+
+
+def swing(x: ca.SX) -> list[ca.SX]:
+    return [x[0] * ca.cos(x[0]), ca.fmax(x[0], 0.3), ca.sqrt(1 + x[0] ** 2)]
+
+
+Recipe = tuple[type[Lifting], tuple[object, ...]]  # a class and what it is called with
+Case = tuple[list[Recipe], np.ndarray]
+
+
+def numbers(limit: float = 3.0) -> st.SearchStrategy[float]:
+    return st.floats(-limit, limit, allow_subnormal=False)
+
+
+def states(nx: int) -> st.SearchStrategy[np.ndarray]:
+    return arrays(np.float64, st.tuples(st.integers(1, 6), st.just(nx)), elements=numbers())
+
+
+def family(nx: int) -> st.SearchStrategy[Recipe]:
+    centers = arrays(np.float64, st.tuples(st.integers(1, 3), st.just(nx)), elements=numbers(), unique=True)
+    return st.one_of(
+        st.just((State, ())),
+        st.just((Constant, ())),
+        st.tuples(st.just(Monomials), st.tuples(st.integers(2, 4))),
+        st.tuples(
+            st.just(Fourier), st.tuples(st.integers(1, 3), st.sampled_from([None, 0, NAMES[0], "theta"]))
+        ),
+        st.tuples(st.just(ThinPlate), st.tuples(centers)),
+        st.tuples(st.just(Gaussian), st.tuples(centers, st.floats(0.1, 3))),
+        st.just((Expressions, (swing, ("theta*cos(theta)", "ramp", "root")))),
+    )
+
+
+def cases() -> st.SearchStrategy[Case]:
+    """Recipes, not liftings: the type hook draws random numbers, which a strategy must not."""
+    return st.integers(1, 3).flatmap(
+        lambda nx: st.tuples(st.lists(family(nx), min_size=1, max_size=4), states(nx))
+    )
+
+
+def made(case: Case) -> tuple[Lifting, np.ndarray]:
+    recipes, X = case
+    parts = [kind(*arguments) for kind, arguments in recipes]
+    return sum(parts[1:], start=parts[0]).bind(NAMES[: X.shape[1]]), X
