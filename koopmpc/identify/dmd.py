@@ -23,8 +23,8 @@ def dmd(episodes: Episodes, *, rank: int | None = None) -> LinearPredictor:
     episodes
         Snapshots; no pair spans two episodes.
     rank
-        Keep r singular vectors: z = U_rᵀ x, A = Ã (r, r), C = U_r, exact modes X′ V Σ⁻¹ W. By default singular
-        values below eps · max(M, nx) of the largest are cut, and A is (nx, nx).
+        Keep r singular vectors: z = U_rᵀ x, A = Ã (r, r), C = U_r, exact modes X′ V Σ⁻¹ W. By default
+        singular values below eps · max(M, nx) of the largest are cut, and A is (nx, nx).
 
     Raises
     ------

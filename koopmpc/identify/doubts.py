@@ -40,15 +40,15 @@ def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, reg
     if rows.samples < nz + nu:
         if not regular:
             found.append(
-                f"rank-deficient: {rows.samples} snapshot pairs cannot determine {nz + nu} coefficients a row; "
-                "the minimum-norm solution is taken; collect more, or lift to fewer observables"
+                f"rank-deficient: {rows.samples} snapshot pairs cannot determine {nz + nu} coefficients "
+                "a row; the minimum-norm solution is taken; collect more, or lift to fewer observables"
             )
         return found
     if rank == len(live):
         if condition > _ILL_CONDITIONED and not regular:
             found.append(
-                f"ill-conditioned: the observables have condition number {condition:.1e} on unit-norm columns; "
-                "pass a ridge, or drop observables that are almost functions of others"
+                f"ill-conditioned: the observables have condition number {condition:.1e} on unit-norm "
+                "columns; pass a ridge, or drop observables that are almost functions of others"
             )
         return found
     rank_z, rank_u = scaled_rank(rows, Z)[0], scaled_rank(rows, U)[0]
@@ -58,14 +58,14 @@ def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, reg
     ):
         if own < P.shape[1] and not (regular and what == "observables"):
             found.append(
-                f"rank-deficient: {P.shape[1] - own} of {P.shape[1]} {what} are linear functions of others on these "
-                f"data ({_dependent(P, own, [names[j] for j in part])}); the minimum-norm solution is taken; "
-                "drop them, or collect richer data"
+                f"rank-deficient: {P.shape[1] - own} of {P.shape[1]} {what} are linear functions of others "
+                f"on these data ({_dependent(P, own, [names[int(j)] for j in part])}); the minimum-norm solution "
+                "is taken; drop them, or collect richer data"
             )
     if rank < rank_z + rank_u:
         found.append(
-            "feedback made A and B inseparable: on these data inputs are linear functions of ψ(x) (rank [Z U] = "
-            f"{rank}, rank Z + rank U = {rank_z + rank_u}); the minimum-norm split is taken; "
+            "feedback made A and B inseparable: on these data inputs are linear functions of ψ(x) "
+            f"(rank [Z U] = {rank}, rank Z + rank U = {rank_z + rank_u}); the minimum-norm split is taken; "
             "add noise to the input, or pass a known B to dmdc"
         )
     return found
@@ -73,12 +73,13 @@ def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, reg
 
 def _dependent(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:
     """Return for the columns beyond `rank` which others they depend on."""
-    R, order = qr(unit(P), mode="r", pivoting=True)
+    R, pivots = qr(unit(P), mode="r", pivoting=True)
+    sorted_names = [names[int(j)] for j in pivots]
     weights = np.abs(solve_triangular(R[:rank, :rank], R[:rank, rank:]))
     said: list[str] = []
-    for j, column in zip(order[rank : rank + _NAMED], weights.T, strict=False):
-        sources = [names[order[i]] for i in np.argsort(-column, kind="stable") if column[i] > 1e-6]
-        said.append(f"{names[j]!r} of {_listed(sources)}")
+    for name, column in zip(sorted_names[rank : rank + _NAMED], weights.T, strict=False):
+        sources = [sorted_names[int(i)] for i in np.argsort(-column, kind="stable") if column[i] > 1e-6]
+        said.append(f"{name!r} of {_listed(sources)}")
     return ", ".join(said) + (", …" if P.shape[1] - rank > _NAMED else "")
 
 

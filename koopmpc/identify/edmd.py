@@ -16,8 +16,8 @@ def edmd(
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u by least squares on M snapshot pairs, with inputs where the data have them.
 
-    Nothing is added to the lifting: no state, no constant. C picks the states where the lifting holds them, by
-    name, else it is the least-squares fit of x by ψ(x), its residual in ``report.state_residual``.
+    Nothing is added to the lifting: no state, no constant. C picks the states where the lifting holds them,
+    by name, else it is the least-squares fit of x by ψ(x), its residual in ``report.state_residual``.
 
     Parameters
     ----------
@@ -26,8 +26,8 @@ def edmd(
     lifting
         ψ: R^nx → R^nz.
     ridge
-        Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz) of the largest, on
-        unit-norm columns, are cut; the report's route says so.
+        Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz + nu) of the
+        largest, on unit-norm columns, are cut; the report's route says so.
     rank
         With rank=r the columns are unscaled, and the predictor is reduced to z = U_rᵀ ψ(x), A = Ã (r, r),
         C = C U_r, with the exact modes X′ V Σ⁻¹ W. A truncated SVD depends on the units of the data.
@@ -44,8 +44,8 @@ def edmd(
 
     References
     ----------
-    Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci. 25,
-    2015; with inputs: Korda & Mezić, Automatica 93, 2018.
+    Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
+    25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018.
     """
     total = moments(episodes, lifting)
     return fit(regression(total, "edmd"), ridge=ridge, rank=rank)
@@ -84,5 +84,5 @@ def _decoder(
         rows = total.rows(np.arange(nz), where[~held])
         K = solve(rows).K
         C[~held] = K.T
-        residual[~held] = rows.residual(np.arange(K.shape[1]), K)
+        residual[~held] = rows.residual(np.arange(len(rows.rest)), K)
     return C, residual

@@ -27,8 +27,8 @@ _PANEL = 16  # columns that dtpqrt eliminates at once
 class Moments(Value):
     """Second moments of the rows d = [ψ(x) u ψ(x⁺)] of M snapshot pairs: G = Σ dᵀd, or R with RᵀR = Σ dᵀd.
 
-    They add: ``a + b`` are the moments of both data sets, in any grouping, to rounding. Where ψ lacks a state,
-    the state is appended to it in these rows, so that C and the residuals need no second pass.
+    They add: ``a + b`` are the moments of both data sets, in any grouping, to rounding. Where ψ lacks a
+    state, the state is appended to it in these rows, so that C and the residuals need no second pass.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Moments(Value):
     samples
         M.
     route
-        "gram" for raw sums of products, "qr" for the triangular factor: twice the digits at six times the cost.
+        "gram" for raw sums of products, "qr" for the triangular factor: twice the digits, six times the cost.
     sums
         G or R, (nd, nd).
     """
@@ -107,7 +107,7 @@ class Moments(Value):
         """Return a few rows [P T] with the same second moments as these columns of all M rows."""
         n = len(regressors)
         if self.route == "qr":
-            R = np.linalg.qr(self.sums[:, np.concatenate([regressors, targets])], mode="r")
+            R = _triangle(self.sums[:, np.concatenate([regressors, targets])])
             return Rows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
         G = self.sums
         size = np.sqrt(G.diagonal()[regressors])
@@ -117,8 +117,8 @@ class Moments(Value):
         held = values > np.finfo(float).eps * max(self.samples, n) * values.max(initial=0.0)
         root = np.sqrt(np.where(held, values, 0.0))
         P = root[:, None] * vectors.T * size
-        T = vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None])
-        T = np.where(held[:, None], T, 0.0) / np.where(held, root, 1.0)[:, None]
+        inverse = np.where(held, 1.0, 0.0) / np.where(held, root, 1.0)
+        T = inverse[:, None] * (vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None]))
         rest = np.maximum(G.diagonal()[targets] - np.sum(T**2, axis=0), 0.0)
         return Rows(P, T, rest, self.samples)
 
@@ -129,9 +129,9 @@ class Moments(Value):
 def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None) -> Moments:
     """Return Σ dᵀd, or its triangular factor, over the rows d = [ψ(x) u ψ(x⁺)] of all snapshot pairs.
 
-    Chunks of fixed size are lifted, added in order and forgotten: memory does not grow with the data, and one
-    BLAS build and thread count gives one result to the bit. Data too large for memory, or a stream, are fed part
-    by part and added: ``moments(part, lifting, route="qr") + …``.
+    Chunks of fixed size are lifted, added in order and forgotten: memory does not grow with the data, and
+    one BLAS build and thread count gives one result to the bit. Data too large for memory, or a stream, are
+    fed part by part and added: ``moments(part, lifting, route="qr") + …``.
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None)
     lifting
         ψ; it is bound to the episodes' states.
     route
-        "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a pilot
-        of sampled chunks chooses: Gram up to 1e6, else QR; if the whole turns out worse, it is read again.
+        "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a
+        pilot of sampled chunks chooses: Gram up to 1e6, else QR; if the whole is worse, it is read again.
 
     Raises
     ------
@@ -180,6 +180,10 @@ def _absorbed(R: Float[np.ndarray, "nd nd"], rows: Float[np.ndarray, "m nd"]) ->
     result, _, _, info = dtpqrt(0, min(_PANEL, len(R)), R, rows)
     assert info == 0, f"dtpqrt refused argument {-info}"
     return np.ascontiguousarray(np.triu(result))
+
+
+def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
+    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
 
 
 def _require_finite(size: Float[np.ndarray, " nd"], full: Lifting, inputs: tuple[str, ...]) -> None:

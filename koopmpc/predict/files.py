@@ -3,7 +3,7 @@
 import json
 import zipfile
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -34,15 +34,15 @@ def load_value(path: str | Path, kind: type[V]) -> V:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        tree = json.loads(arrays.pop("tree").tobytes().decode())
-        known = isinstance(tree, dict) and tree.get("format") == _FORMAT
+        tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
     except FileNotFoundError as error:
         raise LogError(f"{path} does not exist") from error
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, UnicodeDecodeError) as error:
         raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}") from error
-    if not known:
+    node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
+    if node.get("format") != _FORMAT:
         raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")
-    value = from_data(tree["value"], arrays)
+    value = from_data(node.get("value"), arrays)
     if not isinstance(value, kind):
         raise LogError(f"{path} holds a {type(value).__name__}, not a {kind.__name__}")
     return value

@@ -10,7 +10,7 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.projected import Projected
@@ -78,7 +78,8 @@ class LinearPredictor(Value):
         A = checks.array(self.A, "A")
         if A.shape != (nz, nz):
             raise ShapeError(
-                f"A has shape {A.shape}, but the lifting returns {nz} observables; pass the lifting used in the fit"
+                f"A has shape {A.shape}, but the lifting returns {nz} observables; "
+                "pass the lifting used in the fit"
             )
         set_(self, "A", A)
         set_(self, "B", checks.array(self.B, "B", (nz, nu)))
@@ -140,7 +141,7 @@ class LinearPredictor(Value):
 
     @cached_property
     def modes(self) -> Complex[np.ndarray, "nx nz"]:
-        """Koopman modes in the state's coordinates, one a column: the exact DMD modes, or C times A's eigenvectors."""
+        """Modes in the state's coordinates, one a column: exact DMD modes, or C times A's eigenvectors."""
         if self.exact_modes is None or not isinstance(self.lifting, Projected):
             return self.C @ self._eigen[1]
         whole = self.lifting.lifting
@@ -149,13 +150,38 @@ class LinearPredictor(Value):
             return self.exact_modes[[place[name] for name in self.states]]
         return self.C @ (self.lifting.basis.T @ self.exact_modes)
 
-    def eigenfunctions(self, X: ArrayLike) -> Complex[np.ndarray, "M nz"]:
-        """Return φ_j(x) = ξ_jᴴ ψ(x) with ξ_jᴴ A = λ_j ξ_jᴴ at rows of states: φ_j(x⁺) = λ_j φ_j(x) without input.
+    @property
+    def eigenvectors(self) -> Complex[np.ndarray, "nz nz"]:
+        """Right eigenvectors v_j of A, one a column, of length 1, in the order of `eigenvalues`."""
+        return self._eigen[1]
 
-        The order is that of `eigenvalues`; each is scaled so that ξ_jᴴ v_j = 1 with the right eigenvector v_j.
+    @cached_property
+    def left_eigenvectors(self) -> Complex[np.ndarray, "nz nz"]:
+        """Left eigenvectors ξ_jᴴ of A, one a row: ξ_jᴴ A = λ_j ξ_jᴴ, scaled so that ξ_jᴴ v_j = 1.
+
+        Raises
+        ------
+        DataError
+            A is defective: its eigenvectors do not span the lifted space.
+        """
+        try:
+            return np.linalg.inv(self._eigen[1])
+        except np.linalg.LinAlgError as error:
+            raise DataError(
+                "A is defective: its eigenvectors do not span the lifted space, so it has no complete set of "
+                "eigenfunctions; perturb A or lift to other observables"
+            ) from error
+
+    def eigenfunctions(self, X: ArrayLike) -> Complex[np.ndarray, "M nz"]:
+        """Return φ_j(x) = ξ_jᴴ ψ(x) at rows of states (M, nx): φ_j(x⁺) = λ_j φ_j(x) without input.
+
+        Raises
+        ------
+        DataError
+            A is defective.
         """
         Z = self.lifting(checks.array(X, "X", (None, self.nx)))
-        return np.linalg.solve(self._eigen[1], Z.T.astype(complex)).T
+        return Z @ self.left_eigenvectors.T
 
     @cached_property
     def _eigen(self) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
@@ -184,9 +210,10 @@ def eigen(
     A: Float[np.ndarray, "nz nz"],
 ) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
     """Return eigenvalues of A, the largest magnitude first, and its right eigenvectors, one a column."""
-    values, vectors = np.linalg.eig(A)
-    order = np.lexsort((values.imag, -np.abs(values)))
-    return values[order].astype(complex), vectors[:, order].astype(complex)
+    result = np.linalg.eig(A)
+    values, vectors = np.asarray(result.eigenvalues, complex), np.asarray(result.eigenvectors, complex)
+    order = np.lexsort((np.imag(values), -np.abs(values)))
+    return values[order], vectors[:, order]
 
 
 def load_predictor(path: str | Path) -> LinearPredictor:

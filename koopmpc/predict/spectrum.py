@@ -1,0 +1,126 @@
+"""What the spectrum of a predictor says: Ω = log Λ / dt, b = Φ⁺ψ(x₀), x(t) = Re Φ exp(Ωt) b, φ(x⁺) = λ φ(x).
+
+References
+----------
+Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. Dyn. 1, 2014; Snyder & Song,
+"Koopman operator theory for nonlinear dynamic modeling using dynamic mode decomposition", 2021.
+"""
+
+import numpy as np
+from jaxtyping import Complex, Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.projected import Projected
+from koopmpc.predict.linear import LinearPredictor
+
+_ROWS = 4096  # states whose eigenfunctions are held at once
+
+
+def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " nz"]:
+    """Return ω = log(λ) / dt [rad/s], principal branch, in the order of ``predictor.eigenvalues``.
+
+    λ = 0 gives −∞; a frequency beyond π/dt is folded back.
+    """
+    with np.errstate(divide="ignore"):
+        return np.log(predictor.eigenvalues) / predictor.dt
+
+
+def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, " nz"]:
+    """Return b = Φ⁺ ψ(x), the share of each mode in the state x.
+
+    Φ holds the modes in the lifted coordinates, one a column: the exact modes of a rank-truncated fit, else
+    the eigenvectors of A.
+
+    Parameters
+    ----------
+    predictor
+        Its `modes` are the state's rows of Φ.
+    x
+        (nx,)
+    """
+    state = checks.array(x, "x", (predictor.nx,))
+    modes, lifting = _lifted_modes(predictor)
+    z = lifting(state).astype(complex)
+    return np.linalg.lstsq(modes, z, rcond=None)[0]
+
+
+def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> Float[np.ndarray, "steps nx"]:
+    """Return x(t) = Re Φ exp(Ωt) b, b = Φ⁺ ψ(x0): the free motion at any times, without input.
+
+    Parameters
+    ----------
+    predictor
+        Its inputs are taken as 0.
+    x0
+        (nx,), the state at t = 0.
+    times
+        (steps,) [s].
+    """
+    t = checks.array(times, "times", (None,))
+    b = amplitudes(predictor, x0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # exp(Ωt) = λ^(t/dt) on the principal branch, and 0^0 = 1
+        growth = np.power(predictor.eigenvalues, t[:, None] / predictor.dt)
+    return np.real((growth * b) @ predictor.modes.T).astype(np.float64)
+
+
+def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.ndarray, " nz"]:
+    """Return ‖φ(x⁺) − λ φ(x) − ξᴴB u‖ / ‖φ(x)‖ for each eigenfunction: 0 where it evolves linearly.
+
+    The norm runs over all snapshot pairs; the order is that of ``predictor.eigenvalues``.
+
+    Parameters
+    ----------
+    predictor
+        φ = ξᴴ ψ with ξᴴ A = λ ξᴴ.
+    episodes
+        Data of the same states and inputs, best not those of the fit.
+
+    Raises
+    ------
+    ShapeError
+        The data have other states or inputs.
+    DataError
+        They have another dt, an eigenfunction is 0 on all of them, or A is defective.
+    """
+    same_names(predictor, episodes)
+    forced = predictor.left_eigenvectors @ predictor.B
+    error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
+    for episode in episodes:
+        for first in range(0, len(episode), _ROWS):
+            phi = predictor.eigenfunctions(episode.X[first : first + _ROWS + 1])
+            gap = phi[1:] - phi[:-1] * predictor.eigenvalues - episode.U[first : first + _ROWS] @ forced.T
+            error += np.sum(np.abs(gap) ** 2, axis=0)
+            size += np.sum(np.abs(phi[:-1]) ** 2, axis=0)
+    if (size == 0).any():
+        raise DataError(
+            f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it"
+        )
+    return np.sqrt(error / size)
+
+
+def same_names(predictor: LinearPredictor, episodes: Episodes) -> None:
+    """Raise where data and predictor differ in states, inputs or dt."""
+    for mine, theirs, what in (
+        (predictor.states, episodes.states, "states"),
+        (predictor.inputs, episodes.inputs, "inputs"),
+    ):
+        if mine != theirs:
+            raise ShapeError(
+                f"the episodes have {what} ({', '.join(theirs)}), the predictor has ({', '.join(mine)}); "
+                "pass data of the same plant"
+            )
+    if episodes.dt != predictor.dt:
+        raise DataError(
+            f"the episodes have dt {episodes.dt:g} s, the predictor {predictor.dt:g} s; resample one of them"
+        )
+
+
+def _lifted_modes(predictor: LinearPredictor) -> tuple[Complex[np.ndarray, "nl nz"], Lifting]:
+    if predictor.exact_modes is not None and isinstance(predictor.lifting, Projected):
+        return predictor.exact_modes, predictor.lifting.lifting
+    return predictor.eigenvectors, predictor.lifting
