@@ -171,7 +171,7 @@ class Chirp(OpenLoop):
                 f"a chirp up to {max(self.f0, self.f1):g} Hz needs dt below "
                 f"{0.5 / max(self.f0, self.f1):g} s, dt is {dt:g} s; lower the frequency"
             )
-        t = np.mod(dt * np.arange(steps), self.duration)
+        t = dt * (np.arange(steps) % max(round(self.duration / dt), 1))
         wave = np.sin(2 * np.pi * (self.f0 * t + (self.f1 - self.f0) * t**2 / (2 * self.duration)))
         return self.offset + self.amplitude * wave[:, None]
 

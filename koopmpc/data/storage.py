@@ -60,7 +60,8 @@ def _read(file: Path) -> Episodes:
 
 
 def _read_npz(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
-    with np.load(file, allow_pickle=False) as held:
+    # Opened here, for numpy leaves a file that it refuses open.
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
         return held["X"], held["U"], held["steps"], str(held["about"])
 
 

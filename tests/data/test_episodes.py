@@ -1,0 +1,155 @@
+"""Episodes keep runs apart: nothing is paired or split across them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, KoopmpcError, ShapeError
+from koopmpc.values import from_data, to_data
+
+LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=8)
+
+
+def numbered(lengths: list[int], nu: int = 2) -> Episodes:
+    """Episodes whose entries say where they stand: x_k = (episode, k), u_k = (episode, k, …)[:nu]."""
+    runs = [
+        Episode(
+            X=[(e, k) for k in range(steps + 1)],
+            U=np.array([(e, k, -k) for k in range(steps)], dtype=float)[:, :nu],
+        )
+        for e, steps in enumerate(lengths)
+    ]
+    return Episodes(runs, dt=0.1, states=["e", "k"])
+
+
+@given(LENGTHS, st.integers(0, 3))
+def test_snapshots_are_what_a_plain_loop_finds(lengths: list[int], nu: int) -> None:
+    data = numbered(lengths, nu)
+    rows = [(run.X[k], run.U[k], run.X[k + 1]) for run in data.episodes for k in range(len(run.X) - 1)]
+    pairs = data.snapshots()
+    assert len(pairs) == sum(lengths) == len(rows)
+    assert pairs.U.shape == (len(rows), nu)
+    for (x, u, x_next), X, U, X_next in zip(rows, pairs.X, pairs.U, pairs.X_next, strict=True):
+        assert np.array_equal(x, X)
+        assert np.array_equal(u, U)
+        assert np.array_equal(x_next, X_next)
+
+
+@given(LENGTHS)
+def test_no_snapshot_crosses_from_one_episode_to_the_next(lengths: list[int]) -> None:
+    pairs = numbered(lengths).snapshots()
+    assert (pairs.X[:, 0] == pairs.X_next[:, 0]).all()
+    assert (pairs.X[:, 0] == pairs.U[:, 0]).all()
+    assert (pairs.X[:, 1] + 1 == pairs.X_next[:, 1]).all()
+    assert (pairs.X[:, 1] == pairs.U[:, 1]).all()
+
+
+@given(st.lists(st.integers(1, 4), min_size=2, max_size=12), st.floats(0, 1), st.integers(0, 99))
+def test_a_split_deals_out_whole_episodes(lengths: list[int], fraction: float, seed: int) -> None:
+    data = numbered(lengths)
+    if not 0 < round(fraction * len(data)) < len(data):
+        with pytest.raises(DataError, match=f"a split of {len(data)} episodes at fraction .* at least one"):
+            data.split(fraction, seed)
+        return
+    train, held_out = data.split(fraction, seed)
+    sides = [[int(run.X[0, 0]) for run in side] for side in (train, held_out)]
+    assert sorted(sides[0] + sides[1]) == list(range(len(data)))
+    assert len(train) == round(fraction * len(data))
+    assert all(
+        run == data[e]
+        for side, side_e in zip((train, held_out), sides, strict=True)
+        for run, e in zip(side, side_e, strict=True)
+    )
+    assert data.split(fraction, seed) == (train, held_out)
+    assert (train.dt, train.states, train.inputs) == (data.dt, data.states, data.inputs)
+
+
+def test_another_seed_splits_otherwise() -> None:
+    data = numbered([1] * 30)
+    assert data.split(0.5, 1)[0] != data.split(0.5, 2)[0]
+
+
+@given(LENGTHS, LENGTHS)
+def test_joining_and_slicing_undo_each_other(first: list[int], second: list[int]) -> None:
+    a, b = numbered(first), numbered(second)
+    both = a + b
+    assert both[: len(a)] == a
+    assert both[len(a) :] == b
+    assert list(both) == [*a, *b]
+
+
+def test_names_count_up_by_default() -> None:
+    data = Episodes([Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], dt=0.1)
+    assert (data.states, data.inputs, data.nx, data.nu) == (("x0", "x1"), ("u0",), 2, 1)
+
+
+def test_autonomous_data_has_no_inputs() -> None:
+    run = Episode(X=np.zeros((4, 2)))
+    assert run.U.shape == (3, 0)
+    assert len(run) == 3
+    assert Episodes([run], 0.1).inputs == ()
+
+
+def test_episodes_own_their_arrays_and_are_values() -> None:
+    X, U = np.arange(6.0).reshape(3, 2), np.zeros((2, 1))
+    data = Episodes([Episode(X=X, U=U)], dt=0.1)
+    X[:] = 7
+    assert data[0].X[0, 0] == 0
+    assert from_data(to_data(data)) == data
+
+
+def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> Episode:
+    return Episode(X=np.zeros((rows, nx)), U=np.zeros((moves, nu)))
+
+
+@pytest.mark.parametrize(
+    ("act", "kind", "text"),
+    [
+        (
+            lambda: zeros(5, 5),
+            ShapeError,
+            "U has 5 rows and X 5: X must have one row more than U; x_0 … x_T, u_0 … u_{T-1}",
+        ),
+        (lambda: zeros(3, 5), ShapeError, "U has 5 rows and X 3: X must have one row more"),
+        (lambda: Episode(X=np.zeros((0, 2))), ShapeError, "X has no row; an episode holds x_0 at least"),
+        (lambda: Episode(X=[1.0, 2.0]), ShapeError, r"X has shape \(2,\), expected \(any, any\)"),
+        (lambda: Episode(X=[[1.0], [np.nan]]), DataError, r"X holds 1 NaN or inf, the first at \(1, 0\); remove"),
+        (lambda: Episode(X=[[1.0], [2.0]], U=[[np.inf]]), DataError, "U holds 1 NaN or inf"),
+        (lambda: Episodes([], 0.1), DataError, "there is no episode; pass at least one"),
+        (
+            lambda: Episodes([zeros(4, 3), zeros(1, 0)], 0.1),
+            DataError,
+            "episode 1 is too short: X has 1 row and so no step; an episode needs at least 2 rows, drop it",
+        ),
+        (
+            lambda: Episodes([zeros(4, 3), zeros(4, 3, nx=3)], 0.1),
+            ShapeError,
+            "episode 1 has 3 states and 1 inputs, episode 0 has 2 and 1; episodes of one set come from one plant",
+        ),
+        (lambda: Episodes([zeros(4, 3)], -0.1), DataError, "dt is -0.1 s; it must be above zero"),
+        (lambda: Episodes([zeros(4, 3)], 0.1, states=["a"]), ShapeError, "states has 1 names and the data 2 columns"),
+        (lambda: Episodes([zeros(4, 3)], 0.1, inputs="u"), DataError, "inputs is 'u'; pass a tuple of names"),
+        (
+            lambda: Episodes([zeros(4, 3)], 0.1, states=["a", "b"], inputs=["a"]),
+            DataError,
+            "two states or inputs are named 'a'; rename one",
+        ),
+        (
+            lambda: Episodes([zeros(4, 3)], 0.1) + Episodes([zeros(4, 3)], 0.2),
+            DataError,
+            "the episodes have unequal dt: 0.1 s and 0.2 s; resample one of them",
+        ),
+        (
+            lambda: Episodes([zeros(4, 3)], 0.1) + Episodes([zeros(4, 3)], 0.1, states=["a", "b"]),
+            DataError,
+            "the episodes differ in states: x0, x1 and a, b; rename one",
+        ),
+    ],
+)  # fmt: skip
+def test_messages(act: Callable[[], object], kind: type[KoopmpcError], text: str) -> None:
+    with pytest.raises(kind, match=text):
+        act()

@@ -1,0 +1,135 @@
+"""Files give back what was saved, to the bit, and refuse what they cannot read."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.storage import load_episodes
+from koopmpc.errors import DataError, LogError
+
+SUFFIXES = (".npz", ".parquet")
+
+
+def random_episodes(lengths: list[int], nx: int, nu: int, seed: int, dt: float = 0.05) -> Episodes:
+    """Any finite float64, subnormal and negative zero too: random bits."""
+    rng = np.random.default_rng(seed)
+
+    def floats(*shape: int) -> np.ndarray:
+        values = rng.integers(0, 2**64, shape, dtype=np.uint64).view(np.float64)
+        return np.where(np.isfinite(values), values, -0.0)
+
+    runs = [Episode(X=floats(steps + 1, nx), U=floats(steps, nu)) for steps in lengths]
+    return Episodes(runs, dt, [f"x{i} [m/s²]" for i in range(nx)], [f"u{i} [N m]" for i in range(nu)])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    lengths=st.lists(st.integers(1, 5), min_size=1, max_size=5),
+    nx=st.integers(1, 3),
+    nu=st.integers(0, 2),
+    seed=st.integers(0, 2**32 - 1),
+    dt=st.floats(1e-9, 1e3),
+)
+def test_round_trip(
+    tmp_path: Path, suffix: str, lengths: list[int], nx: int, nu: int, seed: int, dt: float
+) -> None:
+    data = random_episodes(lengths, nx, nu, seed, dt)
+    data.save(tmp_path / f"data{suffix}")
+    assert load_episodes(tmp_path / f"data{suffix}") == data
+
+
+def test_several_files_are_one_set(tmp_path: Path) -> None:
+    data = random_episodes([2, 3, 1], 2, 1, 0)
+    data[:1].save(tmp_path / "a.npz")
+    data[1:].save(str(tmp_path / "b.parquet"))
+    assert load_episodes(tmp_path / "a.npz", tmp_path / "b.parquet") == data
+
+
+def test_files_of_unequal_dt_are_refused(tmp_path: Path) -> None:
+    for name, dt in (("a.npz", 0.05), ("b.npz", 0.1)):
+        random_episodes([2], 2, 1, 0, dt).save(tmp_path / name)
+    with pytest.raises(DataError, match=r"unequal dt: 0.05 s and 0.1 s; resample"):
+        load_episodes(tmp_path / "a.npz", tmp_path / "b.npz")
+
+
+def test_a_parquet_file_is_a_table_for_other_tools(tmp_path: Path) -> None:
+    data = random_episodes([2, 1], 1, 1, 3)
+    data.save(tmp_path / "data.parquet")
+    table = pq.read_table(tmp_path / "data.parquet")
+    assert table.column_names == ["episode", "step", "x0 [m/s²]", "u0 [N m]"]
+    assert table["episode"].to_pylist() == [0, 0, 0, 1, 1]
+    assert table["step"].to_pylist() == [0, 1, 2, 0, 1]
+    assert table["x0 [m/s²]"].to_pylist() == [x for run in data for x in run.X[:, 0].tolist()]
+    assert table["u0 [N m]"].to_pylist() == [u for run in data for u in [*run.U[:, 0].tolist(), None]]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_cut_file_is_refused(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"data{suffix}"
+    random_episodes([5, 5], 2, 1, 0).save(file)
+    whole = file.read_bytes()
+    for kept in range(0, len(whole), max(1, len(whole) // 40)):
+        file.write_bytes(whole[:kept])
+        with pytest.raises(LogError, match=f"data{suffix} holds no episodes that can be read"):
+            load_episodes(file)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_no_file_of_episodes_is_refused(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"data{suffix}"
+    with pytest.raises(LogError, match="is not there; check the path"):
+        load_episodes(file)
+    file.write_text("theta, omega\n1, 2\n")
+    with pytest.raises(LogError, match=r"pass a file that Episodes.save wrote"):
+        load_episodes(file)
+
+
+def test_foreign_contents_are_refused(tmp_path: Path) -> None:
+    table, stale = tmp_path / "table.parquet", tmp_path / "rows.parquet"
+    pq.write_table(pa.table({"episode": [0, 0], "step": [0, 1], "x": [0.0, 1.0]}), table)
+    with pytest.raises(LogError, match="the table does not say dt, states and inputs"):
+        load_episodes(table)
+    random_episodes([3, 2], 1, 1, 0).save(stale)
+    held = pq.read_table(stale)
+    pq.write_table(held.take([0, 1, 3, 4, 5, 6]), stale)
+    with pytest.raises(LogError, match="rows are missing or out of order"):
+        load_episodes(stale)
+    np.savez(tmp_path / "other.npz", X=np.zeros((3, 1)))
+    with pytest.raises(LogError, match="U is not a file in the archive"):
+        load_episodes(tmp_path / "other.npz")
+
+
+def test_no_pickle_is_opened(tmp_path: Path) -> None:
+    np.savez(tmp_path / "evil.npz", X=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(LogError, match="allow_pickle=False"):
+        load_episodes(tmp_path / "evil.npz")
+
+
+def test_a_file_with_nan_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "data.npz"
+    random_episodes([2], 1, 1, 0).save(file)
+    with np.load(file) as held:
+        arrays = dict(held)
+    arrays["X"][1] = np.nan
+    np.savez(file, **arrays)
+    with pytest.raises(LogError, match="X holds 1 NaN or inf"):
+        load_episodes(file)
+
+
+def test_other_suffixes_and_taken_names_are_refused(tmp_path: Path) -> None:
+    data = random_episodes([2], 1, 1, 0)
+    for act in (lambda: data.save(tmp_path / "data.csv"), lambda: load_episodes(tmp_path / "data.csv")):
+        with pytest.raises(DataError, match=r"in .npz or .parquet files, not in 'data.csv'; rename it"):
+            act()
+    taken = Episodes(data.episodes, data.dt, states=["step"])
+    with pytest.raises(DataError, match=r"has a column 'step' of its own; rename the state, or save as .npz"):
+        taken.save(tmp_path / "data.parquet")
+    taken.save(tmp_path / "data.npz")
+    assert load_episodes(tmp_path / "data.npz") == taken
