@@ -1,0 +1,1 @@
+"""Problems, the sweep over controllers, the table."""

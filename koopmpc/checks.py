@@ -1,0 +1,145 @@
+"""The one place that words messages about shapes, dtypes, NaN and definiteness."""
+
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc.errors import DataError, DefinitenessError, ShapeError
+
+
+def array(
+    value: ArrayLike,
+    name: str,
+    shape: Sequence[int | None] | None = None,
+    *,
+    finite: bool = True,
+    infinite: bool = False,
+) -> Float[np.ndarray, "..."]:
+    """Return `value` as a new float64, C-contiguous array of the stated shape.
+
+    Parameters
+    ----------
+    value
+        Scalar, list or array.
+    name
+        What the user calls it; it opens every message.
+    shape
+        Expected shape; ``None`` in a place accepts any length there. ``None`` for the whole accepts any shape.
+    finite
+        Refuse NaN and infinities.
+    infinite
+        Accept ±inf (limits have them), but never NaN.
+
+    Raises
+    ------
+    ShapeError
+        The shape differs.
+    DataError
+        The value is no array of real numbers, or holds NaN or inf.
+    """
+    try:
+        raw = np.asarray(value)
+        if np.iscomplexobj(raw):
+            raise DataError(f"{name} is complex; pass real numbers")
+        result = np.array(raw, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(
+            f"{name} is not an array of numbers: got {type(value).__name__}, {error}; pass numbers of one shape"
+        ) from error
+    if shape is not None:
+        fits = len(shape) == result.ndim and all(
+            n is None or n == m for n, m in zip(shape, result.shape, strict=True)
+        )
+        if not fits:
+            raise ShapeError(f"{name} has shape {result.shape}, expected {_written(shape)}")
+    if finite and not np.isfinite(result).all():
+        if not infinite:
+            bad = np.argwhere(~np.isfinite(result))
+            where = tuple(int(i) for i in bad[0])
+            raise DataError(
+                f"{name} holds {len(bad)} NaN or inf, the first at {where}; remove or repair them first"
+            )
+        if np.isnan(result).any():
+            raise DataError(f"{name} holds NaN; use ±inf where there is no limit")
+    return result
+
+
+def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) -> Float[np.ndarray, " n"]:
+    """Return `value` as a vector of `length`; a scalar is repeated."""
+    result = array(value, name, infinite=infinite)
+    if result.ndim == 0:
+        return np.full(length, float(result))
+    if result.shape != (length,):
+        raise ShapeError(f"{name} has shape {result.shape}, expected ({length},) or a scalar")
+    return result
+
+
+def weight(
+    value: ArrayLike, name: str, size: int | None = None, *, definite: bool = False
+) -> Float[np.ndarray, "n n"]:
+    """Return a symmetric positive (semi)definite matrix; a scalar or a 1-D `value` is a diagonal."""
+    result = array(value, name)
+    if result.ndim == 0:
+        result = float(result) * np.eye(1 if size is None else size)
+    elif result.ndim == 1:
+        result = np.diag(result)
+    if result.ndim != 2 or result.shape[0] != result.shape[1]:
+        raise ShapeError(f"{name} has shape {result.shape}, expected a square matrix or its diagonal")
+    if size is not None and result.shape[0] != size:
+        raise ShapeError(f"{name} has shape {result.shape}, expected ({size}, {size}) or its diagonal")
+    scale = float(np.abs(result).max(initial=0.0))
+    if float(np.abs(result - result.T).max(initial=0.0)) > 1e-9 * max(scale, 1e-300):
+        raise DefinitenessError(f"{name} is not symmetric; pass (M + Mᵀ)/2")
+    result = 0.5 * (result + result.T)
+    smallest = float(np.linalg.eigvalsh(result).min(initial=np.inf))
+    if smallest < -1e-9 * scale:
+        raise DefinitenessError(
+            f"{name} is indefinite: its least eigenvalue is {smallest:.3g}; weights must be ⪰ 0"
+        )
+    if definite and smallest <= 0:
+        raise DefinitenessError(
+            f"{name} is not positive definite: its least eigenvalue is {smallest:.3g}; raise it"
+        )
+    return result
+
+
+def positive(value: float, name: str, unit: str = "") -> float:
+    """Return `value` as a finite float above zero."""
+    number = float(array(value, name, ()))
+    if number <= 0:
+        raise DataError(f"{name} is {number:g}{unit and ' ' + unit}; it must be above zero")
+    return number
+
+
+def count(value: int, name: str, least: int = 1) -> int:
+    """Return `value` as an int of at least `least`."""
+    if isinstance(value, bool) or not isinstance(cast(object, value), int | np.integer):
+        raise DataError(f"{name} is {value!r}; pass a whole number")
+    if value < least:
+        raise DataError(f"{name} is {value}; it must be at least {least}")
+    return int(value)
+
+
+def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:
+    """Raise where a lower limit stands above its upper one."""
+    bad = np.flatnonzero(low > high)
+    if bad.size:
+        i = int(bad[0])
+        raise DataError(
+            f"{name} limits cross at index {i}: lower {low[i]:g} is above upper {high[i]:g}; swap or widen them"
+        )
+
+
+def generator(rng: np.random.Generator | int) -> np.random.Generator:
+    """Return a Generator; an int is a seed."""
+    return rng if isinstance(rng, np.random.Generator) else np.random.default_rng(rng)
+
+
+def _written(shape: Sequence[int | None]) -> str:
+    sizes = ["any" if n is None else str(n) for n in shape]
+    return "(" + ", ".join(sizes) + (",)" if len(sizes) == 1 else ")")

@@ -1,0 +1,180 @@
+"""The command line: each command parses, calls one function, and prints."""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from koopmpc.errors import KoopmpcError
+
+if TYPE_CHECKING:
+    from koopmpc.bench.problem import Problem
+
+app = typer.Typer(
+    name="koopmpc",
+    help="From a CasADi model or from data to a constrained controller with a lifted linear predictor.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
+Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
+Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
+Controllers = Annotated[
+    list[str] | None,
+    typer.Option("--controller", "-c", help="One of the five; may be repeated. Default: all."),
+]
+
+
+@app.command("list")
+def list_() -> None:
+    """Show the problems that there are, and their cases."""
+    from koopmpc.bench.library import list_problems, load_problem
+
+    out = _console()
+    for entry in list_problems():
+        out.print(Text.assemble((entry.name, "bold"), "  ", entry.title))
+        try:
+            out.print(Text(f"  cases: {', '.join(load_problem(entry.path).cases)}"))
+        except KoopmpcError as error:
+            out.print(Text(f"  {error}", style="red"))
+
+
+@app.command()
+def run(
+    problem: Annotated[str, typer.Argument(help=_PROBLEM)],
+    controller: Controllers = None,
+    live: Live = False,
+    logs: Logs = Path("logs"),
+) -> None:
+    """Run controllers in closed loop on one problem; one log a run, and a table."""
+    from koopmpc.bench.library import load_problem
+
+    with _friendly():
+        loaded = load_problem(problem)
+        _sweep([loaded], controller, live, logs, loaded.name)
+
+
+@app.command()
+def bench(
+    problems: Annotated[
+        list[str] | None, typer.Argument(help=_PROBLEM + " Default: all shipped problems.")
+    ] = None,
+    controller: Controllers = None,
+    live: Live = False,
+    logs: Logs = Path("logs"),
+) -> None:
+    """Compare the five controllers on several problems."""
+    from koopmpc.bench.library import load_problem, shipped
+
+    with _friendly():
+        _sweep([load_problem(p) for p in problems or shipped()], controller, live, logs, "bench")
+
+
+@app.command()
+def inspect(log: Annotated[Path, typer.Argument(help="A .rrd that koopmpc wrote.")]) -> None:
+    """Recompute the metrics of a run from its log alone."""
+    from koopmpc.bench.table import figures
+    from koopmpc.loop.metrics import metrics
+    from koopmpc.recording.reader import load_run
+
+    with _friendly():
+        loaded = load_run(log)
+        out = _console()
+        out.print(
+            " ".join(
+                str(loaded.metadata[key])
+                for key in ("problem", "case", "controller")
+                if key in loaded.metadata
+            )
+        )
+        out.print(figures(metrics(loaded)))
+
+
+@app.command()
+def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
+    """Open logs in one Rerun viewer."""
+    from koopmpc.recording.viewer import view as open_viewer
+
+    with _friendly():
+        open_viewer(logs)
+
+
+def _sweep(
+    problems: Sequence["Problem"], controllers: list[str] | None, live: bool, logs: Path, what: str
+) -> None:
+    """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from koopmpc.bench.controllers import chosen
+    from koopmpc.bench.sweep import sweep
+    from koopmpc.bench.table import table
+
+    chosen(controllers)
+    folder = _new_folder(logs, what)
+    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+        rows = sweep(
+            problems,
+            controllers,
+            folder=folder,
+            live=live,
+            progress=lambda what, done, total: bar.update(
+                task, description=what, completed=done, total=total
+            ),
+        )
+    out = _console()
+    out.print(table(rows))
+    out.print(f"\nlogs and results.parquet: {folder}", highlight=False, soft_wrap=True)
+    out.print(
+        f"look at a run:  koopmpc view {next((row.log for row in rows if row.log), folder)}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if any(row.fault is not None for row in rows):
+        raise typer.Exit(1)
+
+
+def _console() -> Console:
+    """Return the console of stdout, 100 columns wide where it is no terminal."""
+    out = Console()
+    return out if out.is_terminal else Console(width=100)
+
+
+def _new_folder(logs: Path, what: str) -> Path:
+    """Make and return logs/<time>-<what>, with a number behind it where two calls share a second."""
+    stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}-{what}"
+    tries = 0
+    while True:
+        folder = logs / (stem if tries == 0 else f"{stem}-{tries}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            tries += 1
+        else:
+            return folder
+
+
+@contextmanager
+def _friendly() -> Iterator[None]:
+    """Show errors of koopmpc and warnings as one message each on stderr; exit code 2 for an error."""
+    err = Console(stderr=True)
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        err.print(Text.assemble((f"{category.__name__}: ", "yellow"), str(message)), soft_wrap=True)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        try:
+            yield
+        except KoopmpcError as error:
+            err.print(Text.assemble((f"{type(error).__name__}: ", "red"), str(error)), soft_wrap=True)
+            raise typer.Exit(2) from error

@@ -1,0 +1,1 @@
+"""LQR, Koopman MPC, nonlinear MPC."""

@@ -1,0 +1,60 @@
+"""Cost: the quadratic cost that every controller and every metric shares."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import State
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False)
+class Cost(Value):
+    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} ‖u_k − u_r‖²_R + terminal weight.
+
+    The terminal term is ‖z_N − z_r‖²_{Q_N}, or ‖x_N − r_N‖²_{Q_N} for an (nx, nx) weight.
+
+    Parameters
+    ----------
+    Q
+        Weight of the tracked outputs, ⪰ 0; a scalar or a vector is a diagonal.
+    R
+        Weight of the inputs, ⪰ 0; a scalar or a vector is a diagonal. R + BᵀPB must be positive definite.
+    Q_N
+        Terminal weight, (nx, nx) or (nz, nz). None takes the limit of the Riccati difference equation.
+    of
+        The tracked outputs as observables of the state; the references have as many columns.
+    u_target
+        "equilibrium": u_r holds the reference, found for each reference inside the limits; "zero": u_r = 0.
+
+    Raises
+    ------
+    DefinitenessError
+        A weight is indefinite or not symmetric.
+    """
+
+    Q: ArrayLike
+    R: ArrayLike
+    Q_N: ArrayLike | None = None
+    of: Lifting = field(default_factory=State)
+    u_target: Literal["equilibrium", "zero"] = "equilibrium"
+
+    def __post_init__(self) -> None:
+        for name in ("Q", "R", "Q_N"):
+            value = getattr(self, name)
+            if value is not None:
+                stored = checks.array(value, name)
+                checks.weight(stored, name)
+                object.__setattr__(self, name, stored)
+        if self.u_target not in ("equilibrium", "zero"):
+            raise DataError(f'u_target is {self.u_target!r}; pass "equilibrium" or "zero"')
+
+    def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
+        """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
+        return checks.weight(self.Q, "Q", nr), checks.weight(self.R, "R", nu)

@@ -1,0 +1,102 @@
+"""What LQR and KoopmanMPC share: a predictor's matrices, cost and targets, and ψ(x) at microseconds."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Box, Limits
+from koopmpc.control.target import Targets, targets
+from koopmpc.errors import ShapeError
+from koopmpc.lifting.base import Lifting, rows
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.state import State
+from koopmpc.plant.buffered import Buffered
+from koopmpc.predict.linear import LinearPredictor
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """A predictor under a cost and limits: tracked outputs C z, limited outputs G z, weights and targets."""
+
+    C: Float[np.ndarray, "nr nz"]
+    G: Float[np.ndarray, "ng nz"]
+    Q: Float[np.ndarray, "nr nr"]
+    R: Float[np.ndarray, "nu nu"]
+    inputs: Box
+    outputs: Box
+    targets: Targets
+
+
+def tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> Tracking:
+    """Return the matrices of `cost` and `limits` on the lifted coordinates of `predictor`.
+
+    Raises
+    ------
+    ObservableError
+        The cost or a limit is on an observable that the lifting lacks.
+    ShapeError
+        A weight or a limit has another size than what it weighs or limits.
+    """
+    C = observed(predictor, cost.of)
+    Q, R = cost.matrices(len(C), predictor.nu)
+    G, outputs = _limited(predictor, limits)
+    inputs = limits.inputs(predictor.nu)
+    found = targets(
+        predictor.A,
+        predictor.B,
+        C,
+        Q,
+        inputs,
+        G,
+        outputs,
+        _constant(predictor),
+        hold=cost.u_target == "equilibrium",
+    )
+    return Tracking(C, G, Q, R, inputs, outputs, found)
+
+
+def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr nz"]:
+    """Return the matrix that reads the observables `of` from z: the predictor's own C for the state."""
+    wanted = of.bind(predictor.states)
+    if isinstance(wanted, State):
+        return predictor.C
+    return np.eye(predictor.nz)[rows(predictor.lifting, wanted)]
+
+
+def buffered(lifting: Lifting) -> Buffered:
+    """Return ψ as a function of one state, at about a microsecond a call."""
+    x = ca.SX.sym("x", len(lifting.bound or ()))
+    return Buffered(ca.Function("psi", [x], [ca.densify(lifting.symbolic(x))], {"cse": True}))
+
+
+def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int) -> Float[np.ndarray, "N1 nr"]:
+    """Return N + 1 rows of a reference (nr,) that is held or (M, nr) whose last row is repeated."""
+    R = checks.array(reference, "reference", finite=False)
+    if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
+        raise ShapeError(
+            f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{N}"
+        )
+    R = R.reshape(-1, nr)
+    return np.ascontiguousarray(R[np.minimum(np.arange(N + 1), len(R) - 1)])
+
+
+def _constant(predictor: LinearPredictor) -> int | None:
+    name = Constant().bind(predictor.states).names[0]
+    names = predictor.lifting.names
+    return names.index(name) if name in names else None
+
+
+def _limited(predictor: LinearPredictor, limits: Limits) -> tuple[Float[np.ndarray, "ng nz"], Box]:
+    """Return the rows of z that have a limit, and the limits."""
+    low, high = limits.states(predictor.nx)
+    G = predictor.C
+    if limits.of is not None:
+        H = observed(predictor, limits.of)
+        y = limits.outputs(len(H))
+        G, low, high = np.vstack([G, H]), np.concatenate([low, y.low]), np.concatenate([high, y.high])
+    kept = np.isfinite(low) | np.isfinite(high)
+    return np.ascontiguousarray(G[kept]), Box(low[kept], high[kept])

@@ -1,0 +1,92 @@
+"""What a controller returns: a Move, with a Status for every outcome; and the protocol of a controller."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc.values import Value
+
+
+class Status(Enum):
+    """How a step ended. The first four are as intended; the others come with a Fallback."""
+
+    UNCONSTRAINED = 0  # the unconstrained optimum meets every limit
+    OPTIMAL = 1  # a QP or NLP was solved to its tolerance
+    SOFTENED = 2  # solved, and a soft limit gave way by more than the tolerance
+    SATURATED = 3  # a feedback law was clipped to the input limits
+    MAX_ITERATIONS = 4
+    TIME_LIMIT = 5
+    INFEASIBLE = 6
+    BAD_MEASUREMENT = 7  # NaN or inf in y or in the reference
+    FAILED = 8  # the solver gave no usable answer
+
+
+class Fallback(Enum):
+    """What replaced the answer of a failed step; always inside the input limits."""
+
+    NONE = 0
+    SHIFTED_PLAN = 1  # the last good plan, moved on by one step
+    CLIPPED_LQR = 2  # the unconstrained optimum, clipped to the input limits
+    HOLD = 3  # the last input again
+
+
+@dataclass(slots=True)
+class Move:
+    """One step of a controller.
+
+    Attributes
+    ----------
+    u
+        (nu,) input to apply, a fresh array.
+    status, fallback
+        How it came about.
+    solve_time
+        Wall-clock time of the whole step, from y to u [s].
+    iterations
+        Iterations of the solver; 0 where none ran.
+    """
+
+    u: Float[np.ndarray, " nu"]
+    status: Status
+    fallback: Fallback
+    solve_time: float
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Plan(Value):
+    """The plan behind a Move: X (N+1, nx) from the measured state on, U (N, nu) with U[0] the move."""
+
+    X: Float[np.ndarray, "N1 nx"]
+    U: Float[np.ndarray, "N nu"]
+
+
+class Controller(Protocol):
+    """y, reference → Move, once every dt."""
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]."""
+        ...
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        ...
+
+    @property
+    def horizon(self) -> int:
+        """Steps of preview that the controller reads: it takes reference rows k … k + horizon."""
+        ...
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Forget the last plan; `u_prev` is the input that is held if the first step fails."""
+        ...
+
+    def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
+        """Return the next input for measurement y; `applied` is what the plant really got last."""
+        ...

@@ -1,0 +1,168 @@
+"""Riccati: the infinite-horizon gains, the finite-horizon recursion, and the terminal weight between them."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, DefinitenessError
+
+SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
+LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
+
+
+class Gain(NamedTuple):
+    """The feedback u = −K x and the P of its value xᵀP x."""
+
+    K: Float[np.ndarray, "nu nx"]
+    P: Float[np.ndarray, "nx nx"]
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The backward recursion at k = 0 … N−1: gains K_k and S_k = R + BᵀP_{k+1}B = L_k L_kᵀ."""
+
+    K: Float[np.ndarray, "N nu nz"]
+    L: Float[np.ndarray, "N nu nu"]
+
+
+def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+    """Minimise ∫ xᵀQx + uᵀRu dt for ẋ = A x + B u: K = R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
+
+    Parameters
+    ----------
+    A, B
+        (nx, nx), (nx, nu).
+    Q, R
+        Weights, Q ⪰ 0, R ≻ 0; a scalar or a vector is a diagonal.
+
+    Raises
+    ------
+    DefinitenessError
+        R is not positive definite, or Q is indefinite.
+    DataError
+        No stabilising solution: (A, B) is not stabilisable, or an imaginary mode is not seen by Q.
+    """
+    A, B, Q, R = _pair(A, B, Q, R, definite=True)
+    try:
+        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise DataError(_UNSTABILISABLE) from error
+    K = np.linalg.solve(R, B.T @ P)
+    _require(float(np.linalg.eigvals(A - B @ K).real.max()) < 0)
+    return Gain(K, P)
+
+
+def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+    """Minimise Σ xᵀQx + uᵀRu for x⁺ = A x + B u: K = (R + BᵀPB)⁻¹BᵀPA, P = Q + AᵀP(A − BK).
+
+    Parameters and errors as in `lqr`. For a lifted pair with a Constant observable there is no stabilising
+    solution; `LQR` and `KoopmanMPC` iterate the difference equation instead.
+    """
+    A, B, Q, R = _pair(A, B, Q, R, definite=True)
+    try:
+        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise DataError(_UNSTABILISABLE) from error
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    _require(float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1)
+    return Gain(K, P)
+
+
+def recursion(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    P_N: Float[np.ndarray, "nz nz"],
+    N: int,
+) -> Stages:
+    """Return the stages of P_k = Q + AᵀP_{k+1}(A − B K_k) from P_N back to k = 0.
+
+    Raises
+    ------
+    DefinitenessError
+        R + BᵀPB is not positive definite at some stage.
+    """
+    nz, nu = B.shape
+    K, L = np.empty((N, nu, nz)), np.empty((N, nu, nu))
+    P = P_N
+    for k in range(N - 1, -1, -1):
+        K[k], L[k], P = _step(A, B, Q, R, P)
+    return Stages(K, L)
+
+
+def stationary(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    most: int,
+) -> Gain:
+    """Iterate P ← Q + AᵀP(A − BK) from P = Q until K moves by less than 1e-9, at most `most` steps.
+
+    Never refused: a Constant, or any other mode that u cannot move, only makes its own entries of P grow, which
+    z − z_r does not see; what has grown by 1e12 stops the iteration.
+    """
+    P, K = Q, np.zeros((B.shape[1], A.shape[0]))
+    scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
+    for _ in range(most):
+        K_next, _, P_next = _step(A, B, Q, R, P)
+        if not np.isfinite(P_next).all() or float(np.abs(P_next).max()) > LARGEST * scale:
+            break
+        moved = float(np.abs(K_next - K).max(initial=0.0))
+        P, K = P_next, K_next
+        if moved < SETTLED * (1 + float(np.abs(K).max(initial=0.0))):
+            break
+    return Gain(K, P)
+
+
+def _step(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    P: Float[np.ndarray, "nz nz"],
+) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "nz nz"]]:
+    BP = B.T @ P
+    S = R + BP @ B
+    try:
+        L = np.linalg.cholesky(0.5 * (S + S.T))
+    except np.linalg.LinAlgError as error:
+        least = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
+        raise DefinitenessError(
+            f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state that"
+            " every input moves"
+        ) from error
+    K = scipy.linalg.cho_solve((L, True), BP @ A)
+    P = Q + A.T @ (P @ (A - B @ K))
+    return K, L, 0.5 * (P + P.T)
+
+
+_UNSTABILISABLE = (
+    "the Riccati equation has no stabilising solution: (A, B) is not stabilisable, or Q does not see a mode on the"
+    " stability boundary; check the pair, or use LQR and KoopmanMPC, which iterate the difference equation"
+)
+
+
+def _require(stable: bool) -> None:
+    if not stable:
+        raise DataError(_UNSTABILISABLE)
+
+
+def _pair(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, *, definite: bool
+) -> tuple[
+    Float[np.ndarray, "nx nx"],
+    Float[np.ndarray, "nx nu"],
+    Float[np.ndarray, "nx nx"],
+    Float[np.ndarray, "nu nu"],
+]:
+    A = checks.array(A, "A", (None, None))
+    A = checks.array(A, "A", (len(A), len(A)))
+    B = checks.array(B, "B", (len(A), None))
+    return A, B, checks.weight(Q, "Q", len(A)), checks.weight(R, "R", B.shape[1], definite=definite)

@@ -1,0 +1,55 @@
+"""The small interface of a QP solver: set up once, update vectors, solve; every outcome has a Status."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.control.move import Status
+
+
+@dataclass(frozen=True)
+class QP:
+    """½ vᵀP v + qᵀv → min, low ≤ A v ≤ high; P ⪰ 0 dense, ±inf where there is no limit."""
+
+    P: Float[np.ndarray, "n n"]
+    q: Float[np.ndarray, " n"]
+    A: Float[np.ndarray, "m n"]
+    low: Float[np.ndarray, " m"]
+    high: Float[np.ndarray, " m"]
+
+    def __post_init__(self) -> None:
+        for name in ("P", "q", "A"):
+            checks.array(getattr(self, name), f"the QP's {name}")
+        for name in ("low", "high"):
+            checks.array(getattr(self, name), f"the QP's {name}", infinite=True)
+        checks.crossed(self.low, self.high, "the QP's")
+
+    def sparse(self) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csc_matrix]:
+        """Return the upper triangle of P, and A, in compressed columns."""
+        return scipy.sparse.csc_matrix(np.triu(self.P)), scipy.sparse.csc_matrix(self.A)
+
+
+@dataclass(slots=True)
+class QPSolution:
+    """Minimiser v, multipliers y of low ≤ A v ≤ high (positive at the upper end), and how the solve ended."""
+
+    v: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " m"]
+    status: Status
+    iterations: int
+
+
+class QPSolver(Protocol):
+    """A QP whose P, q and A stay and whose limits move."""
+
+    def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
+        """Set new limits."""
+        ...
+
+    def solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"]) -> QPSolution:
+        """Solve from the warm start (v, y)."""
+        ...

@@ -1,0 +1,33 @@
+"""The errors of koopmpc: one root, and each class is also the builtin that it refines."""
+
+
+class KoopmpcError(Exception):
+    """Root of every error that koopmpc raises on purpose."""
+
+
+class ShapeError(KoopmpcError, ValueError):
+    """An array has another shape than the mathematics needs."""
+
+
+class DataError(KoopmpcError, ValueError):
+    """Data or settings whose values cannot be used: NaN, crossed limits, too few steps."""
+
+
+class DefinitenessError(KoopmpcError, ValueError):
+    """A weight, or R + BᵀPB, is not positive (semi)definite where it must be."""
+
+
+class ObservableError(KoopmpcError, LookupError):
+    """A cost or a limit names an observable that the lifting does not hold."""
+
+
+class ProblemError(KoopmpcError, LookupError):
+    """A problem, or one of its cases, is unknown or its file does not work."""
+
+
+class LogError(KoopmpcError, OSError):
+    """A file is no log, no model, or no data of koopmpc, or cannot be read to its end."""
+
+
+class FitWarning(UserWarning):
+    """A fit is doubtful: rank deficient, ill conditioned, or with inputs that feedback made collinear."""

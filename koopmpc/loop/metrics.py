@@ -1,0 +1,128 @@
+"""metrics: what a Run amounts to, from the Run alone."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.loop.run import Run
+from koopmpc.values import Value
+
+SETTLED = 0.02  # the band of the settling time, as a share of the first error
+
+
+@dataclass(frozen=True, eq=False)
+class Metrics(Value):
+    """Closed-loop figures of a Run.
+
+    Attributes
+    ----------
+    cost
+        Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k‖²_R, no dt; NaN where the run has no Cost or no state.
+    tracking_rmse
+        Root-mean-square of each tracked output's error over k = 1 … T, in its unit.
+    final_error
+        Each tracked output's error at T.
+    violation
+        Largest violation of any state or output limit, in the unit of that limit.
+    input_violation
+        Largest violation of any input limit; a controller keeps it at zero.
+    effort
+        Σ ‖u_k‖² dt.
+    settling_time
+        Time after which the weighted error stays within 2 % of its first value [s]; inf where it never does.
+    solve_time_p50, solve_time_p99, solve_time_max
+        Of the wall-clock time of a step [s].
+    late
+        Steps whose solve_time exceeded dt.
+    status, fallback
+        How many steps ended with each name.
+    """
+
+    cost: float
+    tracking_rmse: Float[np.ndarray, " nr"]
+    final_error: Float[np.ndarray, " nr"]
+    violation: float
+    input_violation: float
+    effort: float
+    settling_time: float
+    solve_time_p50: float
+    solve_time_p99: float
+    solve_time_max: float
+    late: int
+    status: Mapping[str, int]
+    fallback: Mapping[str, int]
+
+
+def metrics(run: Run) -> Metrics:
+    """Return the closed-loop figures of `run`: cost, tracking, violation, effort, settling and solve times."""
+    error = tracking_error(run)
+    nr, nu = error.shape[1], run.U.shape[1]
+    Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
+    stage = np.einsum("ki,ij,kj->k", error, Q, error)
+    p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
+    return Metrics(
+        cost=float("nan")
+        if run.cost is None
+        else float(stage[1:].sum() + np.einsum("ki,ij,kj->", run.U, R, run.U)),
+        tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
+        final_error=error[-1].copy(),
+        violation=_violation(run),
+        input_violation=0.0 if run.limits is None else _excess(run.U, *run.limits.inputs(nu)),
+        effort=float((run.U**2).sum() * run.dt),
+        settling_time=_settling_time(stage, run.dt),
+        solve_time_p50=float(p50),
+        solve_time_p99=float(p99),
+        solve_time_max=float(run.solve_time.max()),
+        late=int((run.solve_time > run.dt).sum()),
+        status=dict(Counter(s.name for s in run.status)),
+        fallback=dict(Counter(f.name for f in run.fallback)),
+    )
+
+
+def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
+    """Return of(x_k) − r_k, the angles among tracked states wrapped to (−π, π]."""
+    X = _states(run)
+    tracked = None if run.cost is None else run.cost.of.bind(run.states)
+    outputs = X if tracked is None else tracked(X)
+    error = outputs - run.reference
+    names = run.states if tracked is None else tracked.names
+    for i in run.angles:
+        if run.states[i] in names:
+            j = names.index(run.states[i])
+            error[:, j] = np.pi - np.mod(np.pi - error[:, j], 2 * np.pi)
+    return error
+
+
+def _states(run: Run) -> Float[np.ndarray, "T1 nx"]:
+    """Return the true states, or the measured ones of a plant that hides them and measures them all."""
+    if np.isnan(run.X).all() and run.Y.shape == run.X.shape:
+        return run.Y
+    return run.X
+
+
+def _violation(run: Run) -> float:
+    if run.limits is None:
+        return 0.0
+    X = _states(run)[1:]
+    worst = _excess(X, *run.limits.states(X.shape[1]))
+    if run.limits.of is not None:
+        outputs = run.limits.of.bind(run.states)(X)
+        worst = max(worst, _excess(outputs, *run.limits.outputs(outputs.shape[1])))
+    return worst
+
+
+def _excess(
+    values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+) -> float:
+    return float(np.maximum(np.maximum(low - values, values - high), 0.0).max(initial=0.0))
+
+
+def _settling_time(stage: Float[np.ndarray, " T1"], dt: float) -> float:
+    """Return the time after which √stage stays below 2 % of its first value."""
+    outside = np.flatnonzero(~(np.sqrt(stage) <= SETTLED * np.sqrt(stage[0])))
+    if not outside.size:
+        return 0.0
+    return float("inf") if outside[-1] == len(stage) - 1 else float((outside[-1] + 1) * dt)

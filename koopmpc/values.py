@@ -1,0 +1,144 @@
+"""Frozen data: equality to the bit, and a plain tree of numbers and names in place of a pickle.
+
+A `Value` is a frozen dataclass of numbers, strings, enums, tuples, arrays and other Values. `to_data` writes it
+as a JSON-able tree, `from_data` builds it again. Only classes of koopmpc are looked up, by name, and they are
+built through their own constructors: loading a file runs no code of that file.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from typing import Any, ClassVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopmpc.errors import DataError, LogError
+
+Array = NDArray[Any]
+Arrays = dict[str, Array]
+
+
+class Value:
+    """Base of frozen dataclasses that hold arrays; `==` compares to the bit and NaN equals NaN."""
+
+    _kinds: ClassVar[dict[str, type["Value"]]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Register the classes of the library itself, and no others, for `from_data`."""
+        super().__init_subclass__(**options)
+        if cls.__module__.split(".")[0] == "koopmpc":
+            Value._kinds[cls.__name__] = cls
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(same(getattr(self, f), getattr(other, f)) for f in _fields(self))
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]  # arrays have no hash
+
+    def as_saved(self) -> "Value":
+        """Return the Value that stands for this one in a file; itself unless a class says otherwise."""
+        return self
+
+
+def same(a: Any, b: Any) -> bool:
+    """Return whether two trees of values are equal to the bit."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        x, y = cast("Array", a), cast("Array", b)
+        return bool(x.dtype == y.dtype) and x.shape == y.shape and x.tobytes() == y.tobytes()
+    if isinstance(a, float) and isinstance(b, float):
+        return a == b or (a != a and b != b)
+    if isinstance(a, tuple | list) and isinstance(b, tuple | list):
+        left, right = cast("Sequence[Any]", a), cast("Sequence[Any]", b)
+        return len(left) == len(right) and all(same(x, y) for x, y in zip(left, right, strict=True))
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        first, second = cast("Mapping[str, Any]", a), cast("Mapping[str, Any]", b)
+        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
+    return bool(a == b)
+
+
+def to_data(value: Any, arrays: Arrays | None = None) -> Any:
+    """Return a JSON-able tree; with `arrays`, arrays go there and leave a key behind, else they become lists."""
+    match value:
+        case None | bool() | int() | str():
+            return value
+        case float():
+            return float(value)
+        case Enum():
+            return {"kind": type(value).__name__, "name": value.name}
+        case np.ndarray():
+            return _array_to_data(cast("Array", value), arrays)
+        case np.generic():
+            return cast("Any", value).item()
+        case Value():
+            stands = value.as_saved()
+            name = type(stands).__name__
+            if Value._kinds.get(name) is not type(stands):
+                raise DataError(f"{name} is not a class of koopmpc and cannot be saved as data")
+            return {"kind": name} | {f: to_data(getattr(stands, f), arrays) for f in _fields(stands)}
+        case tuple() | list():
+            return [to_data(item, arrays) for item in cast("Sequence[Any]", value)]
+        case dict():
+            items = cast("dict[Any, Any]", value)
+            return {"kind": "dict", "items": [[str(k), to_data(v, arrays)] for k, v in items.items()]}
+        case _:
+            raise DataError(
+                f"a {type(value).__name__} cannot be saved as data; use numbers, names and arrays"
+            )
+
+
+def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Sequence[type[Enum]] = ()) -> Any:
+    """Build the value that `to_data` wrote; lists come back as tuples.
+
+    Raises
+    ------
+    LogError
+        The tree names a class that koopmpc does not have, or a class refuses what it holds.
+    """
+    if isinstance(tree, list):
+        return tuple(from_data(item, arrays, enums) for item in cast("list[Any]", tree))
+    if not isinstance(tree, dict):
+        return tree
+    node = cast("dict[str, Any]", tree)
+    kind = node.get("kind")
+    try:
+        if kind == "array":
+            return _array(node, arrays or {})
+        if kind == "dict":
+            return {key: from_data(item, arrays, enums) for key, item in node["items"]}
+        for enum in enums:
+            if enum.__name__ == kind:
+                return enum[node["name"]]
+        if kind not in Value._kinds:
+            raise LogError(f"the file holds a {kind!r}, which this version of koopmpc does not know")
+        build = cast("Callable[..., Any]", Value._kinds[kind])
+        return build(**{key: from_data(item, arrays, enums) for key, item in node.items() if key != "kind"})
+    except LogError:
+        raise
+    except (KeyError, TypeError, ValueError, LookupError) as error:
+        raise LogError(f"the file holds a {kind!r} that cannot be built: {error}") from error
+
+
+def _array_to_data(array: Array, arrays: Arrays | None) -> dict[str, Any]:
+    if arrays is None:
+        values = array.ravel().tolist()
+        return {"kind": "array", "dtype": str(array.dtype), "shape": list(array.shape), "values": values}
+    key = f"array{len(arrays)}"
+    arrays[key] = array
+    return {"kind": "array", "key": key}
+
+
+def _array(node: dict[str, Any], arrays: Mapping[str, Array]) -> Array:
+    if "key" in node:
+        return np.asarray(arrays[node["key"]])
+    dtype = np.dtype(node["dtype"])
+    if dtype.kind not in "fiubc":
+        raise LogError(f"the file holds an array of {dtype}; only numbers are read")
+    return np.array(node["values"], dtype=dtype).reshape(node["shape"])
+
+
+def _fields(value: Value) -> list[str]:
+    return [f.name for f in dataclasses.fields(cast(Any, value)) if f.init]
