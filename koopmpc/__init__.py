@@ -1,1 +1,134 @@
-"""koopmpc: from a CasADi model or from data to a constrained controller with a lifted linear predictor."""
+"""koopmpc: from a CasADi model, or only data, to a constrained controller with a lifted linear predictor.
+
+This file is the table of contents; see README.md for ten lines that use it.
+"""
+
+from koopmpc.bench.library import list_problems, load_problem
+from koopmpc.bench.problem import Case, Problem, Training
+from koopmpc.control.cost import Cost
+from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
+from koopmpc.control.limits import Limits
+from koopmpc.control.lqr import LQR
+from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
+from koopmpc.control.nonlinear_mpc import NonlinearMPC
+from koopmpc.control.riccati import Gain, dlqr, lqr
+from koopmpc.data.collect import Uniform, collect
+from koopmpc.data.episodes import Episode, Episodes, Snapshots
+from koopmpc.data.excitation import PRBS, Chirp, Feedback, Multisine, Noise
+from koopmpc.data.storage import load_episodes
+from koopmpc.errors import (
+    DataError,
+    DefinitenessError,
+    FitWarning,
+    KoopmpcError,
+    LogError,
+    ObservableError,
+    ProblemError,
+    ShapeError,
+)
+from koopmpc.identify.dmd import dmd, dmdc
+from koopmpc.identify.edmd import edmd
+from koopmpc.identify.moments import Moments, moments
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.gaussian import Gaussian
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from koopmpc.lifting.thin_plate import ThinPlate
+from koopmpc.loop.metrics import Metrics, metrics
+from koopmpc.loop.run import Plans, Run
+from koopmpc.loop.simulate import Step, simulate
+from koopmpc.plant.dynamics import Dynamics
+from koopmpc.plant.integrators import CVODES, RK4, Collocation, Euler, ImplicitMidpoint
+from koopmpc.plant.simulated import Plant, SimulatedPlant
+from koopmpc.plant.step_map import Affine, StepMap, discretize
+from koopmpc.predict.linear import LinearPredictor, load_predictor
+from koopmpc.predict.report import FitReport
+from koopmpc.predict.score import Score, score
+from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+from koopmpc.recording.scene import Box, Disk, Line
+
+__all__ = [
+    "CVODES",
+    "LQR",
+    "PRBS",
+    "RK4",
+    "Affine",
+    "Box",
+    "Case",
+    "Chirp",
+    "Collocation",
+    "Constant",
+    "Controller",
+    "Cost",
+    "DataError",
+    "DefinitenessError",
+    "Disk",
+    "Dynamics",
+    "Episode",
+    "Episodes",
+    "Euler",
+    "Expressions",
+    "Fallback",
+    "Feedback",
+    "FitReport",
+    "FitWarning",
+    "Fourier",
+    "Gain",
+    "Gaussian",
+    "ImplicitMidpoint",
+    "KoopmanMPC",
+    "KoopmpcError",
+    "Lifting",
+    "Limits",
+    "Line",
+    "LinearMPC",
+    "LinearPredictor",
+    "LogError",
+    "Metrics",
+    "Moments",
+    "Monomials",
+    "Move",
+    "Multisine",
+    "Noise",
+    "NonlinearMPC",
+    "ObservableError",
+    "Plan",
+    "Plans",
+    "Plant",
+    "Problem",
+    "ProblemError",
+    "Run",
+    "Score",
+    "ShapeError",
+    "SimulatedPlant",
+    "Snapshots",
+    "State",
+    "Status",
+    "Step",
+    "StepMap",
+    "ThinPlate",
+    "Training",
+    "Uniform",
+    "amplitudes",
+    "collect",
+    "continuous_eigenvalues",
+    "discretize",
+    "dlqr",
+    "dmd",
+    "dmdc",
+    "edmd",
+    "linearity_error",
+    "list_problems",
+    "load_episodes",
+    "load_predictor",
+    "load_problem",
+    "lqr",
+    "metrics",
+    "moments",
+    "reconstruct",
+    "score",
+    "simulate",
+]

@@ -93,7 +93,8 @@ def targets(
     span[free] = right[rank:].T
     if constant is not None:
         base[constant] = 1.0
-    z0, Z, u0, W = base[:nz], span[:nz], base[nz:], span[nz:]
+    z0, u0 = np.split(base, [nz])
+    Z, W = np.split(span, [nz])
     root = _root(Q)
     weighted = root @ C @ Z
     inverse = np.linalg.pinv(weighted, rcond=TOLERANCE)
