@@ -1,7 +1,7 @@
 """The command line: each command parses, calls one function, and prints."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from koopmpc.errors import KoopmpcError
+from koopmpc.errors import FitWarning, KoopmpcError
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
@@ -164,7 +164,7 @@ def _new_folder(logs: Path, what: str) -> Path:
 
 
 @contextmanager
-def _friendly() -> Iterator[None]:
+def _friendly() -> Generator[None]:
     """Show errors of koopmpc and warnings as one message each on stderr; exit code 2 for an error."""
     err = Console(stderr=True)
 
@@ -172,6 +172,7 @@ def _friendly() -> Iterator[None]:
         err.print(Text.assemble((f"{category.__name__}: ", "yellow"), str(message)), soft_wrap=True)
 
     with warnings.catch_warnings():
+        warnings.simplefilter("always", FitWarning)
         warnings.showwarning = show
         try:
             yield

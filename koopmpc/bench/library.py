@@ -1,0 +1,126 @@
+"""The problems that there are: found by path or name, loaded from one file each."""
+
+import ast
+import hashlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from koopmpc.bench.names import nearest
+from koopmpc.bench.problem import Problem
+from koopmpc.errors import ProblemError
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+
+class Entry(NamedTuple):
+    """A problem file: its name, the first line of its docstring, and where it is."""
+
+    name: str
+    title: str
+    path: Path
+
+
+def shipped() -> tuple[Path, ...]:
+    """Return the problem files that come with koopmpc: inside the wheel, or beside the package in a checkout."""
+    wheel = _PACKAGE / "problems"
+    return tuple(_files(wheel if wheel.is_dir() else _PACKAGE.parent / "problems"))
+
+
+def list_problems() -> tuple[Entry, ...]:
+    """Return every problem that has a name here: those in ./problems first, then the shipped ones."""
+    found: dict[str, Path] = {}
+    for path in (*_files(Path("problems")), *shipped()):
+        found.setdefault(path.stem, path)
+    return tuple(Entry(name, _title(path), path) for name, path in found.items())
+
+
+def load_problem(problem: str | Path) -> Problem:
+    """Load a problem by path or name; ``"cart_pole:recover"`` keeps one of its cases.
+
+    A name is looked up as a path, then in ./problems, then among the shipped problems. The file is run as Python:
+    load only files that you trust.
+
+    Raises
+    ------
+    ProblemError
+        There is no such problem or case (the message names the nearest), the file raises, or it defines no
+        `problem`.
+    """
+    text = str(problem)
+    path, case = _find(text), ""
+    if path is None and ":" in text:
+        name, _, case = text.rpartition(":")
+        path = _find(name)
+        text = name
+    if path is None:
+        raise ProblemError(_unknown(text))
+    loaded = _load(path)
+    return loaded.select(case) if case else loaded
+
+
+def _find(text: str) -> Path | None:
+    path = Path(text)
+    if path.is_file():
+        return path
+    return next((entry.path for entry in list_problems() if entry.name == text), None)
+
+
+def _unknown(text: str) -> str:
+    if text.endswith(".py") or "/" in text or "\\" in text:
+        return (
+            f"there is no file {text}; pass the path of a problem file, or a name that `koopmpc list` shows"
+        )
+    names = [entry.name for entry in list_problems()]
+    return f"there is no problem {text!r}{nearest(text, names)}; there are {', '.join(names)}, or pass a path"
+
+
+def _load(path: Path) -> Problem:
+    """Run the file and return its `problem` with name and title."""
+    path = path.resolve()
+    module_name = f"koopmpc_problem_{path.stem}_{hashlib.sha1(str(path).encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_loader(module_name, loader=None, origin=str(path))
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    module.__file__ = str(path)
+    sys.modules[module_name] = module  # dataclasses look their module up
+    try:
+        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
+    except Exception as error:
+        sys.modules.pop(module_name)
+        raise ProblemError(f"{path}{_line(error, path)}: {type(error).__name__}: {error}") from error
+    loaded = module.__dict__.get("problem")
+    if not isinstance(loaded, Problem):
+        got = "nothing of that name" if loaded is None else f"a {type(loaded).__name__}"
+        raise ProblemError(
+            f"{path} must define `problem = km.Problem(...)`, but holds {got}; see a file in problems/"
+        )
+    return replace(loaded, name=path.stem, title=_first_line(module.__doc__))
+
+
+def _line(error: Exception, path: Path) -> str:
+    if isinstance(error, SyntaxError):
+        return f", line {error.lineno}"
+    lines = [
+        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
+    ]
+    return f", line {lines[-1]}" if lines else ""
+
+
+def _title(path: Path) -> str:
+    try:
+        return _first_line(ast.get_docstring(ast.parse(path.read_bytes())))
+    except (SyntaxError, ValueError):
+        return "(this file is no valid Python)"
+
+
+def _first_line(docstring: str | None) -> str:
+    return (docstring or "").strip().split("\n")[0]
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.glob("*.py")) if not path.stem.startswith("_"))

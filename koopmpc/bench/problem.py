@@ -1,0 +1,174 @@
+"""Problem: a plant, how to learn it, how to control it, and the cases in which controllers are compared."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.bench.names import nearest
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.data.collect import InputFunction, Uniform
+from koopmpc.data.policy import Excitation
+from koopmpc.errors import DataError, ProblemError, ShapeError
+from koopmpc.lifting.base import Lifting
+from koopmpc.plant.dynamics import Dynamics
+from koopmpc.plant.integrators import RK4, Integrator
+from koopmpc.plant.simulated import Plant
+from koopmpc.plant.step_map import StepMap
+from koopmpc.recording.scene import Shape
+
+Scene = Callable[[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]], Sequence[Shape]]
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """How the data of a problem are collected: the arguments of `collect`.
+
+    Attributes
+    ----------
+    x0
+        Initial states: Uniform(low, high), or (episodes, nx).
+    excitation
+        u_k = excitation(k, y, rng): Noise, PRBS, Multisine, Chirp, Feedback, or a function.
+    episodes, steps
+        How many episodes, of how many steps each.
+    seed
+        Of the random numbers.
+    """
+
+    x0: Uniform | ArrayLike
+    excitation: Excitation | InputFunction
+    episodes: int
+    steps: int
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.count(self.episodes, "Training.episodes")
+        checks.count(self.steps, "Training.steps")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One start and one reference, the same for every controller.
+
+    Attributes
+    ----------
+    x0
+        (nx,) initial state.
+    reference
+        (nr,) held throughout, or (steps+1, nr): row k belongs to x_k.
+    steps
+        Length of the run.
+    limits
+        Take the place of the problem's limits in this case.
+    """
+
+    x0: ArrayLike
+    reference: ArrayLike
+    steps: int
+    limits: Limits | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "x0", checks.array(self.x0, "Case.x0", (None,)))
+        object.__setattr__(self, "reference", checks.array(self.reference, "Case.reference"))
+        checks.count(self.steps, "Case.steps")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """ẋ = f(x, u), the data and the lifting that learn it, the cost and limits that judge, and the cases.
+
+    Attributes
+    ----------
+    dynamics
+        The model that is given to controllers.
+    dt
+        Sampling time [s].
+    equilibrium
+        (x, u) where linear controllers linearise.
+    training
+        Which data the Koopman model learns from.
+    lifting, ridge
+        z = ψ(x), and the weight of the regularisation of `edmd`.
+    cost, limits, horizon
+        The same for all controllers.
+    cases
+        At least one, by name.
+    angles
+        Indices of states whose errors wrap at ±π.
+    plant
+        The truth, where it differs from `dynamics`: data are collected and runs are made on it.
+    scene
+        scene(x, u) → shapes, always the same names; recordings draw them.
+    name, title
+        The file's stem and the first line of its docstring; `load_problem` fills them in.
+
+    Raises
+    ------
+    ShapeError, DataError
+        A start, the equilibrium or an angle does not fit the states; there is no case.
+    """
+
+    dynamics: Dynamics
+    dt: float
+    equilibrium: tuple[ArrayLike, ArrayLike]
+    training: Training
+    lifting: Lifting
+    cost: Cost
+    limits: Limits
+    horizon: int
+    cases: Mapping[str, Case]
+    integrator: Integrator = field(default_factory=RK4)
+    ridge: float = 0.0
+    angles: Sequence[int] = ()
+    plant: Dynamics | StepMap | Plant | None = None
+    scene: Scene | None = None
+    name: str = "problem"
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        nx, nu = self.dynamics.nx, self.dynamics.nu
+        x, u = self.equilibrium
+        point = checks.array(x, "equilibrium x", (nx,)), checks.vector(u, "equilibrium u", nu)
+        object.__setattr__(self, "equilibrium", point)
+        object.__setattr__(self, "dt", checks.positive(self.dt, "dt", "s"))
+        checks.count(self.horizon, "horizon")
+        if self.ridge < 0:
+            raise DataError(f"ridge is {self.ridge:g}; it must be zero or above")
+        if not self.cases:
+            raise DataError(
+                'a problem needs at least one case: cases={"name": km.Case(x0, reference, steps)}'
+            )
+        for name, case in self.cases.items():
+            size = np.shape(case.x0)
+            if size != (nx,):
+                raise ShapeError(
+                    f"case {name!r}: x0 has shape {size}, expected ({nx},): {self.dynamics.states}"
+                )
+        wrong = [i for i in self.angles if not 0 <= i < nx]
+        if wrong:
+            raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
+
+    def select(self, case: str) -> "Problem":
+        """Return the problem with this one case.
+
+        Raises
+        ------
+        ProblemError
+            There is no such case; the message names the nearest.
+        """
+        if case not in self.cases:
+            raise ProblemError(
+                f"problem {self.name!r} has no case {case!r}{nearest(case, self.cases)}; "
+                f"its cases are {', '.join(self.cases)}"
+            )
+        return replace(self, cases={case: self.cases[case]})
+
+    def limits_of(self, case: str) -> Limits:
+        """Return the limits that hold in this case."""
+        own = self.cases[case].limits
+        return self.limits if own is None else own

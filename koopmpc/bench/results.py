@@ -1,0 +1,75 @@
+"""Row: what one run amounts to, and whether it ended as it should."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from koopmpc.loop.metrics import Metrics, tracking_error
+from koopmpc.loop.run import Run
+
+REACHED = 0.05  # the band around the reference, as a share of the first weighted error
+_TOLERANCE = 1e-9  # of an input limit, relative
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run of the bench.
+
+    Attributes
+    ----------
+    problem, case, controller
+        Which run it was.
+    metrics
+        Its figures; None where it raised.
+    reached
+        Whether the weighted tracking error stays below 5 % of its first value over the last tenth of the run.
+    training_time
+        What the data and the fit of its model took [s]; 0 for controllers that learn nothing.
+    log
+        Where its log is; None where there is none.
+    fault
+        Why it did not end as it should; None where it did. Poor control is no fault.
+    """
+
+    problem: str
+    case: str
+    controller: str
+    metrics: Metrics | None = None
+    reached: bool = False
+    training_time: float = 0.0
+    log: Path | None = None
+    fault: str | None = None
+
+
+def faults(run: Run, steps: int) -> list[str]:
+    """Return why a run did not end as it should: steps missing, u not finite or beyond a limit, no status."""
+    found: list[str] = []
+    if run.steps != steps:
+        found.append(f"it took {run.steps} of {steps} steps")
+    if not np.isfinite(run.U).all():
+        k = int(np.argwhere(~np.isfinite(run.U))[0][0])
+        found.append(f"u is {run.U[k]} at step {k}")
+    elif run.limits is not None:
+        low, high = run.limits.inputs(run.U.shape[1])
+        beyond = np.maximum(low - run.U, run.U - high)
+        room = _TOLERANCE * (1.0 + np.abs(run.U))
+        if (beyond > room).any():
+            k = int(np.argmax((beyond - room).max(axis=1)))
+            found.append(f"u = {run.U[k]} at step {k} is {beyond[k].max():.3g} beyond a hard limit")
+    if len(run.status) != run.steps:
+        found.append(f"{len(run.status)} of {run.steps} steps have a status")
+    return found
+
+
+def reached(run: Run) -> bool:
+    """Return whether √(eᵀQe) stays below 5 % of its first value over the last tenth of the run.
+
+    A run that starts on its reference is measured against its largest error.
+    """
+    error = tracking_error(run)
+    Q = np.eye(error.shape[1]) if run.cost is None else run.cost.matrices(error.shape[1], run.U.shape[1])[0]
+    weighted = np.sqrt(np.einsum("ki,ij,kj->k", error, Q, error))
+    scale = weighted[0] if weighted[0] > 0 else weighted.max()
+    last = weighted[-max(1, len(weighted) // 10) :]
+    return bool((last <= REACHED * scale).all())

@@ -1,0 +1,143 @@
+"""sweep: every controller on every case of every problem; one log a run, one row a run."""
+
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koopmpc.bench.controllers import CONTROLLERS, chosen
+from koopmpc.bench.parquet import write_results
+from koopmpc.bench.prepare import Prepared
+from koopmpc.bench.problem import Case, Problem
+from koopmpc.bench.results import Row, faults, reached
+from koopmpc.control.move import Controller
+from koopmpc.loop.metrics import metrics
+from koopmpc.loop.run import Run
+from koopmpc.loop.simulate import simulate
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.recorder import record
+
+Progress = Callable[[str, int, int], None]
+
+
+def sweep(
+    problems: Iterable[Problem],
+    controllers: Sequence[str] | None = None,
+    *,
+    folder: str | Path,
+    live: bool = False,
+    progress: Progress | None = None,
+) -> list[Row]:
+    """Run each controller on each case of each problem, and judge all by the same cost and limits.
+
+    Parameters
+    ----------
+    problems
+        What to run; `load_problem("cart_pole:recover")` holds one case alone.
+    controllers
+        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, nonlinear-mpc; by default all.
+    folder
+        Made if need be; holds one <problem>-<case>-<controller>.rrd a run, and results.parquet.
+    live
+        Stream each run to a viewer while it runs.
+    progress
+        Called with (what runs now, runs done, runs in all).
+
+    Returns
+    -------
+    rows
+        One a run. An exception ends that run alone and is its row's `fault`.
+
+    Raises
+    ------
+    ProblemError
+        There is no such controller.
+    """
+    names, problems, folder = chosen(controllers), list(problems), Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    total = sum(len(problem.cases) for problem in problems) * len(names)
+    rows: list[Row] = []
+    for problem in problems:
+        parts = Prepared(problem)
+        for case in problem.cases:
+            for name in names:
+                if progress is not None:
+                    progress(f"{problem.name}:{case} {name}", len(rows), total)
+                rows.append(_row(parts, case, name, folder, live))
+    if progress is not None:
+        progress("done", total, total)
+    write_results(rows, folder / "results.parquet")
+    return rows
+
+
+def _row(parts: Prepared, case: str, name: str, folder: Path, live: bool) -> Row:
+    """Run, log, read back and judge; whatever is raised on the way becomes the row's fault."""
+    problem = parts.problem.name
+    log = folder / f"{problem}-{case}-{name}.rrd"
+    try:
+        run = _run(parts, case, name, log, live)
+        found = faults(run, parts.problem.cases[case].steps)
+        if load_run(log) != run:
+            found.append(f"{log.name} does not read back equal to the run")
+        training = parts.training_time if name.startswith("koopman") else 0.0
+        return Row(problem, case, name, metrics(run), reached(run), training, log, "; ".join(found) or None)
+    except Exception as error:  # one run must not take the others with it; the exit code says so
+        trace = log.with_suffix(".txt")
+        trace.write_text(traceback.format_exc())
+        fault = f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
+        return Row(problem, case, name, log=log if log.exists() else None, fault=fault)
+
+
+def _run(parts: Prepared, case_name: str, name: str, log: Path, live: bool) -> Run:
+    """Return the run of one controller on one case, written to `log`."""
+    problem, case = parts.problem, parts.problem.cases[case_name]
+    limits = problem.limits_of(case_name)
+    controller = CONTROLLERS[name](parts, limits)
+    _warm_up(controller, parts, case)
+    run = simulate(
+        parts.truth,
+        controller,
+        x0=case.x0,
+        reference=case.reference,
+        steps=case.steps,
+        cost=problem.cost,
+        limits=limits,
+        rng=problem.training.seed,
+        plans=True,
+        angles=problem.angles,
+        metadata=_metadata(problem, case_name, name),
+    )
+    record(run, log, scene=problem.scene, model=getattr(controller, "predictor", None))
+    return run
+
+
+def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
+    """Call the controller twice and reset it: what only the first calls cost is no part of a step's time."""
+    y = parts.step_map.measure(case.x0)
+    reference = np.atleast_1d(np.asarray(case.reference))
+    row = reference if reference.ndim == 1 else reference[0]
+    ahead = np.tile(row, (controller.horizon + 1, 1))
+    controller.reset(case.x0)
+    for _ in range(2):
+        controller(y, ahead)
+    controller.reset(case.x0)
+
+
+def _metadata(problem: Problem, case: str, name: str) -> dict[str, Any]:
+    training = problem.training
+    return {
+        "problem": problem.name,
+        "title": problem.title,
+        "case": case,
+        "controller": name,
+        "horizon": problem.horizon,
+        "ridge": problem.ridge,
+        "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed},
+        "seed": training.seed,
+        "versions": {
+            package: version(package) for package in ("koopmpc", "casadi", "numpy", "osqp", "rerun-sdk")
+        },
+    }

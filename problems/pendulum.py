@@ -1,0 +1,85 @@
+"""Pendulum: driven upright from π/4, and from hanging with a torque too weak to lift it.
+
+Undamped, m = 1 kg on a massless rod of L = 2 m, driven by a torque at the pivot: the plant of D. Snyder and
+C. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode Decomposition" (2021). θ = 0 is
+upright. Holding the rod level takes m g L = 19.6 N m, so `hang` with its 10 N m has to swing.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+import koopmpc as km
+
+
+@dataclass(frozen=True)
+class Pendulum(km.Dynamics):
+    """θ̈ = (g/L) sin θ + u / (m L²)."""
+
+    states = ("theta [rad]", "omega [rad/s]")
+    inputs = ("torque [N m]",)
+
+    m: float = 1.0  # mass [kg]
+    L: float = 2.0  # length [m]
+    g: float = 9.81  # gravity [m/s²]
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """ẋ = [ω, (g/L) sin θ + u / (m L²)]."""
+        theta, omega = x[0], x[1]
+        return ca.vertcat(omega, self.g / self.L * ca.sin(theta) + u[0] / (self.m * self.L**2))
+
+
+pendulum = Pendulum()
+
+
+def products(x: ca.SX) -> list[ca.SX]:
+    """Return ω sin kθ and ω cos kθ for k = 1, 2, and ω²."""
+    theta, omega = x[0], x[1]
+    return [
+        omega * ca.sin(theta),
+        omega * ca.cos(theta),
+        omega * ca.sin(2 * theta),
+        omega * ca.cos(2 * theta),
+        omega**2,
+    ]
+
+
+names = ["omega sin(theta)", "omega cos(theta)", "omega sin(2 theta)", "omega cos(2 theta)", "omega²"]
+
+
+def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
+    """Draw the rod, the bob, the pivot, the place to be, and the torque as an arc."""
+    theta, L = float(x[0]), pendulum.L
+    bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
+    sweep = np.linspace(0.0, float(np.clip(u[0] / 25.0, -1.0, 1.0)) * np.pi, 24)
+    arc = [(0.5 * float(np.sin(a)), 0.5 * float(np.cos(a))) for a in sweep]
+    return [
+        km.Disk("target", (0.0, L), 0.2, color=(200, 215, 200)),
+        km.Line("rod", [(0.0, 0.0), bob], width=0.05),
+        km.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
+        km.Disk("bob", bob, 0.16),
+        km.Line("torque", arc, width=0.05, color=(40, 120, 200)),
+    ]
+
+
+problem = km.Problem(
+    dynamics=pendulum,
+    dt=0.05,
+    equilibrium=([0.0, 0.0], [0.0]),
+    training=km.Training(
+        x0=km.Uniform([-3.2, -4.0], [3.2, 4.0]), excitation=km.Noise(-25.0, 25.0), episodes=200, steps=40
+    ),
+    lifting=km.State() + km.Fourier(2, states="theta") + km.Expressions(products, names) + km.Constant(),
+    cost=km.Cost(Q=[10.0, 1.0], R=0.1),
+    limits=km.Limits(u_min=-25.0, u_max=25.0),
+    horizon=40,
+    cases={
+        "upright": km.Case(x0=[np.pi / 4, 0.0], reference=[0.0, 0.0], steps=200),
+        "hang": km.Case(
+            x0=[np.pi, 0.0], reference=[0.0, 0.0], steps=300, limits=km.Limits(u_min=-10.0, u_max=10.0)
+        ),
+    },
+    angles=(0,),
+    scene=scene,
+)

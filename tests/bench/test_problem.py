@@ -1,0 +1,57 @@
+"""A Problem refuses what does not fit, with what was got and what to do."""
+
+from dataclasses import replace
+
+import pytest
+
+from koopmpc.bench.library import load_problem
+from koopmpc.bench.problem import Case, Training
+from koopmpc.errors import DataError, ProblemError, ShapeError
+from tests.bench.tiny import write
+
+
+@pytest.fixture
+def problem(tmp_path):
+    return load_problem(write(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"cases": {}}, DataError, "needs at least one case"),
+        (
+            {"cases": {"bad": Case([1.0, 2.0], [0.0], 3)}},
+            ShapeError,
+            r"case 'bad': x0 has shape \(2,\), expected \(1,\)",
+        ),
+        ({"equilibrium": ([0.0, 0.0], [0.0])}, ShapeError, r"equilibrium x has shape \(2,\)"),
+        ({"equilibrium": ([float("nan")], [0.0])}, DataError, "equilibrium x holds 1 NaN"),
+        ({"dt": 0.0}, DataError, "dt is 0 s; it must be above zero"),
+        ({"horizon": 0}, DataError, "horizon is 0; it must be at least 1"),
+        ({"ridge": -1.0}, DataError, "ridge is -1; it must be zero or above"),
+        ({"angles": (1,)}, DataError, "angles holds 1; pass indices of states, 0 to 0"),
+    ],
+)
+def test_what_does_not_fit_is_refused(problem, change, error, text):
+    with pytest.raises(error, match=text):
+        replace(problem, **change)
+
+
+def test_a_case_needs_steps_and_numbers():
+    with pytest.raises(DataError, match=r"Case\.steps is 0; it must be at least 1"):
+        Case([0.0], [0.0], 0)
+    with pytest.raises(DataError, match=r"Case\.x0 holds 1 NaN"):
+        Case([float("nan")], [0.0], 3)
+
+
+def test_training_needs_episodes():
+    with pytest.raises(DataError, match=r"Training\.episodes is 0"):
+        Training([0.0], lambda k, y, rng: [0.0], episodes=0, steps=3)
+
+
+def test_select_keeps_all_but_the_other_cases(problem):
+    one = problem.select("far")
+    assert list(one.cases) == ["far"]
+    assert one.dynamics is problem.dynamics
+    with pytest.raises(ProblemError, match=r"'tiny' has no case 'fra', did you mean 'far'\?"):
+        problem.select("fra")

@@ -1,0 +1,190 @@
+"""sweep: a row, a log and a verdict for every run; what one run raises stays with that run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from koopmpc.recording.reader import load_run
+
+from koopmpc.bench.controllers import CONTROLLERS, chosen
+from koopmpc.bench.library import load_problem
+from koopmpc.bench.prepare import Prepared
+from koopmpc.bench.results import faults, reached
+from koopmpc.bench.sweep import sweep
+from koopmpc.control.move import Fallback, Move, Status
+from koopmpc.errors import ProblemError
+from koopmpc.loop.metrics import metrics
+from tests.bench.tiny import write
+
+FIVE = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "nonlinear-mpc"]
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("swept")
+    problem = load_problem(write(folder))
+    told = []
+    rows = sweep([problem], folder=folder / "logs", progress=lambda *step: told.append(step))
+    return problem, rows, folder / "logs", told
+
+
+def test_every_controller_meets_every_case_once(swept):
+    _, rows, _, told = swept
+    assert [(r.problem, r.case, r.controller) for r in rows] == [
+        ("tiny", case, name) for case in ("near", "far") for name in FIVE
+    ]
+    assert [done for _, done, _ in told] == list(range(11))
+    assert {total for *_, total in told} == {10}
+
+
+def test_all_end_as_they_should_and_the_short_case_is_no_fault(swept):
+    _, rows, _, _ = swept
+    assert [row.fault for row in rows] == [None] * 10
+    assert all(row.reached for row in rows if row.case == "near")
+    assert not any(
+        row.reached for row in rows if row.case == "far"
+    )  # 6 steps are too few: a result, not a fault
+
+
+def test_figures_are_those_of_the_log_alone(swept):
+    _, rows, _, _ = swept
+    for row in rows:
+        assert metrics(load_run(row.log)) == row.metrics
+
+
+def test_the_same_cost_and_limits_judge_every_controller(swept):
+    problem, rows, _, _ = swept
+    for row in rows:
+        run = load_run(row.log)
+        assert run.cost == problem.cost
+        assert run.limits == problem.limits_of(row.case)
+        assert np.abs(run.U).max() <= (2.0 if row.case == "near" else 1.0)
+        assert run.metadata["controller"] == row.controller
+        assert run.plans is not None or row.controller.endswith("lqr")
+
+
+def test_the_oracle_is_not_beaten_by_much(swept):
+    _, rows, _, _ = swept
+    cost = {(row.case, row.controller): row.metrics.cost for row in rows}
+    for (case, name), value in cost.items():
+        assert value >= 0.97 * cost[case, "nonlinear-mpc"], name
+
+
+def test_the_table_on_disk_has_a_row_a_run(swept):
+    _, rows, folder, _ = swept
+    stored = pq.read_table(folder / "results.parquet").to_pylist()
+    assert len(stored) == len(rows)
+    for line, row in zip(stored, rows, strict=True):
+        assert (line["case"], line["controller"], line["log"]) == (row.case, row.controller, row.log.name)
+        assert line["cost"] == row.metrics.cost
+        assert line["final_error"] == row.metrics.final_error.tolist()
+        assert sum(line["status"].values()) == 40 if row.case == "near" else 6
+        assert set(line["status"]) == {s.name for s in Status}
+
+
+def test_a_run_is_the_same_when_it_is_repeated(swept, tmp_path):
+    problem, rows, _, _ = swept
+    again = sweep([problem.select("near")], ["koopman-mpc"], folder=tmp_path)
+    first = next(row for row in rows if (row.case, row.controller) == ("near", "koopman-mpc"))
+    assert np.array_equal(load_run(again[0].log).U, load_run(first.log).U)
+
+
+def test_data_and_model_are_made_once(swept):
+    parts = Prepared(swept[0])
+    assert parts.model is parts.model
+    assert parts.truth is parts.step_map
+    assert parts.training_time > 0
+
+
+def test_the_truth_may_be_another_plant(swept):
+    problem, *_ = swept
+    heavier = type(problem.dynamics)
+    parts = Prepared(replace(problem, plant=heavier()))
+    assert parts.truth is not parts.step_map
+    np.testing.assert_array_equal(parts.truth([0.3], [0.1]), parts.step_map([0.3], [0.1]))
+    given = Prepared(problem).step_map
+    assert Prepared(replace(problem, plant=given)).truth is given
+
+
+def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_path, monkeypatch):
+    def broken(parts, limits):
+        raise RuntimeError("no such gain")
+
+    monkeypatch.setitem(CONTROLLERS, "koopman-lqr", broken)
+    rows = sweep([swept[0].select("far")], folder=tmp_path)
+    assert [row.controller for row in rows if row.fault] == ["koopman-lqr"]
+    (row,) = (row for row in rows if row.fault)
+    assert row.fault.startswith("RuntimeError: no such gain (the whole traceback is in")
+    assert row.metrics is None
+    assert row.log is None
+    assert "in broken" in (tmp_path / "tiny-far-koopman-lqr.txt").read_text()
+    assert pq.read_table(tmp_path / "results.parquet")["cost"].null_count == 1
+
+
+def test_a_model_that_cannot_be_learned_takes_only_its_own_controllers(tmp_path):
+    broken = write(tmp_path, **{"km.Noise(-2.0, 2.0)": "lambda k, y, rng: [float('nan')]"})
+    rows = sweep([load_problem(f"{broken}:far")], folder=tmp_path)
+    assert [row.controller for row in rows if row.fault] == ["koopman-lqr", "koopman-mpc"]
+
+
+class Cheat:
+    """A controller that leaves its limits."""
+
+    nu, horizon = 1, 0
+
+    def __init__(self, dt, u):
+        self.dt, self.u = dt, u
+
+    def reset(self, x0=None, u_prev=None):
+        """Nothing to forget."""
+
+    def __call__(self, y, reference, applied=None):
+        return Move(np.array([self.u]), Status.OPTIMAL, Fallback.NONE, 0.0, 0)
+
+
+def test_an_input_beyond_its_limit_is_a_fault(swept, tmp_path, monkeypatch):
+    monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, 1.5))
+    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    assert row.fault == "u = [1.5] at step 0 is 0.5 beyond a hard limit"
+    assert row.metrics is not None
+
+
+def test_an_input_that_is_not_finite_is_a_fault(swept, tmp_path, monkeypatch):
+    monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, np.nan))
+    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    assert "every input must be finite" in row.fault
+
+
+def test_a_log_that_differs_is_a_fault(swept, tmp_path, monkeypatch):
+    monkeypatch.setattr("koopmpc.bench.sweep.load_run", lambda path: None)
+    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    assert row.fault == "tiny-far-lqr.rrd does not read back equal to the run"
+
+
+def test_missing_steps_and_statuses_are_faults(swept):
+    run = load_run(next(row.log for row in swept[1] if row.case == "far"))
+    assert faults(run, 6) == []
+    assert faults(run, 7) == ["it took 6 of 7 steps"]
+    assert faults(replace(run, status=run.status[:-1]), 6) == ["5 of 6 steps have a status"]
+    assert faults(replace(run, U=np.full_like(run.U, np.inf)), 6) == ["u is [inf] at step 0"]
+
+
+def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
+    run = load_run(next(row.log for row in swept[1] if row.case == "near"))
+    X = np.full_like(run.X, 1.0)
+    X[1:] = 0.049
+    assert reached(replace(run, X=X))
+    X[-2] = 0.051
+    assert not reached(replace(run, X=X))
+    X[-2], X[20] = 0.0, 3.0
+    assert reached(replace(run, X=X))
+
+
+def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
+    with pytest.raises(
+        ProblemError,
+        match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
+    ):
+        sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
+    assert list(chosen(None)) == FIVE

@@ -1,0 +1,102 @@
+"""The table fits 100 columns, says what did not reach, and shows what was raised."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from koopmpc.bench.results import Row
+from koopmpc.bench.table import duration, figures, table
+from koopmpc.loop.metrics import Metrics
+
+GOOD = Metrics(
+    cost=120.5,
+    tracking_rmse=np.array([0.1, 0.2]),
+    final_error=np.array([0.001, -0.02]),
+    violation=0.0,
+    input_violation=0.0,
+    effort=3.0,
+    settling_time=2.35,
+    solve_time_p50=13e-6,
+    solve_time_p99=4.2e-3,
+    solve_time_max=1.5,
+    late=1,
+    status={"UNCONSTRAINED": 150, "OPTIMAL": 48, "MAX_ITERATIONS": 2},
+    fallback={"NONE": 198, "SHIFTED_PLAN": 2},
+)
+
+
+def printed(renderable, width=100):
+    out = Console(file=io.StringIO(), width=width)
+    out.print(renderable)
+    return out.file.getvalue()
+
+
+def rows():
+    return [
+        Row("plant", "case", "lqr", replace(GOOD, cost=2.41e6, settling_time=np.inf), reached=False),
+        Row("plant", "case", "linear-mpc", replace(GOOD, settling_time=np.inf), reached=True),
+        Row("plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31),
+        Row("plant", "case", "nonlinear-mpc", GOOD, reached=True),
+        Row("plant", "other", "lqr", fault="RuntimeError: the [gain] is lost"),
+    ]
+
+
+def test_each_row_says_how_it_went():
+    lines = printed(table(rows())).split("\n")
+    line = {
+        name: next(text for text in lines if text.strip().startswith(name))
+        for name in ("koopman-mpc", "linear-mpc", "nonlinear-mpc", "lqr")
+    }
+    assert "does not reach" in line["lqr"]
+    assert "2e+04" in line["lqr"]  # the ratio to nonlinear-mpc
+    assert "within 5 %" in line["linear-mpc"]
+    assert "2.35 s" in line["koopman-mpc"]
+    assert "0.25" in line["koopman-mpc"]
+    assert "13 µs" in line["nonlinear-mpc"]
+    assert "4.2 ms" in line["nonlinear-mpc"]
+
+
+def test_one_table_a_case_with_training_time_and_faults_in_full():
+    text = printed(table(rows()))
+    assert text.index("plant:case") < text.index("plant:other")
+    assert "learned from data in 310 ms" in text
+    assert "plant:other lqr: RuntimeError: the [gain] is lost" in text
+    assert "raised" in text
+
+
+def test_no_column_of_violations_where_there_is_none():
+    assert "over " not in printed(table([rows()[3]])).split("cost:")[0]
+    assert "over " in printed(table(rows())).split("cost:")[0]
+
+
+def test_a_hundred_columns_cut_nothing():
+    text = printed(table(rows()))
+    assert "…" not in text
+    assert max(len(line) for line in text.split("\n")) <= 100
+
+
+def test_figures_show_every_metric():
+    text = printed(figures(GOOD))
+    for part in (
+        "120.5",
+        "[0.1, 0.2]",
+        "[0.001, -0.02]",
+        "2.35 s",
+        "13 µs, 4.2 ms, 1.5 s",
+        "2 MAX_ITERATIONS",
+        "2 SHIFTED_PLAN",
+    ):
+        assert part in text
+    assert "does not settle" in printed(figures(replace(GOOD, settling_time=np.inf)))
+
+
+@given(st.floats(1e-8, 1e4))
+def test_a_duration_is_right_to_its_digits(seconds):
+    number, unit = duration(seconds).split()
+    size = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}[unit]
+    assert float(number) * size == pytest.approx(seconds, rel=6e-3)

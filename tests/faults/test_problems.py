@@ -1,0 +1,103 @@
+"""The shipped plants are the ones of the papers, and are physically right."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import solve_continuous_are
+
+from koopmpc.bench.library import load_problem
+from koopmpc.plant.dynamics import right_side
+
+angle, speed = st.floats(-3.1, 3.1), st.floats(-4.0, 4.0)
+
+
+def rhs(name, x, u):
+    f = right_side(load_problem(name).dynamics)
+    return np.array(f(x, u)).ravel()
+
+
+def linearised(dynamics, x, u):
+    f = right_side(dynamics)
+    X, U = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    J = ca.Function("J", [X, U], [ca.jacobian(f(X, U), X), ca.jacobian(f(X, U), U)])
+    return tuple(np.array(m) for m in J(x, u))
+
+
+def continuous_gain(A, B, Q, R):
+    P = solve_continuous_are(A, B, Q, R)
+    return np.linalg.solve(R, B.T @ P)
+
+
+PENDULUM, CART_POLE = load_problem("pendulum"), load_problem("cart_pole")
+
+
+def test_the_pendulum_has_the_papers_upright_gain():
+    A, B = linearised(PENDULUM.dynamics, [0.0, 0.0], [0.0])
+    K = continuous_gain(A, B, np.diag([0.0, 10.0]), np.eye(1))
+    np.testing.assert_allclose(K, [[39.24, 17.998]], atol=1e-3)
+
+
+def test_the_cart_pole_has_the_papers_gain():
+    A, B = linearised(CART_POLE.dynamics, [0.0, 0.0, np.pi, 0.0], [0.0])
+    K = continuous_gain(A, B, np.diag([5.0, 10.0, 0.0, 0.0]), np.eye(1))
+    np.testing.assert_allclose(K, [[-2.2361, -7.9534, 175.6827, 74.7644]], atol=1e-4)
+
+
+@given(angle, speed, st.floats(-25.0, 25.0))
+def test_the_torques_work_is_the_pendulums_energy(theta, omega, u):
+    p = PENDULUM.dynamics
+    x = ca.SX.sym("x", 2)
+    energy = 0.5 * p.m * (p.L * x[1]) ** 2 + p.m * p.g * p.L * ca.cos(x[0])
+    slope = np.array(ca.Function("dE", [x], [ca.gradient(energy, x)])([theta, omega])).ravel()
+    dx = np.array(right_side(p)([theta, omega], [u])).ravel()
+    np.testing.assert_allclose(slope @ dx, u * omega, atol=1e-9)
+
+
+@given(angle, speed, speed, st.floats(-40.0, 40.0))
+def test_the_forces_work_is_the_cart_poles_energy(theta, omega, velocity, u):
+    p = CART_POLE.dynamics
+    x = ca.SX.sym("x", 4)
+    tip = ca.vertcat(x[1] + p.L * x[3] * ca.cos(x[2]), p.L * x[3] * ca.sin(x[2]))
+    energy = 0.5 * p.M * x[1] ** 2 + 0.5 * p.m * ca.sumsqr(tip) - p.m * p.g * p.L * ca.cos(x[2])
+    point = [0.3, velocity, theta, omega]
+    slope = np.array(ca.Function("dE", [x], [ca.gradient(energy, x)])(point)).ravel()
+    dx = np.array(right_side(p)(point, [u])).ravel()
+    np.testing.assert_allclose(slope @ dx, u * velocity, atol=1e-8)
+
+
+@pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
+def test_references_are_equilibria_and_cases_fit(problem):
+    x, u = problem.equilibrium
+    np.testing.assert_allclose(np.array(right_side(problem.dynamics)(x, u)).ravel(), 0.0, atol=1e-12)
+    for case in problem.cases.values():
+        held = np.array(right_side(problem.dynamics)(case.reference, u)).ravel()
+        np.testing.assert_allclose(held, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
+@given(theta=angle, u=st.floats(-40.0, 40.0))
+def test_scenes_have_the_same_finite_shapes_everywhere(problem, theta, u):
+    start = problem.scene(problem.equilibrium[0], np.zeros(1))
+    x = problem.equilibrium[0] + theta
+    shapes = problem.scene(x, np.array([u]))
+    assert [(type(s), s.name) for s in shapes] == [(type(s), s.name) for s in start]
+    assert len({s.name for s in shapes}) == len(shapes)
+
+
+def test_the_limits_are_the_ones_asked_for():
+    limits = {
+        f"{p.name}:{case}": tuple(float(v[0]) for v in p.limits_of(case).inputs(1))
+        for p in (PENDULUM, CART_POLE)
+        for case in p.cases
+    }
+    assert limits["pendulum:upright"] == (-25.0, 25.0)
+    assert limits["pendulum:hang"] == (-10.0, 10.0)
+    assert limits["cart_pole:recover"] == (-40.0, 40.0)
+
+
+def test_ten_newton_metres_cannot_hold_the_pendulum_level():
+    p = PENDULUM.dynamics
+    assert p.m * p.g * p.L > 10.0
+    assert rhs("pendulum", [np.pi / 2, 0.0], [-10.0])[1] > 0.0  # θ = 0 is upright: it still falls away

@@ -1,0 +1,163 @@
+"""The command line: exit codes, messages on stderr, files where they are said to be."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from koopmpc.recording.reader import load_run
+from typer.testing import CliRunner
+
+from koopmpc.bench.controllers import CONTROLLERS
+from koopmpc.cli import app
+from koopmpc.loop.metrics import metrics
+from tests.bench.tiny import write
+
+TWO = ["-c", "lqr", "-c", "koopman-mpc"]
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def invoke(*arguments):
+        return CliRunner().invoke(app, [str(a) for a in arguments])
+
+    return invoke
+
+
+def folders(tmp_path):
+    return sorted((tmp_path / "logs").iterdir())
+
+
+def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
+    result = call("run", write(tmp_path), *TWO)
+    assert result.exit_code == 0, result.output
+    (folder,) = folders(tmp_path)
+    assert folder.name.endswith("-tiny")
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"results.parquet"} | {
+        f"tiny-{case}-{name}.rrd" for case in ("near", "far") for name in ("lqr", "koopman-mpc")
+    }
+    assert "tiny:near" in result.stdout
+    assert "does not reach" in result.stdout  # six steps are too few, and that is no failure
+    assert f"logs{os.sep}{folder.name}" in result.stdout
+
+
+def test_run_takes_a_name_in_problems_and_one_case(call, tmp_path):
+    write(tmp_path / "problems")
+    result = call("run", "tiny:far", "-c", "lqr", "--logs", tmp_path / "elsewhere")
+    assert result.exit_code == 0, result.output
+    (folder,) = (tmp_path / "elsewhere").iterdir()
+    assert {path.name for path in folder.iterdir()} == {"results.parquet", "tiny-far-lqr.rrd"}
+
+
+def test_two_calls_in_one_second_have_a_folder_each(call, tmp_path):
+    path = write(tmp_path)
+    for _ in range(3):
+        assert call("run", f"{path}:far", "-c", "lqr").exit_code == 0
+    assert len(folders(tmp_path)) == 3
+
+
+def test_bench_takes_several_problems(call, tmp_path):
+    first, second = write(tmp_path, "one"), write(tmp_path, "two")
+    result = call("bench", f"{first}:far", f"{second}:far", "-c", "lqr")
+    assert result.exit_code == 0, result.output
+    (folder,) = folders(tmp_path)
+    assert folder.name.endswith("-bench")
+    assert {path.stem for path in folder.glob("*.rrd")} == {"one-far-lqr", "two-far-lqr"}
+
+
+def test_a_run_that_raises_exits_with_one_and_the_others_are_there(call, tmp_path, monkeypatch):
+    def broken(parts, limits):
+        raise RuntimeError("out of [gain]")
+
+    monkeypatch.setitem(CONTROLLERS, "lqr", broken)
+    result = call("run", f"{write(tmp_path)}:far", *TWO)
+    assert result.exit_code == 1
+    assert "tiny:far lqr: RuntimeError: out of [gain]" in result.stdout
+    (folder,) = folders(tmp_path)
+    assert [path.name for path in folder.glob("*.rrd")] == ["tiny-far-koopman-mpc.rrd"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["run", "pendulun"], "did you mean 'pendulum'?"),
+        (["run", "pendulum:uprigth"], "did you mean 'upright'?"),
+        (["run", "pendulum", "-c", "lqg"], "there is no controller 'lqg', did you mean 'lqr'?"),
+        (["bench", "nowhere.py"], "there is no file nowhere.py"),
+        (["inspect", "nowhere.rrd"], "nowhere.rrd"),
+    ],
+)
+def test_mistakes_are_one_message_on_stderr_exit_two_and_leave_nothing(call, tmp_path, arguments, text):
+    result = call(*arguments)
+    assert result.exit_code == 2
+    assert text in result.stderr
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_problem_that_raises_says_where(call, tmp_path):
+    result = call("run", write(tmp_path, **{"horizon=5": "horizon=int('five')"}))
+    assert result.exit_code == 2
+    assert "tiny.py, line" in result.stderr
+    assert "ValueError: invalid literal" in result.stderr
+
+
+def test_inspect_recomputes_the_metrics_from_the_log_alone(call, tmp_path):
+    path = write(tmp_path)
+    assert call("run", f"{path}:near", "-c", "lqr").exit_code == 0
+    path.unlink()
+    log = folders(tmp_path)[0] / "tiny-near-lqr.rrd"
+    result = call("inspect", log)
+    assert result.exit_code == 0, result.output
+    expected = metrics(load_run(log))
+    assert "tiny near lqr" in result.stdout
+    assert f"{expected.cost:.6g}" in result.stdout
+    assert f"{expected.settling_time:.3g} s" in result.stdout
+
+
+def test_inspect_refuses_what_is_no_log(call, tmp_path):
+    (tmp_path / "note.rrd").write_text("not a log")
+    result = call("inspect", "note.rrd")
+    assert result.exit_code == 2
+    assert "LogError" in result.stderr
+
+
+def test_list_shows_names_titles_cases_and_what_is_broken(call, tmp_path):
+    write(tmp_path / "problems")
+    (tmp_path / "problems" / "torn.py").write_text('"""Torn: half a file."""\nx = (\n')
+    result = call("list")
+    assert result.exit_code == 0
+    for text in (
+        "tiny  Tiny: a leaky tank",
+        "near, far",
+        "pendulum",
+        "cart_pole",
+        "shift, recover",
+        "torn.py, line 2",
+    ):
+        assert text in result.stdout
+
+
+def test_view_opens_all_logs_in_one_viewer(call, monkeypatch):
+    opened = []
+    monkeypatch.setattr("koopmpc.recording.viewer.view", opened.append)
+    assert call("view", "a.rrd", "b.rrd").exit_code == 0
+    assert [[path.name for path in paths] for paths in opened] == [["a.rrd", "b.rrd"]]
+
+
+def test_fit_warnings_are_one_line(call, tmp_path):
+    doubtful = write(tmp_path, **{"episodes=20, steps=5": "episodes=1, steps=2"})
+    result = call("run", f"{doubtful}:far", "-c", "koopman-mpc")
+    assert "FitWarning: " in result.stderr
+
+
+def test_python_m_is_the_same_program(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "koopmpc", "run", "pendulun"], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert "did you mean 'pendulum'?" in done.stderr
