@@ -1,6 +1,5 @@
 """The discrete-time plant x⁺ = F(x, u), y = h(x), immutable."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.plant.batch import Batch, march, warn_of
 from koopmpc.plant.buffered import Buffered, dense
 from koopmpc.plant.dynamics import Dynamics, closed, output, right_side
 from koopmpc.plant.integrators import RK4, Integrator
@@ -110,7 +110,7 @@ class StepMap:
         try:
             return self._step(x, u)[0]
         except RuntimeError as error:
-            _warn_of(error, x, u)
+            warn_of(error, x, u)
             return np.full(self.nx, np.nan)
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
@@ -123,7 +123,7 @@ class StepMap:
         moves = checks.array(U, "U", (None, self.nu))
         X = np.empty((len(moves) + 1, self.nx))
         X[0] = start
-        self._fill(X, moves)
+        march(self._step, X, moves)
         return X
 
     def rollouts(self, X0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "episodes steps nx"]:
@@ -132,8 +132,7 @@ class StepMap:
         moves = checks.array(U, "U", (len(starts), None, self.nu))
         X = np.empty((len(starts), moves.shape[1] + 1, self.nx))
         X[:, 0] = starts
-        for episode, inputs in zip(X, moves, strict=True):
-            self._fill(episode, inputs)
+        self._batch.fill(X, moves)
         return X
 
     def linearize(self, x: ArrayLike, u: ArrayLike) -> Affine:
@@ -144,24 +143,13 @@ class StepMap:
         B = np.ascontiguousarray(columns_B.reshape(self.nu, self.nx).T)
         return Affine(A, B, x_next - A @ x - B @ u)
 
-    def _fill(self, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
-        """Write x_1 … x_T after X[0]; NaN from where an implicit method fails."""
-        (x, u), (x_next,), evaluate, _ = self._step.slot()
-        x[:] = X[0]
-        for k in range(len(U)):
-            u[:] = U[k]
-            try:
-                evaluate()
-            except RuntimeError as error:
-                _warn_of(error, x, u)
-                X[k + 1 :] = np.nan
-                return
-            X[k + 1] = x_next
-            x[:] = x_next
-
     @cached_property
     def _step(self) -> Buffered:
         return Buffered(self.F)
+
+    @cached_property
+    def _batch(self) -> Batch:
+        return Batch(self._step)
 
     @cached_property
     def _output(self) -> Buffered:
@@ -206,15 +194,6 @@ def _vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]
         result.reshape(1)
         if result.ndim == 0 and length == 1
         else checks.array(result, name, (length,), finite=False)
-    )
-
-
-def _warn_of(error: RuntimeError, x: np.ndarray, u: np.ndarray) -> None:
-    reason = str(error).strip().splitlines()[-1]
-    warnings.warn(
-        f"the integrator found no x⁺ from x={x}, u={u}; x⁺ is NaN, try a smaller dt ({reason})",
-        RuntimeWarning,
-        stacklevel=3,
     )
 
 

@@ -1,0 +1,130 @@
+"""x⁺ = F(x, u) as machine code: the C that CasADi generates, in a loop over episodes and steps."""
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
+
+# No fused multiply-adds and no -march: the interpreter's numbers, on any machine of this kind.
+_FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+_LOOP = """
+#ifdef _WIN32
+__declspec(dllexport)
+#endif
+void koopmpc_rollouts(long long episodes, long long steps, double* X, const double* U) {{
+  const double* arg[{sz_arg}];
+  double* res[{sz_res}];
+  casadi_int iw[{sz_iw}];
+  double w[{sz_w}];
+  for (long long e = 0; e < episodes; ++e) {{
+    for (long long k = 0; k < steps; ++k) {{
+      arg[0] = X;
+      arg[1] = U;
+      res[0] = X + {nx};
+      koopmpc_step(arg, res, iw, w, 0);
+      X += {nx};
+      U += {nu};
+    }}
+    X += {nx};
+  }}
+}}
+"""
+
+
+def source(F: ca.Function) -> str:
+    """Return C with ``koopmpc_rollouts(E, T, X, U)``: X (E, T+1, nx) from its first rows and U (E, T, nu)."""
+    x, u = ca.SX.sym("x", F.size1_in(0)), ca.SX.sym("u", F.size1_in(1))
+    step = ca.Function("koopmpc_step", [x, u], [F(x, u)])
+    generator = ca.CodeGenerator("koopmpc", {"with_header": False})
+    generator.add(step)
+    sizes = {f"sz_{name}": getattr(step, f"sz_{name}")() + 1 for name in ("arg", "res", "iw", "w")}
+    # Static: an exported name could be taken by one of the same name elsewhere in the process.
+    return (
+        "#define CASADI_SYMBOL_EXPORT static\n"
+        + generator.dump()
+        + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
+    )
+
+
+def compiler() -> list[str] | None:
+    """Return the command of a C compiler: $CC, cc, gcc or clang, the first that is found."""
+    for command in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        words = shlex.split(command)
+        if words and shutil.which(words[0]):
+            return words
+    return None
+
+
+def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
+    """Return F's machine code, from `cache` if it is there; without a cache nothing is left on disk.
+
+    Raises
+    ------
+    OSError, subprocess.SubprocessError
+        The compiler fails or its output does not load.
+    """
+    text = source(F)
+    if cache is None:
+        with tempfile.TemporaryDirectory() as folder:  # mapped code outlives its file
+            return _bound(_compile(text, command, Path(folder) / "step.so"))
+    key = "\0".join([text, *command, *_FLAGS, platform.machine(), platform.system()])
+    path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
+    if path.is_file():
+        try:
+            return _bound(path)
+        except (OSError, AttributeError):  # of another kind of machine: write it again
+            path.unlink()
+    return _bound(_compile(text, command, path))
+
+
+def private_cache() -> Path | None:
+    """Return this user's folder for machine code, or None where others could write into it."""
+    if not hasattr(os, "getuid"):
+        return None
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    folder = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "koopmpc"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return None
+    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return folder if ours and os.access(folder, os.W_OK) else None
+
+
+def _compile(text: str, command: list[str], path: Path) -> Path:
+    """Compile into a folder of our own beside `path`, then move there in one stroke."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        code, library = Path(folder) / "step.c", Path(folder) / "step.so"
+        code.write_text(text)
+        subprocess.run(
+            [*command, *_FLAGS, "-o", str(library), str(code), "-lm"], check=True, capture_output=True
+        )
+        library.replace(path)
+    return path
+
+
+def _bound(path: Path) -> Kernel:
+    rollouts = ctypes.CDLL(str(path)).koopmpc_rollouts
+    rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
+    rollouts.restype = None
+
+    def run(X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
+        if not (X.flags.c_contiguous and U.flags.c_contiguous):
+            raise AssertionError("machine code reads contiguous arrays only")
+        rollouts(U.shape[0], U.shape[1], X.ctypes.data, U.ctypes.data)
+
+    return run
