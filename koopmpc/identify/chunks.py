@@ -8,7 +8,7 @@ from jaxtyping import Float
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import Lifting
 
-ROWS = 4096  # snapshot pairs lifted at once
+ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
 
 
 class Piece(NamedTuple):

@@ -1,6 +1,7 @@
 """Second moments of the rows [ψ(x) u ψ(x⁺)]: all that the linear regressions need of the snapshots."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -11,7 +12,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.chunks import chunks, table
+from koopmpc.identify.chunks import ROWS, chunks, table
 from koopmpc.identify.solve import Rows, norms
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
@@ -19,7 +20,7 @@ from koopmpc.values import Value
 
 Route = Literal["gram", "qr"]
 _WELL_CONDITIONED = 1e6  # scaled cond(Z) up to which normal equations lose nothing
-_PILOT = 4  # chunks that choose the route
+_PILOT = 4  # least number of chunks that choose the route
 _PANEL = 16  # columns that dtpqrt eliminates at once
 
 
@@ -152,7 +153,8 @@ def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None)
     pieces = chunks(episodes)
     if route is not None:
         return _read(episodes, bound, range(len(pieces)), route)
-    pilot = sorted(set(np.linspace(0, len(pieces) - 1, _PILOT).round().astype(int).tolist()))
+    width = bound.nz + episodes.nu
+    pilot = _spread(len(pieces), max(_PILOT, -(-4 * width // ROWS)))
     first = _read(episodes, bound, pilot, "gram")
     if first.condition <= _WELL_CONDITIONED:
         total = first if len(pilot) == len(pieces) else _read(episodes, bound, range(len(pieces)), "gram")
@@ -161,7 +163,12 @@ def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None)
     return _read(episodes, bound, range(len(pieces)), "qr")
 
 
-def _read(episodes: Episodes, lifting: Lifting, which: "range | list[int]", route: Route) -> Moments:
+def _spread(total: int, wanted: int) -> list[int]:
+    """Return at most `wanted` of the indices 0 … total − 1, evenly spread."""
+    return sorted({round(i * (total - 1) / (wanted - 1)) for i in range(wanted)})
+
+
+def _read(episodes: Episodes, lifting: Lifting, which: Sequence[int], route: Route) -> Moments:
     full, pieces, nu = _with_states(lifting), chunks(episodes), episodes.nu
     width = 2 * full.nz + nu
     sums, samples = np.zeros((width, width)), 0

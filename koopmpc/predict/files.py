@@ -1,7 +1,6 @@
 """A Value in one .npz file: its arrays, and one JSON text that holds the rest."""
 
 import json
-import zipfile
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -36,13 +35,18 @@ def load_value(path: str | Path, kind: type[V]) -> V:
             arrays = {name: file[name] for name in file.files}
         tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
     except FileNotFoundError as error:
-        raise LogError(f"{path} does not exist") from error
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, UnicodeDecodeError) as error:
+        raise LogError(f"{path} does not exist; check the path") from error
+    except Exception as error:  # numpy and zipfile raise a dozen kinds for damaged bytes
         raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}") from error
     node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
     if node.get("format") != _FORMAT:
         raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")
-    value = from_data(node.get("value"), arrays)
+    try:
+        value = from_data(node.get("value"), arrays)
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    except Exception as error:  # a class met something that it was never meant to hold
+        raise LogError(f"{path} is damaged, or was made by hand: {error}") from error
     if not isinstance(value, kind):
         raise LogError(f"{path} holds a {type(value).__name__}, not a {kind.__name__}")
     return value

@@ -84,6 +84,13 @@ class LinearPredictor(Value):
         set_(self, "A", A)
         set_(self, "B", checks.array(self.B, "B", (nz, nu)))
         set_(self, "C", checks.array(self.C, "C", (nx, nz)))
+        modes = self.exact_modes
+        if modes is not None:
+            if not isinstance(lifting, Projected) or modes.shape != lifting.basis.shape:
+                raise ShapeError(
+                    f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
+                )
+            set_(self, "exact_modes", np.array(modes, dtype=np.complex128, order="C"))
 
     @property
     def nx(self) -> int:
@@ -143,7 +150,7 @@ class LinearPredictor(Value):
     def modes(self) -> Complex[np.ndarray, "nx nz"]:
         """Modes in the state's coordinates, one a column: exact DMD modes, or C times A's eigenvectors."""
         if self.exact_modes is None or not isinstance(self.lifting, Projected):
-            return self.C @ self._eigen[1]
+            return self.C @ self.eigenvectors
         whole = self.lifting.lifting
         place = {name: i for i, name in enumerate(whole.names)}
         if set(self.states) <= set(place):
@@ -165,7 +172,7 @@ class LinearPredictor(Value):
             A is defective: its eigenvectors do not span the lifted space.
         """
         try:
-            return np.linalg.inv(self._eigen[1])
+            return np.linalg.inv(self.eigenvectors)
         except np.linalg.LinAlgError as error:
             raise DataError(
                 "A is defective: its eigenvectors do not span the lifted space, so it has no complete set of "
