@@ -98,11 +98,22 @@ def private_cache() -> Path | None:
     folder = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "koopmpc"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
+        ours = _private(folder) and os.access(folder, os.W_OK)
     except OSError:
         return None
-    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
-    return folder if ours and os.access(folder, os.W_OK) else None
+    return folder if ours else None
+
+
+def _private(folder: Path) -> bool:
+    """Return whether nobody but this user (and root) can change what `folder` holds or where its path leads."""
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        return False
+    above = [parent.stat() for parent in folder.resolve().parents]
+    return all(
+        parent.st_uid in (0, os.getuid()) and (not parent.st_mode & 0o022 or parent.st_mode & stat.S_ISVTX)
+        for parent in above
+    )
 
 
 def _compile(text: str, command: list[str], path: Path) -> Path:

@@ -1,6 +1,6 @@
 """Plants that hold their state: what hardware offers, and a step map in its place."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +11,7 @@ from koopmpc.errors import DataError
 from koopmpc.plant.step_map import StepMap
 
 
+@runtime_checkable
 class Plant(Protocol):
     """What `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`."""
 
