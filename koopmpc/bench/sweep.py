@@ -1,8 +1,8 @@
 """sweep: every controller on every case of every problem; one log a run, one row a run."""
 
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,10 @@ from koopmpc.bench.results import Row, faults, reached
 from koopmpc.control.move import Controller
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import simulate
+from koopmpc.loop.simulate import Observer, simulate
+from koopmpc.recording.connect import find_viewer
 from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import record
+from koopmpc.recording.recorder import Recorder, record
 
 Progress = Callable[[str, int, int], None]
 
@@ -42,7 +43,7 @@ def sweep(
     folder
         Made if need be; holds one <problem>-<case>-<controller>.rrd a run, and results.parquet.
     live
-        Stream each run to a viewer while it runs.
+        Stream each run, while it runs, to the viewer that is up, or that is opened. Without one: one UserWarning.
     progress
         Called with (what runs now, runs done, runs in all).
 
@@ -58,6 +59,13 @@ def sweep(
     """
     names, problems, folder = chosen(controllers), list(problems), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    if live and find_viewer() is None:
+        live = False
+        warnings.warn(
+            "no Rerun viewer is up, and there is no display to open one on; the runs are recorded all the same",
+            UserWarning,
+            stacklevel=2,
+        )
     total = sum(len(problem.cases) for problem in problems) * len(names)
     rows: list[Row] = []
     for problem in problems:
@@ -97,21 +105,39 @@ def _run(parts: Prepared, case_name: str, name: str, log: Path, live: bool) -> R
     limits = problem.limits_of(case_name)
     controller = CONTROLLERS[name](parts, limits)
     _warm_up(controller, parts, case)
-    run = simulate(
-        parts.truth,
-        controller,
-        x0=case.x0,
-        reference=case.reference,
-        steps=case.steps,
-        cost=problem.cost,
-        limits=limits,
-        rng=problem.training.seed,
-        plans=True,
-        angles=problem.angles,
-        metadata=_metadata(problem, case_name, name),
-    )
-    record(run, log, scene=problem.scene, model=getattr(controller, "predictor", None))
-    return run
+    about: dict[str, Any] = {
+        "cost": problem.cost,
+        "limits": limits,
+        "angles": tuple(problem.angles),
+        "metadata": _metadata(problem, case_name, name),
+    }
+    drawn: dict[str, Any] = {"scene": problem.scene, "model": getattr(controller, "predictor", None)}
+
+    def closed_loop(*observers: Observer) -> Run:
+        return simulate(
+            parts.truth,
+            controller,
+            x0=case.x0,
+            reference=case.reference,
+            steps=case.steps,
+            observers=observers,
+            plans=True,
+            **about,
+        )
+
+    if not live:
+        run = closed_loop()
+        record(run, log, **drawn)
+        return run
+    plant = parts.truth
+    names: dict[str, Any] = {
+        "dt": plant.dt,
+        "states": plant.states,
+        "inputs": plant.inputs,
+        "outputs": plant.outputs,
+    }
+    with Recorder(log, live=True, **names, **about, **drawn) as recorder:
+        return closed_loop(recorder)
 
 
 def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
@@ -136,8 +162,4 @@ def _metadata(problem: Problem, case: str, name: str) -> dict[str, Any]:
         "horizon": problem.horizon,
         "ridge": problem.ridge,
         "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed},
-        "seed": training.seed,
-        "versions": {
-            package: version(package) for package in ("koopmpc", "casadi", "numpy", "osqp", "rerun-sdk")
-        },
     }
