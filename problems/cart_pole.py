@@ -38,20 +38,6 @@ class CartPole(km.Dynamics):
 cart_pole = CartPole()
 
 
-def products(x: ca.SX) -> list[ca.SX]:
-    """Return ω sin θ, ω cos θ, ω² sin θ and ω² sin 2θ: what the centrifugal terms are made of."""
-    theta, omega = x[2], x[3]
-    return [
-        omega * ca.sin(theta),
-        omega * ca.cos(theta),
-        omega**2 * ca.sin(theta),
-        omega**2 * ca.sin(2 * theta),
-    ]
-
-
-names = ["omega sin(theta)", "omega cos(theta)", "omega² sin(theta)", "omega² sin(2 theta)"]
-
-
 def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
     """Draw the rail with a tick at each metre, the cart, the pole, and the force as a bar of 1 m for 40 N."""
     position, theta, L = float(x[0]), float(x[2]), cart_pole.L
@@ -72,13 +58,17 @@ problem = km.Problem(
     dynamics=cart_pole,
     dt=0.05,
     equilibrium=([0.0, 0.0, np.pi, 0.0], [0.0]),
+    # Identified in closed loop, with a stabilising gain and noise. The rig's actuator is not limited to 40 N: with
+    # that limit the pole falls from many of these starts, and data of falling spoil the fit.
     training=km.Training(
-        x0=km.Uniform([-2.0, -2.0, np.pi - 0.8, -1.5], [2.0, 2.0, np.pi + 0.8, 1.5]),
-        excitation=km.Noise(-40.0, 40.0),
-        episodes=1000,
-        steps=10,
+        x0=km.Uniform([-2.0, -1.0, np.pi - 0.7, -0.7], [2.0, 1.0, np.pi + 0.7, 0.7]),
+        excitation=km.Feedback(
+            [[-2.2, -8.0, 176.0, 75.0]], km.Noise(-10.0, 10.0), x_ref=[0.0, 0.0, np.pi, 0.0]
+        ),
+        episodes=300,
+        steps=60,
     ),
-    lifting=km.State() + km.Fourier(2, states="theta") + km.Expressions(products, names) + km.Constant(),
+    lifting=km.State() + km.Fourier(1, states="theta") + km.Constant(),
     cost=km.Cost(Q=[5.0, 10.0, 50.0, 5.0], R=0.01),
     limits=km.Limits(u_min=-40.0, u_max=40.0),
     horizon=50,

@@ -67,8 +67,12 @@ problem = km.Problem(
     dynamics=pendulum,
     dt=0.05,
     equilibrium=([0.0, 0.0], [0.0]),
+    # An upright plant is identified in closed loop: without feedback it falls, and data of falling spoil the fit.
     training=km.Training(
-        x0=km.Uniform([-3.2, -4.0], [3.2, 4.0]), excitation=km.Noise(-25.0, 25.0), episodes=200, steps=40
+        x0=km.Uniform([-1.0, -1.0], [1.0, 1.0]),
+        excitation=km.Feedback([[40.0, 15.0]], km.Noise(-20.0, 20.0), u_min=-25.0, u_max=25.0),
+        episodes=200,
+        steps=60,
     ),
     lifting=km.State() + km.Fourier(2, states="theta") + km.Expressions(products, names) + km.Constant(),
     cost=km.Cost(Q=[10.0, 1.0], R=0.1),

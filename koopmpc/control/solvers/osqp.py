@@ -19,7 +19,14 @@ from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution
 from koopmpc.errors import DataError, ShapeError
 
-DEFAULTS: Mapping[str, Any] = {"eps_abs": 1e-5, "eps_rel": 1e-5, "max_iter": 4000, "check_termination": 5}
+# sigma: on plans of an unstable plant that saturate for many steps, half the iterations of OSQP's own 1e-6.
+DEFAULTS: Mapping[str, Any] = {
+    "eps_abs": 1e-5,
+    "eps_rel": 1e-5,
+    "sigma": 1e-4,
+    "max_iter": 4000,
+    "check_termination": 5,
+}
 _INFINITY = 1e30
 
 _codes = osqp.SolverStatus
