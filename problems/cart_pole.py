@@ -73,8 +73,8 @@ problem = km.Problem(
     limits=km.Limits(u_min=-40.0, u_max=40.0),
     horizon=50,
     cases={
-        "shift": km.Case(x0=[-1.0, 0.0, np.pi, 0.0], reference=[1.0, 0.0, np.pi, 0.0], steps=160),
-        "recover": km.Case(x0=[0.0, 0.0, np.pi - 0.5, 0.0], reference=[0.0, 0.0, np.pi, 0.0], steps=160),
+        "shift": km.Case(x0=[-1.0, 0.0, np.pi, 0.0], reference=[1.0, 0.0, np.pi, 0.0], steps=240),
+        "recover": km.Case(x0=[0.0, 0.0, np.pi - 0.5, 0.0], reference=[0.0, 0.0, np.pi, 0.0], steps=240),
     },
     angles=(2,),
     scene=scene,
