@@ -28,6 +28,7 @@ def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, reg
     names = [*observables, *inputs]
     size = norms(rows.P)
     zero = np.flatnonzero(size == 0)
+    zero = zero[zero >= nz] if regular else zero
     found: list[str] = []
     if zero.size:
         found.append(

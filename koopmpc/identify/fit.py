@@ -124,7 +124,7 @@ def _reduced(
     nz = task.lifting.nz
     if rank > nz:
         raise DataError(f"rank is {rank}, but the lifting has {nz} observables; pass {nz} or less")
-    Z, rest = rows.P[:, :nz], rows.P[:, nz:]
+    Z, free = rows.P[:, :nz], rows.P[:, nz:]
     _, s, Vt = np.linalg.svd(Z, full_matrices=False)
     held = int(np.sum(s > cutoff(rows) * s[0]))
     if held < rank:
@@ -135,14 +135,14 @@ def _reduced(
     r = max(min(held, rank), 1)
     basis = np.ascontiguousarray(Vt[:r].T)
     Z_r = Z @ basis
-    small = Rows(np.hstack([Z_r, rest]), rows.T, rows.rest, rows.samples)
+    small = Rows(np.hstack([Z_r, free]), rows.T, rows.rest, rows.samples)
     K = solve(small, ridge=ridge).K
     forward = K[:r, :nz].T  # X′ V_r Σ_r⁻¹, (nz, r)
     A = basis.T @ forward
     B = basis.T @ (K[r:, :nz].T if task.B is None else task.B)
     C = basis if task.C is None else task.C @ basis
-    ahead = np.vstack([A.T, np.empty((0, r)) if task.B is not None else B.T]) @ C.T
-    residual = small.residual(task.x_next, ahead)
+    given = Rows(np.hstack([Z_r, task.rows.P[:, nz:]]), task.rows.T, rows.rest, rows.samples)
+    residual = given.residual(task.x_next, np.vstack([A.T, B.T]) @ C.T)
     lost = Z - Z_r @ basis.T
     lost = lost if task.C is None else lost @ task.C.T
     state_residual = np.hypot(task.state_residual, np.sqrt(np.sum(lost**2, axis=0) / rows.samples))

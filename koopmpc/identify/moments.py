@@ -174,7 +174,8 @@ def _read(episodes: Episodes, lifting: Lifting, which: Sequence[int], route: Rou
     sums, samples = np.zeros((width, width)), 0
     for i in which:
         D = table(episodes, full, pieces[i])
-        sums = sums + D.T @ D if route == "gram" else _absorbed(sums, D)
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
+            sums = sums + D.T @ D if route == "gram" else _absorbed(sums, D)
         samples += len(D)
         _require_finite(sums.diagonal() if route == "gram" else np.abs(D).max(axis=0), full, episodes.inputs)
     return Moments(lifting, episodes.inputs, episodes.dt, samples, route, sums)

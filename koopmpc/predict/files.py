@@ -31,7 +31,7 @@ def load_value(path: str | Path, kind: type[V]) -> V:
         The file is missing, damaged, or holds something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with Path(path).open("rb") as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
     except FileNotFoundError as error:

@@ -20,6 +20,8 @@ from koopmpc.predict.files import load_value, save_value
 from koopmpc.predict.report import FitReport
 from koopmpc.values import Value
 
+_DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent
+
 
 @dataclass(frozen=True, eq=False)
 class LinearPredictor(Value):
@@ -171,13 +173,12 @@ class LinearPredictor(Value):
         DataError
             A is defective: its eigenvectors do not span the lifted space.
         """
-        try:
-            return np.linalg.inv(self.eigenvectors)
-        except np.linalg.LinAlgError as error:
+        if np.linalg.cond(self.eigenvectors) > _DEFECTIVE:
             raise DataError(
                 "A is defective: its eigenvectors do not span the lifted space, so it has no complete set of "
                 "eigenfunctions; perturb A or lift to other observables"
-            ) from error
+            )
+        return np.linalg.inv(self.eigenvectors)
 
     def eigenfunctions(self, X: ArrayLike) -> Complex[np.ndarray, "M nz"]:
         """Return φ_j(x) = ξ_jᴴ ψ(x) at rows of states (M, nx): φ_j(x⁺) = λ_j φ_j(x) without input.

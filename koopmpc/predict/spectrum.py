@@ -25,8 +25,10 @@ def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " 
 
     λ = 0 gives −∞; a frequency beyond π/dt is folded back.
     """
+    values = predictor.eigenvalues
     with np.errstate(divide="ignore"):
-        return np.log(predictor.eigenvalues) / predictor.dt
+        growth = np.log(np.abs(values)) / predictor.dt
+    return growth + 1j * (np.angle(values) / predictor.dt)
 
 
 def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, " nz"]:

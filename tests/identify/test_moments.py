@@ -1,0 +1,193 @@
+"""Moments are sums: order, grouping and chunks change nothing, and no pair spans two episodes."""
+
+from dataclasses import replace
+from functools import reduce
+from itertools import pairwise
+from operator import add
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, FitWarning
+from koopmpc.identify.chunks import chunks, table
+from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.solve import solve
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from tests.identify.plants import brute_force, random_episodes
+
+LENGTHS = st.lists(st.integers(1, 9), min_size=1, max_size=8)
+LIFTING = Constant() + State() + Monomials(2)
+
+
+def gram(m: Moments) -> np.ndarray:
+    return m.sums if m.route == "gram" else m.sums.T @ m.sums
+
+
+def close(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.abs(a - b).max() <= 1e-12 * max(np.abs(b).max(), 1))
+
+
+@given(LENGTHS, st.integers(1, 3), st.integers(0, 2), st.integers(0, 999), st.sampled_from(["gram", "qr"]))
+def test_moments_are_the_products_of_the_rows_of_each_episode(
+    lengths: list[int], nx: int, nu: int, seed: int, route: str
+) -> None:
+    data = random_episodes(seed, lengths, nx, nu)
+    m = moments(data, LIFTING, route=route)
+    D = brute_force(data, LIFTING.bind(data.states))
+    assert m.samples == sum(lengths) == len(D)
+    assert close(gram(m), D.T @ D)
+
+
+@given(LENGTHS, st.integers(1, 7), st.integers(0, 999))
+def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed: int) -> None:
+    data = random_episodes(seed, lengths, 2, 1)
+    pieces = chunks(data, rows)
+    assert all(sum(p.last - p.first for p in chunk) == rows for chunk in pieces[:-1])
+    lifting = State().bind(data.states)
+    assert np.array_equal(
+        np.vstack([table(data, lifting, chunk) for chunk in pieces]), brute_force(data, lifting)
+    )
+
+
+@given(LENGTHS, st.integers(0, 999), st.sampled_from(["gram", "qr"]), st.randoms(use_true_random=False))
+def test_moments_add_in_any_order_and_grouping(lengths: list[int], seed: int, route: str, random) -> None:
+    data = random_episodes(seed, lengths, 2, 1)
+    whole = moments(data, LIFTING, route=route)
+    parts = [moments(data[i : i + 1], LIFTING, route=route) for i in range(len(data))]
+    random.shuffle(parts)
+    left = reduce(add, parts)
+    right = reduce(lambda a, b: b + a, reversed(parts))
+    for total in (left, right):
+        assert total.samples == whole.samples
+        assert total.route == route
+        assert close(gram(total), gram(whole))
+
+
+def test_a_long_episode_in_many_chunks_equals_its_parts() -> None:
+    data = random_episodes(0, [5000], 2, 1)
+    X, U = data[0].X, data[0].U
+    cuts = [0, 1, 1023, 1024, 3333, 5000]
+    parts = [
+        Episode(X=X[a : b + 1], U=U[a:b]) for a, b in pairwise(cuts)
+    ]  # neighbours share a state and no pair
+    for route in ("gram", "qr"):
+        a = moments(data, LIFTING, route=route)
+        b = moments(Episodes(parts, data.dt), LIFTING, route=route)
+        assert a.samples == b.samples == 5000
+        assert close(gram(a), gram(b))
+
+
+def test_one_source_gives_the_same_bits_each_time() -> None:
+    data = random_episodes(0, [700] * 5, 2, 1)
+    assert moments(data, LIFTING) == moments(data, LIFTING)
+
+
+def test_a_state_that_the_lifting_lacks_is_appended_to_the_rows() -> None:
+    data = random_episodes(0, [20], 2, 1)
+    m = moments(data, Fourier(1), route="gram")
+    assert m.nz == 4
+    assert m.full.names == (*m.lifting.names, *data.states)
+    D = brute_force(data, m.full)
+    assert close(m.sums, D.T @ D)
+    assert D[:, m.regressors].shape[1] == 5
+    assert np.allclose(D[:, m.targets[4:]], data[0].X[1:])
+
+
+@pytest.mark.parametrize("route", ["gram", "qr"])
+def test_rows_have_the_second_moments_of_the_columns_asked_for(route: str) -> None:
+    data = random_episodes(3, [60, 40], 2, 1)
+    m = moments(data, LIFTING, route=route)
+    D = brute_force(data, m.full)
+    rows = m.rows(m.regressors, m.targets)
+    P, T = D[:, m.regressors], D[:, m.targets]
+    assert np.allclose(rows.P.T @ rows.P, P.T @ P, rtol=0, atol=1e-10)
+    assert np.allclose(rows.P.T @ rows.T, P.T @ T, rtol=0, atol=1e-10)
+    assert np.allclose(np.sum(rows.T**2, axis=0) + rows.rest, np.sum(T**2, axis=0))
+    K = np.linalg.lstsq(P, T, rcond=None)[0]
+    size = np.sqrt(np.mean((T - P @ K) ** 2, axis=0))
+    # a target that P holds exactly (the constant) has a residual of the rounding of its sums
+    assert np.allclose(rows.residual(np.arange(T.shape[1]), K), size, rtol=1e-9, atol=1e-6)
+
+
+def nearly_parallel(gap: float, count: int = 400) -> tuple[Episodes, np.ndarray]:
+    """Data whose states differ by `gap`: scaled cond(Z) ≈ 2/gap; and the A that made them."""
+    rng = np.random.default_rng(1)
+    A = np.array([[0.5, 0.25], [-0.75, 0.5]])
+    starts = rng.uniform(-1, 1, count)
+    X = np.column_stack([starts, starts + gap * rng.uniform(-1, 1, count)])
+    return Episodes([Episode(X=[x, A @ x]) for x in X], 0.1), A
+
+
+def test_gram_loses_at_condition_1e10_and_qr_does_not() -> None:
+    data, A = nearly_parallel(1e-10)
+    error = {}
+    for route in ("gram", "qr"):
+        m = moments(data, State(), route=route)
+        K = solve(m.rows(m.regressors, m.targets)).K
+        error[route] = np.abs(K.T - A).max()
+    assert error["qr"] < 1e-4
+    assert error["gram"] > 1e-1
+
+
+@pytest.mark.parametrize(("gap", "route"), [(1e-3, "gram"), (1e-5, "gram"), (1e-7, "qr"), (1e-10, "qr")])
+def test_the_condition_number_chooses_the_route(gap: float, route: str) -> None:
+    data, _ = nearly_parallel(gap)
+    m = moments(data, State())
+    assert m.route == route
+    D = brute_force(data, m.lifting)[:, :2]
+    assert m.condition == pytest.approx(np.linalg.cond(D / np.linalg.norm(D, axis=0)), rel=1e-3)
+
+
+def test_data_that_turn_out_worse_than_the_pilot_are_read_again() -> None:
+    # chunks that the pilot skips hold the one huge state that makes the columns parallel
+    data = random_episodes(0, [1023] * 12, 2, 0)
+    parts = list(data)
+    wild = np.array(parts[2].X)
+    wild[500] = [1e9, 1e9]
+    parts[2] = Episode(X=wild)
+    spoiled = Episodes(parts, data.dt)
+    assert moments(data, State()).route == "gram"
+    m = moments(spoiled, State())
+    assert m.condition > 1e6
+    assert m.route == "qr"
+
+
+def test_columns_are_scaled_before_they_are_judged() -> None:
+    data = random_episodes(0, [300], 3, 0)
+    D = [1.0, 1e9, 1e-9]
+    scaled = Episodes([Episode(X=e.X * D) for e in data], data.dt)
+    assert moments(scaled, State()).route == "gram"
+    assert moments(scaled, State()).condition == pytest.approx(moments(data, State()).condition)
+
+
+def test_a_triangle_and_gram_sums_become_gram_sums_and_warn() -> None:
+    data = random_episodes(0, [30, 30], 2, 1)
+    a, b = moments(data[:1], LIFTING, route="qr"), moments(data[1:], LIFTING, route="gram")
+    with pytest.warns(FitWarning, match="triangular factor was added to Gram sums.*half the digits"):
+        total = a + b
+    assert total.route == "gram"
+    assert close(total.sums, gram(moments(data, LIFTING, route="gram")))
+
+
+def test_moments_of_other_liftings_do_not_add() -> None:
+    data = random_episodes(0, [30], 2, 1)
+    a = moments(data, LIFTING)
+    with pytest.raises(DataError, match="moments differ in lifting, inputs or dt"):
+        _ = a + moments(data, State())
+    with pytest.raises(DataError, match="one plant in one lifting"):
+        _ = a + replace(a, dt=0.2)
+
+
+@pytest.mark.parametrize("route", ["gram", "qr"])
+def test_an_observable_that_is_not_finite_is_named(route: str) -> None:
+    data = Episodes([Episode(X=[[1.0], [0.5], [0.0], [0.5]])], 0.1, ["x [m]"])
+    inverse = State() + Expressions(lambda x: [1 / x[0]], ["1/x"])
+    with pytest.raises(DataError, match="the observable '1/x' is NaN, infinite"):
+        moments(data, inverse, route=route)

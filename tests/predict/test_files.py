@@ -1,0 +1,167 @@
+"""A saved predictor comes back to the bit; what is no predictor is refused with words."""
+
+import io
+import json
+import pickle
+import zipfile
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from koopmpc.errors import LogError
+from koopmpc.identify.edmd import edmd
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.gaussian import Gaussian
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from koopmpc.lifting.thin_plate import ThinPlate
+from koopmpc.predict.files import load_value, save_value
+from koopmpc.predict.linear import LinearPredictor, load_predictor
+from tests.identify.plants import random_episodes
+
+DATA = random_episodes(0, [80, 60], 2, 1)
+CENTERS = [[0.0, 0.5], [0.2, -0.7]]
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    edmd(DATA, LIFTINGS[0]).save(tmp_path / "model.npz")
+    return tmp_path / "model.npz"
+
+
+LIFTINGS = [
+    State() + Constant() + Fourier(2, states=[0]),
+    State() + Monomials(3),
+    State() + ThinPlate(CENTERS) + Gaussian(CENTERS, 0.8),
+    State() + Expressions(lambda x: [x[0] * ca.exp(-(x[1] ** 2))], ["bump"]),
+]
+
+
+@pytest.mark.parametrize("rank", [None, 2])
+@pytest.mark.parametrize("lifting", LIFTINGS, ids=lambda each: str(each.bind(DATA.states).nz))
+def test_a_predictor_comes_back_to_the_bit(lifting, rank: int | None, tmp_path: Path) -> None:
+    model = edmd(DATA, lifting, rank=rank)
+    model.save(tmp_path / "model.npz")
+    again = load_predictor(tmp_path / "model.npz")
+    assert again == model
+    assert again.report == model.report
+    U = np.random.default_rng(0).uniform(-1, 1, (20, 1))
+    assert np.array_equal(again.rollout([0.1, 0.2], U), model.rollout([0.1, 0.2], U))
+    assert np.array_equal(again.modes, model.modes)
+
+
+def test_equality_sees_one_bit(saved: Path) -> None:
+    model = load_predictor(saved)
+    A = np.array(model.A)
+    A[0, 0] = np.nextafter(A[0, 0], 2)
+    other = LinearPredictor(
+        A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, model.report
+    )
+    assert other != model
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"nothing\.npz does not exist; check the path"):
+        load_predictor(tmp_path / "nothing.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 no zip", pickle.dumps([1, 2])])
+def test_a_file_of_something_else(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "model.npz").write_bytes(content)
+    with pytest.raises(LogError, match="is no file that koopmpc saved, or is damaged"):
+        load_predictor(tmp_path / "model.npz")
+
+
+def outcome(path: Path) -> LinearPredictor | str:
+    """Return the predictor, or the text of the LogError."""
+    try:
+        return load_predictor(path)
+    except LogError as error:
+        return str(error)
+
+
+def test_any_cut_is_refused_and_any_flipped_byte_is_refused_or_harmless(saved: Path, tmp_path: Path) -> None:
+    whole = saved.read_bytes()
+    model = load_predictor(saved)
+    bad = tmp_path / "bad.npz"
+    for i in range(0, len(whole), 37):
+        bad.write_bytes(whole[:i])
+        assert str(bad) in outcome(bad)
+        bad.write_bytes(whole[:i] + bytes([whole[i] ^ 0x55]) + whole[i + 1 :])
+        got = outcome(bad)
+        assert got == model or str(bad) in got
+
+
+def test_a_pickle_inside_is_not_opened(tmp_path: Path) -> None:
+    opened: list[int] = []
+
+    class Trap:
+        def __reduce__(self) -> tuple[object, ...]:
+            return opened.append, (1,)
+
+    path = tmp_path / "trap.npz"
+    np.savez(path, tree=np.array([Trap()], dtype=object), allow_pickle=True)
+    with pytest.raises(LogError, match="is no file that koopmpc saved"):
+        load_predictor(path)
+    assert not opened
+
+
+def value(**fields: object):
+    """Return the change that sets these fields of the predictor; `...` removes one."""
+
+    def change(tree: dict) -> dict:
+        held = {k: v for k, v in (tree["value"] | fields).items() if v is not ...}
+        return tree | {"value": held}
+
+    return change
+
+
+def edited(source: Path, target: Path, change) -> Path:
+    """Write a copy of a saved predictor whose JSON text was changed by hand."""
+    with np.load(source) as file:
+        arrays = {name: file[name] for name in file.files}
+    tree = json.loads(arrays.pop("tree").tobytes())
+    tree = change(tree)
+    np.savez(target, tree=np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8), **arrays)
+    return target
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda t: t | {"format": "koopmpc-99"}, "is no koopmpc-1 file; save it again with this version"),
+        (lambda t: [1, 2], "is no koopmpc-1 file"),
+        (value(kind="os.system"), "holds a 'os.system', which this version"),
+        (value(lifting={"kind": "Popen", "args": ["ls"]}), "holds a 'Popen', which this version"),
+        (value(lifting="State"), "is damaged, or was made by hand"),
+        (value(extra=1), "'LinearPredictor' that cannot be built"),
+        (value(dt=...), "'LinearPredictor' that cannot be built"),
+        (value(dt=-1.0), "dt is -1 s; it must be above zero"),
+        (value(A={"kind": "array", "key": "array99"}), "'array' that cannot be built"),
+        (value(states=["a", "b", "c"]), "cannot be built"),
+        (lambda t: t | {"value": t["value"]["report"]}, "holds a FitReport, not a LinearPredictor"),
+        (lambda t: {"format": t["format"]}, "holds a NoneType, not a LinearPredictor"),
+    ],
+)
+def test_a_file_made_by_hand_is_refused(change, text: str, saved: Path, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=text):
+        load_predictor(edited(saved, tmp_path / "hostile.npz", change))
+
+
+def test_a_file_without_its_text(tmp_path: Path) -> None:
+    np.savez(tmp_path / "data.npz", X=np.zeros(3))
+    with pytest.raises(LogError, match="is no file that koopmpc saved"):
+        load_predictor(tmp_path / "data.npz")
+
+
+def test_any_value_goes_through_a_file(tmp_path: Path) -> None:
+    report = edmd(DATA, State()).report
+    assert report is not None
+    save_value(report, tmp_path / "report.npz")
+    assert load_value(tmp_path / "report.npz", type(report)) == report
+    with zipfile.ZipFile(io.BytesIO((tmp_path / "report.npz").read_bytes())) as file:
+        assert set(file.namelist()) == {"tree.npy", "array0.npy", "array1.npy"}

@@ -1,0 +1,92 @@
+"""The multi-step score: a perfect model scores zero, and errors land on their own step."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.state import State
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.score import score
+from tests.predict.models import random_predictor
+
+
+def runs(model: LinearPredictor, lengths: list[int], seed: int = 0, noise: float = 0.0) -> Episodes:
+    rng = np.random.default_rng(seed)
+    parts: list[Episode] = []
+    for length in lengths:
+        U = rng.standard_normal((length, model.nu))
+        X = model.rollout(rng.standard_normal(model.nx), U)
+        parts.append(Episode(X=X + noise * rng.standard_normal(X.shape), U=U))
+    return Episodes(parts, model.dt, model.states, model.inputs)
+
+
+@given(st.integers(1, 4), st.integers(0, 2), st.integers(1, 8), st.integers(1, 3), st.integers(0, 999))
+def test_a_perfect_model_scores_zero(nx: int, nu: int, horizon: int, stride: int, seed: int) -> None:
+    model = random_predictor(seed, nx, nu)
+    data = runs(model, [8, 11, 20], seed)
+    result = score(model, data, horizon, stride=stride)
+    size = max(np.abs(e.X).max() for e in data)
+    assert result.rmse.max() <= 1e-12 * max(size, 1)
+    assert result.rmse.shape == result.relative.shape == (horizon, nx)
+    assert result.horizon == horizon
+    assert result.starts == sum(len(range(0, n - horizon + 1, stride)) for n in (8, 11, 20))
+    assert result.states == model.states
+
+
+@given(st.integers(1, 7), st.integers(1, 3), st.integers(0, 99))
+def test_the_errors_are_those_of_rollouts_from_each_start(horizon: int, stride: int, seed: int) -> None:
+    model = random_predictor(seed, 2, 1, State() + Constant() + Fourier(1))
+    data = runs(random_predictor(seed, 2, 1), [7, 10], seed, noise=0.1)
+    errors, truths = [], []
+    for e in data:
+        for k in range(0, len(e) - horizon + 1, stride):
+            truths.append(e.X[k + 1 : k + horizon + 1])
+            errors.append(model.rollout(e.X[k], e.U[k : k + horizon])[1:] - truths[-1])
+    result = score(model, data, horizon, stride=stride)
+    rmse, size = np.sqrt(np.mean(np.square(errors), axis=0)), np.sqrt(np.mean(np.square(truths), axis=0))
+    assert np.allclose(result.rmse, rmse, rtol=1e-10)
+    assert np.allclose(result.relative, rmse / size, rtol=1e-10)
+    assert result.total == pytest.approx(np.sqrt(np.mean((rmse / size) ** 2)))
+
+
+def test_long_episodes_are_scored_in_blocks() -> None:
+    model = random_predictor(0, 2, 1)
+    data = runs(model, [9000], noise=0.1)
+    X, U = data[0].X, data[0].U
+    halves = [
+        Episode(X=X[a : b + 1], U=U[a:b]) for a, b in ((0, 4500), (4499, 9000))
+    ]  # horizon 2 overlaps by 1
+    whole = score(model, data, 2)
+    split = score(model, Episodes(halves, data.dt, data.states, data.inputs), 2)
+    assert whole.starts == split.starts == 8999
+    assert np.allclose(whole.rmse, split.rmse, rtol=1e-12)
+
+
+def test_a_state_that_is_zero_throughout() -> None:
+    model = LinearPredictor(np.eye(2), np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
+    data = Episodes([Episode(X=[[1, 0], [1, 0], [1, 0]])], 0.1, ("a", "b"))
+    assert np.array_equal(score(model, data, 2).relative, np.zeros((2, 2)))
+    off = LinearPredictor([[1, 0], [1, 1]], np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
+    assert np.array_equal(score(off, data, 2).relative, [[0, np.inf], [0, np.inf]])
+
+
+def test_bad_input_is_refused() -> None:
+    model = random_predictor(0, 2, 1)
+    data = runs(model, [9, 5])
+    with pytest.raises(
+        DataError, match="episode 1 has 5 steps, the horizon is 6; shorten the horizon or drop"
+    ):
+        score(model, data, 6)
+    with pytest.raises(DataError, match="horizon is 0; it must be at least 1"):
+        score(model, data, 0)
+    with pytest.raises(DataError, match="stride is 0; it must be at least 1"):
+        score(model, data, 2, stride=0)
+    with pytest.raises(ShapeError, match="the episodes have states"):
+        score(random_predictor(0, 3, 1), data, 2)
+    with pytest.raises(DataError, match=r"the episodes have dt 0.1 s, the predictor 0.2 s"):
+        score(random_predictor(0, 2, 1, dt=0.2), data, 2)

@@ -1,0 +1,144 @@
+"""The equations of the spectrum, checked against exponentials and rollouts."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.dmd import dmd
+from koopmpc.identify.edmd import edmd
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+from tests.identify.plants import one_step_pairs
+from tests.predict.models import random_predictor
+
+OSCILLATOR = np.array([[0.0, 1.0], [-4.0, -0.3]])  # ẍ = −4x − 0.3ẋ
+
+
+def sampled(dt: float) -> LinearPredictor:
+    return LinearPredictor(expm(OSCILLATOR * dt), np.empty((2, 0)), np.eye(2), State(), dt, ("x", "v"), ())
+
+
+@given(st.floats(0.01, 0.5))
+def test_continuous_eigenvalues_are_those_of_the_differential_equation(dt: float) -> None:
+    found = np.sort_complex(continuous_eigenvalues(sampled(dt)))
+    assert np.allclose(found, np.sort_complex(np.linalg.eigvals(OSCILLATOR)), atol=1e-9)
+
+
+def test_an_eigenvalue_of_zero_decays_at_once() -> None:
+    model = LinearPredictor([[0, 0], [0, 0.5]], np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
+    assert continuous_eigenvalues(model)[1].real == -np.inf
+    assert np.allclose(reconstruct(model, [3, 4], [0, 0.1, 0.2]), [[3, 4], [0, 2], [0, 1]])
+
+
+@given(st.floats(0.05, 0.5), st.integers(0, 99))
+def test_reconstruction_between_the_samples_is_the_flow(dt: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x0, times = rng.standard_normal(2), rng.uniform(0, 3, 5)
+    X = reconstruct(sampled(dt), x0, times)
+    assert np.allclose(X, [expm(OSCILLATOR * t) @ x0 for t in times], atol=1e-10)
+
+
+@given(st.integers(1, 5), st.integers(0, 999))
+def test_reconstruction_equals_the_rollout_of_a_diagonalisable_model(nx: int, seed: int) -> None:
+    model = random_predictor(seed, nx, 0)
+    x0 = np.random.default_rng(seed).standard_normal(nx)
+    X = model.rollout(x0, np.empty((15, 0)))
+    scale = np.linalg.cond(model.eigenvectors) * max(1, np.abs(X).max())
+    assert np.allclose(reconstruct(model, x0, np.arange(16) * model.dt), X, atol=1e-11 * scale)
+
+
+def test_reconstruction_of_a_lifted_model_equals_its_rollout() -> None:
+    data = quadratic_data()
+    lifting = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
+    x0, times = [0.7, -0.4], np.arange(30) * data.dt
+    whole = edmd(data, lifting)
+    expected = whole.rollout(x0, np.empty((29, 0)))
+    assert np.allclose(reconstruct(whole, x0, times), expected, atol=1e-10)
+    # at full rank the exact modes carry the same motion
+    reduced = edmd(data, lifting, rank=3)
+    assert reduced.exact_modes is not None
+    assert np.allclose(reconstruct(reduced, x0, times), expected, atol=1e-8)
+
+
+def quadratic_data() -> Episodes:
+    """x₀⁺ = .9x₀, x₁⁺ = .5x₁ + .3x₀²: exact on [x₀, x₁, x₀²]."""
+    return one_step_pairs(lambda x, u: np.array([0.9 * x[0], 0.5 * x[1] + 0.3 * x[0] ** 2]), 2, 0, 100)
+
+
+@given(st.integers(0, 99))
+def test_amplitudes_are_the_least_squares_share_of_each_exact_mode(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    X = [rng.standard_normal(6)]
+    A = random_predictor(seed, 6, 0).A
+    for _ in range(8):
+        X.append(A @ X[-1])
+    data = Episodes([Episode(X=np.array(X))], 0.1)
+    model = dmd(data, rank=3)
+    b = amplitudes(model, X[0])
+    assert np.allclose(b, np.linalg.pinv(model.modes) @ X[0], atol=1e-6 * max(1, np.abs(b).max()))
+
+
+def test_amplitudes_of_an_unreduced_model_are_its_eigenfunctions() -> None:
+    model = random_predictor(3, 2, 0, State() + Constant() + Monomials(2))
+    assert np.allclose(amplitudes(model, [0.3, 0.4]), model.eigenfunctions([[0.3, 0.4]])[0])
+
+
+def test_eigenfunctions_of_an_exact_model_evolve_linearly() -> None:
+    data = quadratic_data()
+    lifting = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
+    error = linearity_error(edmd(data, lifting), data)
+    assert error.shape == (3,)
+    assert error.max() < 1e-10
+
+
+def test_eigenfunctions_of_a_wrong_lifting_do_not() -> None:
+    data = quadratic_data()
+    model = edmd(data, State())
+    s = data.snapshots()
+    phi, ahead = model.eigenfunctions(s.X), model.eigenfunctions(s.X_next)
+    expected = [
+        np.linalg.norm(ahead[:, j] - model.eigenvalues[j] * phi[:, j]) / np.linalg.norm(phi[:, j])
+        for j in (0, 1)
+    ]
+    error = linearity_error(model, data)
+    assert np.allclose(error, expected, atol=1e-12)
+    assert error.min() < 1e-10  # x₀ alone is an eigenfunction
+    assert error.max() > 0.05
+
+
+def test_inputs_are_accounted_for() -> None:
+    model = random_predictor(0, 3, 2)
+    rng = np.random.default_rng(0)
+    U = rng.standard_normal((9000, 2))  # longer than one block
+    data = Episodes(
+        [Episode(X=model.rollout(rng.standard_normal(3), U), U=U)], model.dt, model.states, model.inputs
+    )
+    assert linearity_error(model, data).max() < 1e-12
+
+
+def test_data_of_another_plant_are_refused() -> None:
+    model = random_predictor(0, 2, 1)
+    X, U = np.ones((4, 2)), np.ones((3, 1))
+    with pytest.raises(
+        ShapeError, match=r"the episodes have states \(x0, x1\), the predictor has \(x0 \[m\]"
+    ):
+        linearity_error(model, Episodes([Episode(X=X, U=U)], 0.1))
+    with pytest.raises(ShapeError, match=r"the episodes have inputs \(\), the predictor has \(u0 \[N\]\)"):
+        linearity_error(model, Episodes([Episode(X=X)], 0.1, model.states))
+    with pytest.raises(DataError, match=r"the episodes have dt 0.2 s, the predictor 0.1 s"):
+        linearity_error(model, Episodes([Episode(X=X, U=U)], 0.2, model.states, model.inputs))
+
+
+def test_an_eigenfunction_that_is_zero_on_the_data_has_no_relative_error() -> None:
+    model = LinearPredictor(np.diag([0.9, 0.5]), np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
+    data = Episodes([Episode(X=[[1, 0], [0.9, 0]])], 0.1, ("a", "b"))
+    with pytest.raises(DataError, match="eigenfunction 1 is 0 in all snapshots"):
+        linearity_error(model, data)
