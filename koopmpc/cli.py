@@ -133,12 +133,11 @@ def _sweep(
         )
     out = _console()
     out.print(table(rows))
-    out.print(f"\nlogs and results.parquet: {folder}", highlight=False, soft_wrap=True)
-    out.print(
-        f"look at a run:  koopmpc view {next((row.log for row in rows if row.log), folder)}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
+    logged = [row for row in rows if row.log is not None]
+    if logged:
+        shown = next((row for row in logged if row.controller == "koopman-mpc"), logged[0])
+        out.print(Text(f"look at a run: koopmpc view {shown.log}"), soft_wrap=True)
     if any(row.fault is not None for row in rows):
         raise typer.Exit(1)
 

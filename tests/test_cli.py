@@ -5,12 +5,12 @@ import subprocess
 import sys
 
 import pytest
-from koopmpc.recording.reader import load_run
 from typer.testing import CliRunner
 
 from koopmpc.bench.controllers import CONTROLLERS
 from koopmpc.cli import app
 from koopmpc.loop.metrics import metrics
+from koopmpc.recording.reader import load_run
 from tests.bench.tiny import write
 
 TWO = ["-c", "lqr", "-c", "koopman-mpc"]
@@ -42,6 +42,7 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
     assert "tiny:near" in result.stdout
     assert "does not reach" in result.stdout  # six steps are too few, and that is no failure
     assert f"logs{os.sep}{folder.name}" in result.stdout
+    assert f"koopmpc view logs{os.sep}{folder.name}{os.sep}tiny-near-koopman-mpc.rrd" in result.stdout
 
 
 def test_run_takes_a_name_in_problems_and_one_case(call, tmp_path):
@@ -153,6 +154,7 @@ def test_fit_warnings_are_one_line(call, tmp_path):
     doubtful = write(tmp_path, **{"episodes=20, steps=5": "episodes=1, steps=2"})
     result = call("run", f"{doubtful}:far", "-c", "koopman-mpc")
     assert "FitWarning: " in result.stderr
+    assert "warnings.warn" not in result.stderr
 
 
 def test_python_m_is_the_same_program(tmp_path):

@@ -20,8 +20,8 @@ _STATUS = {
     "OPTIMAL": "optimal",
     "SOFTENED": "softened",
     "SATURATED": "clipped",
-    "MAX_ITERATIONS": "iterations",
-    "TIME_LIMIT": "time",
+    "MAX_ITERATIONS": "unfinished",
+    "TIME_LIMIT": "out of time",
     "INFEASIBLE": "infeasible",
     "BAD_MEASUREMENT": "bad y",
     "FAILED": "failed",
@@ -31,7 +31,8 @@ LEGEND = (
     "cost: Σ‖x−r‖²_Q + ‖u‖²_R over the run, and its ratio to nonlinear-mpc. settles: time until the weighted "
     "error stays below 2 % of its first value. off: largest entry of x−r at the end. over: largest violation of "
     "a state or output limit. p50, p99: time of a step. Steps: free, the unconstrained optimum met all limits; "
-    "optimal, a QP or NLP was solved; clipped, the feedback was cut to the input limits."
+    "optimal, a QP or NLP was solved; unfinished, it was not, and a fallback took over; clipped, the feedback was "
+    "cut to the input limits."
 )
 
 

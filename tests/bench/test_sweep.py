@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from koopmpc.recording.reader import load_run
 
 from koopmpc.bench.controllers import CONTROLLERS, chosen
 from koopmpc.bench.library import load_problem
@@ -15,6 +14,8 @@ from koopmpc.bench.sweep import sweep
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.errors import ProblemError
 from koopmpc.loop.metrics import metrics
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.recorder import Recorder
 from tests.bench.tiny import write
 
 FIVE = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "nonlinear-mpc"]
@@ -160,6 +161,35 @@ def test_a_log_that_differs_is_a_fault(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.load_run", lambda path: None)
     (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.fault == "tiny-far-lqr.rrd does not read back equal to the run"
+
+
+class Unseen(Recorder):
+    """A Recorder that streams nowhere."""
+
+    def __init__(self, path, *, live, **about):
+        assert live
+        super().__init__(path, **about)
+
+
+def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
+    problem, rows, _, _ = swept
+    monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
+    monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
+    (row,) = sweep([problem.select("far")], ["koopman-mpc"], folder=tmp_path, live=True)
+    assert row.fault is None
+    live = load_run(row.log)
+    kept = load_run(next(r.log for r in rows if (r.case, r.controller) == ("far", "koopman-mpc")))
+    assert np.array_equal(live.U, kept.U)
+    assert live.plans == kept.plans
+    assert live.metadata == kept.metadata
+
+
+def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):
+    monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: None)
+    with pytest.warns(UserWarning, match="no Rerun viewer is up") as caught:
+        rows = sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, live=True)
+    assert len(caught) == 1
+    assert [row.fault for row in rows] == [None, None]
 
 
 def test_missing_steps_and_statuses_are_faults(swept):
