@@ -48,40 +48,33 @@ def right_side(dynamics: Dynamics) -> ca.Function:
     """
     _check_names(dynamics)
     x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
-    value = _expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", dynamics.nx)
-    return closed(
-        ca.Function("f", [x, u], [ca.densify(value)], ["x", "u"], ["dx"]), f"{type(dynamics).__name__}.rhs"
-    )
+    value = _expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", ca.vertcat(x, u), dynamics.nx)
+    return ca.Function("f", [x, u], [value], ["x", "u"], ["dx"])
 
 
 def output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
     """Return h of y = h(x), and the names of y: a state's own name where h passes that state on."""
     _check_names(dynamics)
     x = ca.SX.sym("x", dynamics.nx)
-    value = _expression(dynamics.measure(x), f"{type(dynamics).__name__}.measure", None)
+    value = _expression(dynamics.measure(x), f"{type(dynamics).__name__}.measure", x)
     names: list[str] = []
     for i in range(value.size1()):
         passed = [name for j, name in enumerate(dynamics.states) if ca.is_equal(value[i], x[j])]
         names.append(passed[0] if passed else f"y{i}")
-    h = ca.Function("h", [x], [ca.densify(value)], ["x"], ["y"])
-    return closed(h, f"{type(dynamics).__name__}.measure"), tuple(names)
+    return ca.Function("h", [x], [value], ["x"], ["y"]), tuple(names)
 
 
-def closed(function: ca.Function, name: str) -> ca.Function:
-    """Return `function` if all of its symbols are arguments."""
-    if function.has_free():
-        raise DataError(f"{name} holds free symbols {function.get_free()}; make them parameters with numbers")
-    return function
-
-
-def _expression(value: object, name: str, rows: int | None) -> ca.SX:
+def _expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
     if not isinstance(value, ca.SX | ca.DM):
         raise DataError(f"{name} returned a {type(value).__name__}; return one column, ca.vertcat(...)")
     column = ca.SX(value)
     if column.size2() != 1 or (rows is not None and column.size1() != rows):
         expected = f"({rows}, 1), one row a state" if rows is not None else "one column"
         raise ShapeError(f"{name} returned shape {column.shape}, expected {expected}")
-    return column
+    free = [str(symbol) for symbol in ca.symvar(column) if not ca.depends_on(symbol, known)]
+    if free:
+        raise DataError(f"{name} holds free symbols {free}; make them parameters with numbers")
+    return ca.densify(column)
 
 
 def _check_names(dynamics: Dynamics) -> None:

@@ -14,7 +14,7 @@ from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plant.batch import Batch, march, warn_of
 from koopmpc.plant.buffered import Buffered, dense
-from koopmpc.plant.dynamics import Dynamics, closed, output, right_side
+from koopmpc.plant.dynamics import Dynamics, output, right_side
 from koopmpc.plant.integrators import RK4, Integrator
 from koopmpc.values import Value
 
@@ -48,7 +48,7 @@ class StepMap:
     ShapeError
         F or h takes or returns other shapes, or there are more or fewer names than rows.
     DataError
-        dt is not above zero, or F holds free symbols.
+        dt is not above zero.
     """
 
     F: ca.Function
@@ -79,8 +79,8 @@ class StepMap:
         if h.size1_in(0) != nx:
             raise ShapeError(f"h takes {h.size1_in(0)} states, F has {nx}; pass h of the same x")
         freeze = object.__setattr__
-        freeze(self, "F", dense(closed(F, "F")))
-        freeze(self, "h", dense(closed(h, "h")))
+        freeze(self, "F", dense(F))
+        freeze(self, "h", dense(h))
         freeze(self, "dt", checks.positive(dt, "dt", "s"))
         freeze(self, "states", _names(states, "states", "x", nx))
         freeze(self, "inputs", _names(inputs, "inputs", "u", nu))
