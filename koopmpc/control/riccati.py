@@ -12,6 +12,7 @@ from koopmpc import checks
 from koopmpc.errors import DataError, DefinitenessError
 
 SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
+RESTS = 50  # steps for which it must have settled, at most
 LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
 
 
@@ -103,22 +104,55 @@ def stationary(
     R: Float[np.ndarray, "nu nu"],
     most: int,
 ) -> Gain:
-    """Iterate P ← Q + AᵀP(A − BK) from P = Q until K moves by less than 1e-9, at most `most` steps.
+    """Iterate P ← Q + AᵀP(A − BK) from P = Q until K rests, at most `most` steps.
 
-    Never refused: a Constant, or any other mode that u cannot move, only makes its own entries of P grow, which
-    z − z_r does not see; what has grown by 1e12 stops the iteration.
+    K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
+    weight may take that long to reach an input. Never refused: a Constant, or any other mode that u cannot move,
+    only makes its own entries of P grow, which z − z_r does not see. Where P has grown by 1e12, an unstable mode
+    that u cannot move has taken over; the iteration then runs on the controllable part alone.
     """
+    gain, bounded = _iterate(A, B, Q, R, most)
+    if not bounded:
+        V = _controllable(A, B)
+        gain, _ = _iterate(A @ V @ V.T, B, Q, R, most)
+    return gain
+
+
+def _iterate(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    most: int,
+) -> tuple[Gain, bool]:
+    """Return the last gain, and whether P stayed below `LARGEST`."""
     P, K = Q, np.zeros((B.shape[1], A.shape[0]))
     scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
+    rested = 0
     for _ in range(most):
         K_next, _, P_next = _step(A, B, Q, R, P)
         if not np.isfinite(P_next).all() or float(np.abs(P_next).max()) > LARGEST * scale:
-            break
+            return Gain(K, P), False
         moved = float(np.abs(K_next - K).max(initial=0.0))
         P, K = P_next, K_next
-        if moved < SETTLED * (1 + float(np.abs(K).max(initial=0.0))):
+        rested = rested + 1 if moved <= SETTLED * float(np.abs(K).max(initial=0.0)) else 0
+        if rested >= min(len(A), RESTS):
             break
-    return Gain(K, P)
+    return Gain(K, P), True
+
+
+def _controllable(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nc"]:
+    """Return an orthonormal basis of the controllable subspace, the span of [B, AB, A²B, …]."""
+    V = np.empty((len(A), 0))
+    new, least = B, SETTLED * float(np.linalg.norm(B, 2))
+    while new.shape[1] and V.shape[1] < len(A):
+        for _ in range(2):  # twice is enough for orthogonality to rounding
+            new = new - V @ (V.T @ new)
+        left, sigma, _ = np.linalg.svd(new, full_matrices=False)
+        left = left[:, sigma > least]
+        V = np.hstack([V, left])
+        new, least = A @ left, SETTLED * float(np.linalg.norm(A, 2))
+    return V
 
 
 def _step(
