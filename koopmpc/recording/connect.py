@@ -1,0 +1,75 @@
+"""Find the viewer that is up, or open one; never wait for one that cannot come."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+PORT = 9876
+_START = 15.0  # longest wait for a viewer that was opened [s]
+
+
+def find_viewer(port: int = PORT) -> str | None:
+    """Return the address of the viewer at `port`, opened if there is none yet; None where there is no display."""
+    if not is_up(port) and not (has_display() and open_viewer([], port)):
+        return None
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def is_up(port: int) -> bool:
+    """Return whether something listens at `port` of this machine."""
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=0.2):
+            return True
+    except OSError:
+        return False
+
+
+def has_display() -> bool:
+    """Return whether a window can be opened."""
+    if sys.platform.startswith("linux"):
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return True
+
+
+def open_viewer(logs: Sequence[str], port: int = PORT) -> bool:
+    """Start a viewer that lives on by itself and listens to this machine alone; return whether it came up."""
+    viewer = start_viewer(*logs, port=port)
+    if viewer is not None:
+        viewer.returncode = 0  # nobody waits for it
+    return viewer is not None
+
+
+def start_viewer(*arguments: str, port: int) -> "subprocess.Popen[bytes] | None":
+    """Start the viewer's process and return it as soon as it listens; None where it ends before, or never does."""
+    command = [str(_program()), "--bind", "127.0.0.1", "--port", str(port), *arguments]
+    quiet = subprocess.DEVNULL
+    viewer = subprocess.Popen(
+        command,
+        stdin=quiet,
+        stdout=quiet,
+        stderr=quiet,
+        start_new_session=True,
+        env=os.environ | {"RUST_LOG": "error"},  # its notes would cover the picture
+    )
+    deadline = time.monotonic() + _START
+    while time.monotonic() < deadline and viewer.poll() is None:
+        if is_up(port):
+            return viewer
+        time.sleep(0.05)
+    viewer.kill()
+    viewer.wait()
+    return None
+
+
+def _program() -> Path:
+    """Return the viewer itself, not the script that starts it: that one would leave it behind when it ends."""
+    import rerun_cli
+
+    folder = Path(rerun_cli.__file__).parent
+    if sys.platform == "darwin" and (app := folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun").exists():
+        return app
+    return folder / ("rerun.exe" if sys.platform.startswith("win") else "rerun")

@@ -1,0 +1,166 @@
+"""About: all of a Run that does not change from step to step, as exact JSON and as a page to read."""
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, cast
+
+import numpy as np
+
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.errors import LogError
+from koopmpc.lifting.base import Lifting
+from koopmpc.loop.metrics import Metrics
+from koopmpc.loop.run import Run
+from koopmpc.values import Value, from_data, to_data
+
+_FORMAT = "koopmpc-log-1"
+
+
+@dataclass(frozen=True, eq=False)
+class About(Value):
+    """The fields of a Run that one line in a log holds for all steps."""
+
+    cost: Cost | None
+    limits: Limits | None
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    angles: tuple[int, ...] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @classmethod
+    def of(cls, run: Run) -> "About":
+        """Return what `run` says about itself."""
+        return cls(**{f.name: getattr(run, f.name) for f in dataclasses.fields(cls)})
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields as keywords for a Run."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+
+    @property
+    def problem(self) -> str:
+        """The problem's name, "run" where the metadata have none."""
+        return str(self.metadata.get("problem", "run"))
+
+    @property
+    def application(self) -> str:
+        """One application a problem: Rerun keeps the layouts that people make by it."""
+        return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]", "_", self.problem)
+
+    @property
+    def title(self) -> str:
+        """Problem, case and controller, as far as they are known."""
+        parts = [self.metadata.get(key) for key in ("problem", "case", "controller")]
+        return " · ".join(str(p) for p in parts if p is not None) or "run"
+
+    def tracked(self, nr: int) -> tuple[str, ...]:
+        """Return the names of the `nr` outputs that the references belong to."""
+        names = self.states if self.cost is None else self.cost.of.bind(self.states).names
+        return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))
+
+
+def to_json(about: About, steps: int | None) -> str:
+    """Return `about` as JSON, exact to the bit; `steps` where the length is known beforehand."""
+    tree = {"format": _FORMAT, "steps": steps, "written_with": _versions(), "about": to_data(about)}
+    return json.dumps(tree, ensure_ascii=False)
+
+
+def from_json(text: str) -> tuple[About, int | None]:
+    """Return what `to_json` wrote.
+
+    Raises
+    ------
+    LogError
+        The text is damaged or of another format.
+    """
+    try:
+        tree: Any = json.loads(text)
+        if tree["format"] != _FORMAT:
+            raise LogError(f"the description has format {tree['format']!r}, this koopmpc reads {_FORMAT!r}")
+        about, steps = from_data(tree["about"]), tree["steps"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogError(f"the description is damaged: {error}") from error
+    if not isinstance(about, About):
+        raise LogError(f"the description holds a {type(about).__name__}, not what a run is about")
+    return about, steps
+
+
+def to_markdown(about: About) -> str:
+    """Return a page that says what ran, under which cost and limits, with which seeds and versions."""
+    lines = [f"# {about.title}", ""]
+    if "title" in about.metadata:
+        lines += [str(about.metadata["title"]), ""]
+    lines += [f"**States** {', '.join(about.states)}  ", f"**Inputs** {', '.join(about.inputs)}  "]
+    lines += [f"**Sampling time** {about.dt:g} s", ""]
+    if about.cost is not None:
+        lines += [
+            "| cost | value |",
+            "|---|---|",
+            *_table(about.cost, ("Q", "R", "Q_N", "of", "u_target"), about),
+            "",
+        ]
+    if about.limits is not None:
+        names = ("u_min", "u_max", "x_min", "x_max", "of", "y_min", "y_max", "slack")
+        lines += ["| limits | value |", "|---|---|", *_table(about.limits, names, about), ""]
+    rows = [(key, value) for key, value in about.metadata.items() if key != "title"]
+    rows.append(("written with", _versions()))
+    lines += ["| run | value |", "|---|---|", *(f"| {key} | {_short(value)} |" for key, value in rows), ""]
+    return "\n".join(lines)
+
+
+def metrics_to_markdown(metrics: Metrics, tracked: tuple[str, ...]) -> str:
+    """Return the metrics as a table."""
+    m = metrics
+    times = (m.solve_time_p50, m.solve_time_p99, m.solve_time_max)
+    rows = [
+        ("closed-loop cost", f"{m.cost:.6g}"),
+        *((f"tracking RMSE, {n}", f"{e:.4g}") for n, e in zip(tracked, m.tracking_rmse, strict=True)),
+        *((f"final error, {n}", f"{e:.3g}") for n, e in zip(tracked, m.final_error, strict=True)),
+        ("settling time", f"{m.settling_time:.3g} s" if np.isfinite(m.settling_time) else "never settles"),
+        ("state limit violation", f"{m.violation:.3g}"),
+        ("input limit violation", f"{m.input_violation:.3g}"),
+        ("effort, Σ u² dt", f"{m.effort:.4g}"),
+        ("solve time p50 / p99 / max", " / ".join(f"{1e3 * t:.3g}" for t in times) + " ms"),
+        ("late steps", str(m.late)),
+        ("status", _short(m.status)),
+        ("fallback", _short(m.fallback)),
+    ]
+    return "\n".join(["| metric | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def _table(value: Value, names: tuple[str, ...], about: About) -> list[str]:
+    pairs = [(name, getattr(value, name)) for name in names]
+    pairs = [(n, ", ".join(v.bind(about.states).names) if isinstance(v, Lifting) else v) for n, v in pairs]
+    return [f"| {name} | {_short(v)} |" for name, v in pairs if v is not None]
+
+
+def _short(value: Any) -> str:
+    """Return `value` in a few characters, fit for a cell."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k} {_short(v)}" for k, v in cast("Mapping[str, Any]", value).items())
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, np.ndarray):
+        text = np.array2string(cast("np.ndarray", value), precision=4, threshold=16, separator=", ")
+    else:
+        text = str(value)
+    text = " ".join(text.split()).replace("|", "\\|")
+    return text if len(text) <= 200 else text[:199] + "…"
+
+
+@cache
+def _versions() -> dict[str, str]:
+    found: dict[str, str] = {}
+    for package in ("koopmpc", "numpy", "casadi", "osqp", "rerun-sdk"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found

@@ -1,0 +1,236 @@
+"""load_run: a log back into the Run that was written, to the bit."""
+# pyright: basic
+
+import struct
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koopmpc.control.move import Fallback, Status
+from koopmpc.errors import LogError
+from koopmpc.loop.run import Plans, Run
+from koopmpc.recording.description import About, from_json
+
+_ENTITIES = (
+    "/state", "/reference", "/measurement", "/control/u", "/solver/time_ms", "/solver/status",
+    "/prediction/x", "/prediction/u", "/description", "/metrics",
+)  # fmt: skip
+_MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
+_FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
+
+
+def load_run(path: str | Path) -> Run:
+    """Return the Run that `record` or a `Recorder` wrote to `path`, equal to the bit.
+
+    A log that was cut short, or whose writer died, yields the steps that are whole, and a UserWarning.
+
+    Raises
+    ------
+    LogError
+        The file is missing, no log of koopmpc, damaged, or holds no whole step.
+    """
+    path = Path(path)
+    log = _read(path)
+    about, planned_steps = _about(log, path)
+    X, reference = log.vectors("/state"), log.vectors("/reference")
+    U = log.vectors("/control/u")
+    seconds, iterations = (
+        log.column("/solver/time_ms", "seconds"),
+        log.column("/solver/time_ms", "iterations"),
+    )
+    counts = [len(X) - 1, len(seconds)]
+    counts += [len(U)] if about.inputs else []
+    counts += [len(reference) - 1] if len(reference) else []
+    steps = min(counts)
+    if steps < 1:
+        raise LogError(f"{path} holds no whole step; its run ended before the second state was written")
+    end = log.static("/metrics", "steps")
+    if end is None or end != steps:
+        total = end if end is not None else planned_steps
+        of = "" if total is None else f" of {total}"
+        warnings.warn(
+            f"{path} ends after step {steps}{of}: the file was cut short or its writer did not close it; "
+            "the run holds what is there",
+            UserWarning,
+            stacklevel=2,
+        )
+    status, fallback = _statuses(log, steps, path)
+    return Run(
+        X=X[: steps + 1],
+        Y=_measured(log, X)[: steps + 1],
+        U=U[:steps] if len(U) else np.empty((steps, 0)),
+        reference=reference[: steps + 1] if len(reference) else np.empty((steps + 1, 0)),
+        status=status,
+        fallback=fallback,
+        solve_time=seconds[:steps],
+        iterations=iterations[:steps].astype(np.int64),
+        plans=_plans(log, steps),
+        **about.fields(),
+    )
+
+
+class _Log:
+    """The columns of a recording: rows in order of their step, by (entity, component)."""
+
+    def __init__(self, chunks: Any) -> None:
+        self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
+        for chunk in chunks:
+            batch = chunk.to_record_batch()
+            k = (
+                None
+                if chunk.is_static
+                else batch.column("step").to_numpy(zero_copy_only=False).astype(np.int64)
+            )
+            for name in batch.schema.names:
+                metadata = batch.schema.field(name).metadata or {}
+                if metadata.get(b"rerun:kind") == b"data":
+                    key = (chunk.entity_path, name.split(":")[-1])
+                    self._parts.setdefault(key, []).append((k, batch.column(name)))
+
+    def static(self, entity: str, component: str) -> Any:
+        """Return the one value that does not change, or None."""
+        parts = self._parts.get((entity, component))
+        return None if parts is None else parts[-1][1].to_pylist()[-1][0]
+
+    def rows(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Return the steps, the width, and the flat values of a component, in order of the steps."""
+        import pyarrow as pa
+
+        parts = self._parts.get((entity, component), [])
+        if not parts:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+        k = np.concatenate([k for k, _ in parts])
+        lists = pa.concat_arrays([column for _, column in parts])
+        order = np.argsort(k, kind="stable")
+        if (np.diff(k) < 0).any():
+            k, lists = k[order], lists.take(pa.array(order))
+        widths = lists.value_lengths().to_numpy(zero_copy_only=False)
+        return k, widths, lists.flatten()
+
+    def matrix(self, entity: str, component: str = "scalars") -> tuple[np.ndarray, np.ndarray]:
+        """Return the steps and one row of values each."""
+        k, widths, values = self.rows(entity, component)
+        flat = values if isinstance(values, np.ndarray) else values.to_numpy(zero_copy_only=False)
+        if len(widths) and (widths != widths[0]).any():
+            raise LogError(f"{entity} has rows of different lengths; the log was not written by koopmpc")
+        return k, np.array(flat).reshape(len(k), int(widths[0]) if len(widths) else 0)
+
+    def vectors(self, entity: str) -> np.ndarray:
+        """Return the rows 0, 1, … up to the first that is missing."""
+        k, values = self.matrix(entity)
+        return values[: _whole(k)]
+
+    def column(self, entity: str, component: str) -> np.ndarray:
+        """Return one number a row: 0, 1, … up to the first that is missing."""
+        k, values = self.matrix(entity, component)
+        return values[: _whole(k)].reshape(-1)
+
+
+def _whole(k: np.ndarray) -> int:
+    """Return how many of 0, 1, 2, … stand at the head of `k`."""
+    gaps = np.flatnonzero(k != np.arange(len(k)))
+    return int(gaps[0]) if len(gaps) else len(k)
+
+
+def _read(path: Path) -> _Log:
+    from rerun.chunk import RrdReader
+
+    if not path.is_file():
+        raise LogError(f"{path} does not exist; pass the .rrd of a run")
+    try:
+        with _whole_messages(path) as whole, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Rerun's word on a missing footer: load_run has its own
+            return _Log(RrdReader(whole).stream().filter(content=list(_ENTITIES)).to_chunks())
+    except LogError:
+        raise
+    except Exception as error:  # the reader of Rerun raises whatever its own parts raise
+        raise LogError(f"{path} is no log, or is damaged: {error}") from error
+
+
+@contextmanager
+def _whole_messages(path: Path) -> Iterator[Path]:
+    """Yield a file that ends with a whole message: `path` itself, or a copy without its last, torn message.
+
+    An .rrd is a header of 12 bytes and then messages, each with a header of 16 bytes (kind and length, little-endian).
+    """
+    size, end = path.stat().st_size, _FILE_HEADER
+    with path.open("rb") as file:
+        if file.read(4) != _MAGIC:
+            raise LogError(f"{path} is no log of koopmpc: it does not start as an .rrd file does")
+        file.seek(max(size - 12, 0))
+        closed = file.read(8) == _FOOTER
+        while not closed and end + _MESSAGE_HEADER <= size:
+            file.seek(end)
+            kind, length = struct.unpack("<QQ", file.read(_MESSAGE_HEADER))
+            if not _END < kind <= _LAST_KIND or end + _MESSAGE_HEADER + length > size:
+                break
+            end += _MESSAGE_HEADER + length
+        if closed or end == size:
+            yield path
+            return
+        file.seek(0)
+        head = file.read(end)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "whole.rrd"
+        copy.write_bytes(head)
+        yield copy
+
+
+def _about(log: _Log, path: Path) -> tuple[About, int | None]:
+    text = log.static("/description", "json")
+    if text is None:
+        raise LogError(f"{path} is a Rerun recording, but no log of koopmpc: it has no description")
+    return from_json(text)
+
+
+def _measured(log: _Log, X: np.ndarray) -> np.ndarray:
+    """Return the measurements: the states, but for the rows that were written apart."""
+    k, values = log.matrix("/measurement")
+    if not len(k):
+        return X.copy()
+    if values.shape[1] != X.shape[1]:
+        return values
+    Y = X.copy()
+    inside = k < len(Y)
+    Y[k[inside]] = values[inside]
+    return Y
+
+
+def _statuses(log: _Log, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
+    """Return what each step ended with: the last change at or before it."""
+    k, _, words = log.rows("/solver/status", "state")
+    if not len(k) or k[0] != 0:
+        raise LogError(f"{path} lacks the status of its first step; it was not written by koopmpc")
+    try:
+        pairs = [_pair(word) for word in words.to_pylist()]
+    except KeyError as error:
+        raise LogError(
+            f"{path} holds the status {error}, which this version of koopmpc does not know"
+        ) from error
+    held = [pairs[i] for i in np.searchsorted(k, np.arange(steps), side="right") - 1]
+    return tuple(s for s, _ in held), tuple(f for _, f in held)
+
+
+def _pair(word: str) -> tuple[Status, Fallback]:
+    status, _, fallback = word.partition(" → ")
+    return Status[status], Fallback[fallback or "NONE"]
+
+
+def _plans(log: _Log, steps: int) -> Plans | None:
+    """Return the plans, NaN where a step had none; None where no step had one."""
+    parts = []
+    for entity in ("/prediction/x", "/prediction/u"):
+        k, values = log.matrix(entity)
+        width = log.static(entity, "last_width")
+        if width is None or not len(k):
+            return None
+        whole = np.full((steps, values.shape[1] // width, width), np.nan)
+        inside = k < steps
+        whole[k[inside]] = values[inside].reshape(-1, *whole.shape[1:])
+        parts.append(whole)
+    return Plans(*parts)

@@ -1,0 +1,225 @@
+"""Writer: the one way in which rows become a Rerun recording."""
+# pyright: basic
+
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koopmpc.control.move import Fallback, Status
+from koopmpc.errors import KoopmpcError
+from koopmpc.loop.metrics import metrics
+from koopmpc.loop.run import Run
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.recording.blueprint import blueprint
+from koopmpc.recording.description import About, metrics_to_markdown, to_json, to_markdown
+from koopmpc.recording.rows import Rows
+from koopmpc.recording.scenes import Bounds, Drawing, Scene, draw, draw_ahead, stages
+from koopmpc.recording.styles import input_limits, styles
+
+_FLUSH = 3.0  # longest wait for a sink [s]
+
+
+class Writer:
+    """One recording: `about` first, then blocks of rows in order, then the end.
+
+    Within a block the states go last: a state that can be read says that all else of its row can be read.
+    """
+
+    def __init__(
+        self,
+        about: About,
+        *,
+        path: Path | None,
+        viewer: str | None = None,
+        scene: Scene | None = None,
+        model: LinearPredictor | None = None,
+        steps: int | None = None,
+    ) -> None:
+        """Open the sinks; `viewer` is the address of a viewer that is up."""
+        import rerun as rr
+
+        self._about, self._scene, self._model = about, scene, model
+        self._bounds = Bounds()
+        self._status: tuple[Status, Fallback] | None = None
+        self._styled: set[str] = set()
+        self._u: np.ndarray | None = None
+        self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
+        sinks: list[Any] = []
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            sinks.append(rr.FileSink(path))
+        if viewer is not None:
+            sinks.append(rr.GrpcSink(viewer))
+        self._rec.set_sinks(*sinks, default_blueprint=self._blueprint())
+        self._rec.send_recording_name(about.title)
+        text = rr.TextDocument(to_markdown(about), media_type=rr.MediaType.MARKDOWN)
+        self._rec.log("description", text, rr.AnyValues(json=to_json(about, steps)), static=True)
+        if model is not None:
+            self._eigenvalues(model)
+
+    def write(self, rows: Rows) -> None:
+        """Write one block."""
+        import rerun as rr
+
+        n, m = len(rows.X), len(rows.U)
+        k = rows.k + np.arange(n)
+        if not self._styled:
+            for entity, style in styles(self._about, rows).items():
+                self._style(entity, style)
+        if self._scene is not None:
+            self._draw(rows)
+        if len(rows.planned):
+            self._vectors("prediction/x", rows.planned, rows.plan_X)
+            self._vectors("prediction/u", rows.planned, rows.plan_U)
+        measured = _differ(rows.X, rows.Y)
+        self._vectors("measurement", k[measured], rows.Y[measured])
+        self._vectors("reference", k, rows.reference)
+        if m:
+            self._vectors("control/u", k[:m], rows.U)
+            ends = np.unique(k[[0, m - 1]])
+            limits = [value for _, value in input_limits(self._about)]
+            self._vectors("control/limits", ends, np.tile(limits, (len(ends), 1)))
+            self._vectors("solver/deadline_ms", ends, np.full((len(ends), 1), 1e3 * self._about.dt))
+            exact = rr.DynamicArchetype.columns(
+                "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
+            )
+            scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
+            self._rec.send_columns("solver/time_ms", self._times(k[:m]), [*scalars, *exact])
+            self._statuses(rows)
+        self._vectors("state", k, rows.X)
+
+    def flush(self) -> None:
+        """Wait until the sinks have what was written."""
+        self._rec.flush(timeout_sec=_FLUSH)
+
+    def end(self, run: Run | None) -> None:
+        """Write the metrics of the whole `run` and close; the log says from now on that it is complete."""
+        import rerun as rr
+
+        numbers: dict[str, Any] = {"steps": 0}
+        text = "No step was recorded."
+        if run is not None:
+            numbers["steps"] = run.steps
+            try:
+                with np.errstate(all="ignore"):
+                    found = metrics(run)
+                text = metrics_to_markdown(found, self._about.tracked(run.reference.shape[1]))
+                numbers |= {"cost": found.cost, "effort": found.effort, "violation": found.violation}
+            except (KoopmpcError, ValueError) as error:
+                text = f"The metrics cannot be computed: {error}"
+        document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        self._rec.log("metrics", document, rr.AnyValues(**numbers), static=True)
+        if self._scene is not None:
+            self._rec.send_blueprint(self._blueprint(), make_active=False)
+        self._rec.flush(timeout_sec=_FLUSH)
+        self._rec.disconnect()
+
+    def _blueprint(self) -> Any:
+        bounds = self._bounds if self._scene is not None else None
+        return blueprint(self._about, bounds=bounds, eigenvalues=self._model is not None)
+
+    def _times(self, k: np.ndarray) -> list[Any]:
+        import rerun as rr
+
+        nanoseconds = np.rint(k * self._about.dt * 1e9).astype("timedelta64[ns]")
+        return [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)]
+
+    def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray) -> None:
+        """Write one vector a row; higher dimensions go flat, their last width kept beside them."""
+        import rerun as rr
+
+        if not values.size:
+            return
+        width = values[0].size
+        columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(len(k), width))
+        if values.ndim > 2:
+            self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
+        self._rec.send_columns(entity, self._times(k), columns)
+
+    def _style(self, entity: str, style: Any) -> None:
+        """Log what holds for the whole run, once."""
+        if entity not in self._styled:
+            self._styled.add(entity)
+            self._rec.log(entity, style, static=True)
+
+    def _statuses(self, rows: Rows) -> None:
+        """Write the status where it changes, and a line of text for every fallback that sets in."""
+        import rerun as rr
+
+        pairs = list(zip(rows.status, rows.fallback, strict=True))
+        changed = [i for i, pair in enumerate(pairs) if pair != (pairs[i - 1] if i else self._status)]
+        self._status = pairs[-1]
+        if changed:
+            words = [_word(*pairs[i]) for i in changed]
+            times = self._times(rows.k + np.array(changed))
+            self._rec.send_columns("solver/status", times, rr.StateChange.columns(state=words))
+        fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
+        if fallen:
+            texts = [f"step {rows.k + i}: {_word(*pairs[i])}" for i in fallen]
+            columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+            self._rec.send_columns("log", self._times(rows.k + np.array(fallen)), columns)
+
+    def _draw(self, rows: Rows) -> None:
+        """Draw the scene of every row, and of a few stages of its plan."""
+        scene = self._scene
+        assert scene is not None
+        ahead: dict[int, list[Any]] = {}
+        for k, X, U in zip(rows.planned, rows.plan_X, rows.plan_U, strict=True):
+            if np.isfinite(X).all() and np.isfinite(U).all():
+                ahead[int(k)] = [scene(X[i], U[min(i, len(U) - 1)]) for i in stages(len(U))]
+        now: list[Sequence[Any]] = []
+        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
+            self._u = rows.U[i] if i < len(rows.U) else self._u
+            x = y if np.isnan(x).any() and len(y) == len(x) else x
+            now.append([] if self._u is None or not np.isfinite(x).all() else list(scene(x, self._u)))
+        k = rows.k + np.arange(len(now))
+        self._place("world", k, draw(now, self._bounds))
+        if ahead or "world/prediction" in self._styled:
+            self._styled.add("world/prediction")
+            self._place("world/prediction", k, draw_ahead(now, [ahead.get(int(i), []) for i in k]))
+
+    def _place(self, parent: str, k: np.ndarray, drawings: dict[str, Drawing]) -> None:
+        import rerun as rr
+
+        for name, drawing in drawings.items():
+            entity = f"{parent}/{rr.escape_entity_path_part(name)}"
+            self._style(entity, drawing.style)
+            self._rec.send_columns(entity, self._times(k), drawing.columns)
+
+    def _eigenvalues(self, model: LinearPredictor) -> None:
+        """Draw the eigenvalues of A over the unit circle; those outside it are red."""
+        import rerun as rr
+
+        values = np.asarray(model.eigenvalues)
+        turn = np.linspace(0, 2 * np.pi, 181)
+        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        axes = [[(-1.15, 0), (1.15, 0)], [(0, -1.15), (0, 1.15)]]
+        outside = np.abs(values) > 1 + 1e-9
+        colors = np.where(outside[:, None], [214, 60, 60], [40, 110, 200]).astype(np.uint8)
+        log = self._rec.log
+        log(
+            "model/axes",
+            rr.LineStrips2D(axes, radii=0.003, colors=[205, 210, 216], draw_order=1),
+            static=True,
+        )
+        log("model/circle", rr.LineStrips2D([circle], radii=0.006, colors=[120, 130, 145]), static=True)
+        points = np.stack([np.real(values), -np.imag(values)], axis=1)
+        labels = [f"|λ| = {abs(v):.4f}" for v in values]
+        dots = rr.Points2D(points, radii=0.03, colors=colors, labels=labels, show_labels=False)
+        log("model/eigenvalues", dots, static=True)
+
+
+def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    """Return the rows of Y that are not, to the bit, those of X."""
+    if X.shape != Y.shape or not X.size:
+        return np.arange(len(Y))
+    return np.flatnonzero(
+        (np.ascontiguousarray(X).view(np.int64) != np.ascontiguousarray(Y).view(np.int64)).any(axis=1)
+    )
+
+
+def _word(status: Status, fallback: Fallback) -> str:
+    return status.name if fallback is Fallback.NONE else f"{status.name} → {fallback.name}"
