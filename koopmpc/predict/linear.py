@@ -1,5 +1,6 @@
 """LinearPredictor: z⁺ = A z + B u, x ≈ C z, z₀ = ψ(x₀)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,7 @@ from koopmpc.values import Value
 _DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class LinearPredictor(Value):
     """A lifted linear predictor z⁺ = A z + B u, x ≈ C z, z₀ = ψ(x₀).
 
@@ -65,34 +66,48 @@ class LinearPredictor(Value):
     dt: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
-    report: FitReport | None = None
-    exact_modes: Complex[np.ndarray, "nl nz"] | None = None
+    report: FitReport | None
+    exact_modes: Complex[np.ndarray, "nl nz"] | None
 
-    def __post_init__(self) -> None:
-        states, inputs = tuple(self.states), tuple(self.inputs)
-        lifting = self.lifting.bind(states)
-        nz, nx, nu = lifting.nz, len(states), len(inputs)
-        set_ = object.__setattr__
-        set_(self, "states", states)
-        set_(self, "inputs", inputs)
-        set_(self, "lifting", lifting)
-        set_(self, "dt", checks.positive(self.dt, "dt", "s"))
-        A = checks.array(self.A, "A")
-        if A.shape != (nz, nz):
+    def __init__(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike,
+        lifting: Lifting,
+        dt: float,
+        states: Sequence[str],
+        inputs: Sequence[str],
+        report: FitReport | None = None,
+        exact_modes: Complex[np.ndarray, "nl nz"] | None = None,
+    ) -> None:
+        bound = lifting.bind(tuple(states))
+        nz, nx, nu = bound.nz, len(states), len(inputs)
+        transition = checks.array(A, "A")
+        if transition.shape != (nz, nz):
             raise ShapeError(
-                f"A has shape {A.shape}, but the lifting returns {nz} observables; "
+                f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
                 "pass the lifting used in the fit"
             )
-        set_(self, "A", A)
-        set_(self, "B", checks.array(self.B, "B", (nz, nu)))
-        set_(self, "C", checks.array(self.C, "C", (nx, nz)))
-        modes = self.exact_modes
+        modes = exact_modes
         if modes is not None:
-            if not isinstance(lifting, Projected) or modes.shape != lifting.basis.shape:
+            if not isinstance(bound, Projected) or modes.shape != bound.basis.shape:
                 raise ShapeError(
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
-            set_(self, "exact_modes", np.array(modes, dtype=np.complex128, order="C"))
+            modes = np.array(modes, dtype=np.complex128, order="C")
+        for name, value in {
+            "A": transition,
+            "B": checks.array(B, "B", (nz, nu)),
+            "C": checks.array(C, "C", (nx, nz)),
+            "lifting": bound,
+            "dt": checks.positive(dt, "dt", "s"),
+            "states": tuple(states),
+            "inputs": tuple(inputs),
+            "report": report,
+            "exact_modes": modes,
+        }.items():
+            object.__setattr__(self, name, value)
 
     @property
     def nx(self) -> int:
@@ -113,7 +128,7 @@ class LinearPredictor(Value):
         """Return z = ψ(x) for one state (nx,) or rows of states (M, nx)."""
         return self.lifting(checks.array(x, "x"))
 
-    def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "T+1 nx"]:
+    def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = A z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
 
         Parameters

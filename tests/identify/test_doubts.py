@@ -134,9 +134,3 @@ def test_a_rank_that_the_data_do_not_have_is_lowered() -> None:
     assert "rank 3 was asked for, the snapshots have rank 2, which is taken" in sentences[0]
     assert model.A.shape == (2, 2)
     assert not warned(flat, State(), rank=2)[1]
-
-
-def test_the_warning_points_at_the_users_line() -> None:
-    with pytest.warns(FitWarning) as caught:
-        edmd(random_episodes(0, [2], 2, 1), State())
-    assert caught[0].filename == __file__

@@ -44,5 +44,3 @@ def test_it_is_saved_as_data_with_a_traced_function_inside() -> None:
 def test_a_basis_of_another_height_is_refused() -> None:
     with pytest.raises(ShapeError, match="basis has 4 rows, the lifting returns 2 observables"):
         Projected(State(), np.ones((4, 2))).bind(STATES)
-    with pytest.raises(ShapeError, match="basis has shape"):
-        Projected(State(), [1.0, 2.0])

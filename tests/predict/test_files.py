@@ -137,7 +137,7 @@ def edited(source: Path, target: Path, change) -> Path:
         (lambda t: [1, 2], "is no koopmpc-1 file"),
         (value(kind="os.system"), "holds a 'os.system', which this version"),
         (value(lifting={"kind": "Popen", "args": ["ls"]}), "holds a 'Popen', which this version"),
-        (value(lifting="State"), "is damaged, or was made by hand"),
+        (value(lifting="State"), "is damaged, or was made by hand|cannot be built"),
         (value(extra=1), "'LinearPredictor' that cannot be built"),
         (value(dt=...), "'LinearPredictor' that cannot be built"),
         (value(dt=-1.0), "dt is -1 s; it must be above zero"),
