@@ -44,6 +44,8 @@ def array(
         raw = np.asarray(value)
         if np.iscomplexobj(raw):
             raise DataError(f"{name} is complex; pass real numbers")
+        if raw.dtype.kind not in "biufO" or (raw.dtype.kind == "O" and any(v is None for v in raw.flat)):
+            raise TypeError("None and text are no numbers")
         result = np.array(raw, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         if isinstance(error, DataError):
@@ -84,14 +86,15 @@ def weight(
 ) -> Float[np.ndarray, "n n"]:
     """Return a symmetric positive (semi)definite matrix; a scalar or a 1-D `value` is a diagonal."""
     result = array(value, name)
+    got = result.shape
     if result.ndim == 0:
         result = float(result) * np.eye(1 if size is None else size)
     elif result.ndim == 1:
         result = np.diag(result)
     if result.ndim != 2 or result.shape[0] != result.shape[1]:
-        raise ShapeError(f"{name} has shape {result.shape}, expected a square matrix or its diagonal")
+        raise ShapeError(f"{name} has shape {got}, expected a square matrix or its diagonal")
     if size is not None and result.shape[0] != size:
-        raise ShapeError(f"{name} has shape {result.shape}, expected ({size}, {size}) or its diagonal")
+        raise ShapeError(f"{name} has shape {got}, expected ({size}, {size}) or its diagonal")
     scale = float(np.abs(result).max(initial=0.0))
     if float(np.abs(result - result.T).max(initial=0.0)) > 1e-9 * max(scale, 1e-300):
         raise DefinitenessError(f"{name} is not symmetric; pass (M + Mᵀ)/2")

@@ -8,6 +8,7 @@ built through their own constructors: loading a file runs no code of that file.
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
+from math import copysign
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -49,8 +50,10 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         x, y = cast("Array", a), cast("Array", b)
         return bool(x.dtype == y.dtype) and x.shape == y.shape and x.tobytes() == y.tobytes()
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return False
     if isinstance(a, float) and isinstance(b, float):
-        return a == b or (a != a and b != b)
+        return (a == b and copysign(1.0, a) == copysign(1.0, b)) or (a != a and b != b)
     if isinstance(a, tuple | list) and isinstance(b, tuple | list):
         left, right = cast("Sequence[Any]", a), cast("Sequence[Any]", b)
         return len(left) == len(right) and all(same(x, y) for x, y in zip(left, right, strict=True))
@@ -118,13 +121,13 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
         return build(**{key: from_data(item, arrays, enums) for key, item in node.items() if key != "kind"})
     except LogError:
         raise
-    except (KeyError, TypeError, ValueError, LookupError) as error:
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise LogError(f"the file holds a {kind!r} that cannot be built: {error}") from error
 
 
 def _array_to_data(array: Array, arrays: Arrays | None) -> dict[str, Any]:
     if arrays is None:
-        values = array.ravel().tolist()
+        values = array.ravel().view(_parts(array.dtype)).tolist()  # JSON knows no complex numbers
         return {"kind": "array", "dtype": str(array.dtype), "shape": list(array.shape), "values": values}
     key = f"array{len(arrays)}"
     arrays[key] = array
@@ -132,12 +135,17 @@ def _array_to_data(array: Array, arrays: Arrays | None) -> dict[str, Any]:
 
 
 def _array(node: dict[str, Any], arrays: Mapping[str, Array]) -> Array:
-    if "key" in node:
-        return np.asarray(arrays[node["key"]])
-    dtype = np.dtype(node["dtype"])
+    dtype = np.asarray(arrays[node["key"]]).dtype if "key" in node else np.dtype(node["dtype"])
     if dtype.kind not in "fiubc":
         raise LogError(f"the file holds an array of {dtype}; only numbers are read")
-    return np.array(node["values"], dtype=dtype).reshape(node["shape"])
+    if "key" in node:
+        return np.asarray(arrays[node["key"]])
+    return np.array(node["values"], dtype=_parts(dtype)).view(dtype).reshape(node["shape"])
+
+
+def _parts(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the real and imaginary parts of a complex type; any other type itself."""
+    return np.dtype(f"f{dtype.itemsize // 2}") if dtype.kind == "c" else dtype
 
 
 def _fields(value: Value) -> list[str]:
