@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Value
 
@@ -63,21 +63,18 @@ class Limits(Value):
                 value = getattr(self, end)
                 if value is not None:
                     object.__setattr__(self, end, checks.array(value, end, infinite=True))
-            a, b = getattr(self, low), getattr(self, high)
-            if a is not None and b is not None:
-                lower, upper = np.broadcast_arrays(np.atleast_1d(a), np.atleast_1d(b))
-                checks.crossed(lower, upper, name)
+            _require_room(getattr(self, low), getattr(self, high), low, high, name)
         if (self.y_min is not None or self.y_max is not None) and self.of is None:
             raise DataError(
                 "y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)"
             )
         if self.slack is not None:
-            linear, quadratic = self.slack
+            linear, quadratic = (float(weight) for weight in checks.array(self.slack, "slack", (2,)))
             if linear < 0 or quadratic < 0 or linear + quadratic == 0:
                 raise DataError(
                     f"slack is {self.slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None"
                 )
-            object.__setattr__(self, "slack", (float(linear), float(quadratic)))
+            object.__setattr__(self, "slack", (linear, quadratic))
 
     def inputs(self, nu: int) -> Box:
         """Return the box of the inputs."""
@@ -98,6 +95,30 @@ def softened(slacks: Float[np.ndarray, "N ng"], outputs: Box) -> bool:
         return False
     size = np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in outputs))
     return bool((slacks > SOFTENED * (1 + size)).any())
+
+
+def _require_room(
+    low: Float[np.ndarray, "..."] | None,
+    high: Float[np.ndarray, "..."] | None,
+    low_name: str,
+    high_name: str,
+    name: str,
+) -> None:
+    """Raise where no number is between the limits."""
+    lower, upper = (
+        np.atleast_1d(-np.inf if low is None else low),
+        np.atleast_1d(np.inf if high is None else high),
+    )
+    if lower.shape != upper.shape and 1 not in (lower.size, upper.size):
+        raise ShapeError(
+            f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
+        )
+    a, b = np.broadcast_arrays(lower, upper)
+    checks.crossed(a, b, name)
+    if (lower == np.inf).any() or (upper == -np.inf).any():
+        raise DataError(
+            f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit"
+        )
 
 
 def _box(low: ArrayLike | None, high: ArrayLike | None, low_name: str, high_name: str, n: int) -> Box:
