@@ -5,6 +5,7 @@ This file is the table of contents; see README.md for ten lines that use it.
 
 from koopmpc.bench.library import list_problems, load_problem
 from koopmpc.bench.problem import Case, Problem, Training
+from koopmpc.bench.sweep import sweep
 from koopmpc.control.cost import Cost
 from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
 from koopmpc.control.limits import Limits
@@ -48,7 +49,10 @@ from koopmpc.predict.linear import LinearPredictor, load_predictor
 from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.scene import Box, Disk, Line
+from koopmpc.recording.viewer import view
 
 __all__ = [
     "CVODES",
@@ -100,6 +104,7 @@ __all__ = [
     "Plant",
     "Problem",
     "ProblemError",
+    "Recorder",
     "Run",
     "Score",
     "ShapeError",
@@ -125,10 +130,14 @@ __all__ = [
     "load_episodes",
     "load_predictor",
     "load_problem",
+    "load_run",
     "lqr",
     "metrics",
     "moments",
     "reconstruct",
+    "record",
     "score",
     "simulate",
+    "sweep",
+    "view",
 ]
