@@ -89,8 +89,7 @@ def collect(
         else:
             X, U = _batch(plant, starts, excitation, length, streams)
             Y = _measured(plant, X)
-            for e, run in enumerate(Y):
-                _finite(run, e, 0)
+            _finite(Y)
             runs = [Episode(X=y, U=u) for y, u in zip(Y, U, strict=True)]
     return Episodes(runs, plant.dt, plant.outputs, plant.inputs)
 
@@ -105,7 +104,7 @@ def _drive(
     for k in range(steps):
         U[k] = policy(k, Y[k])
         Y[k + 1] = plant.step(U[k])
-        _finite(Y[k + 1 : k + 2], e, k + 1)
+        _finite(Y[None, k + 1 : k + 2], e, k + 1)
     return Episode(X=Y, U=U)
 
 
@@ -126,8 +125,8 @@ def _batch(
     X[:, 0] = starts
     for k in range(steps):
         Y = _measured(plant, X[:, k : k + 1])
+        _finite(Y, step=k)
         for e, policy in enumerate(policies):
-            _finite(Y[e], e, k)
             moves[e, k] = policy(k, Y[e, 0])
         X[:, k + 1] = plant.rollouts(X[:, k], moves[:, k : k + 1])[:, 1]
     return X, moves
@@ -165,11 +164,11 @@ def _starts(
     return rows
 
 
-def _finite(rows: Float[np.ndarray, "rows ny"], episode: int, first: int) -> None:
-    """Raise if a row is not finite; the rows start at step `first`."""
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if bad.size:
+def _finite(Y: Float[np.ndarray, "E rows ny"], episode: int = 0, step: int = 0) -> None:
+    """Raise if a row is not finite; the first is of this episode and this step."""
+    bad = np.argwhere(~np.isfinite(Y).all(axis=2))
+    if len(bad):
         raise DataError(
-            f"episode {episode} is NaN or infinite from step {first + int(bad[0])} on: the plant diverged; "
-            "start nearer, excite less, take fewer steps, or hold it with Feedback"
+            f"episode {episode + int(bad[0, 0])} is NaN or infinite from step {step + int(bad[0, 1])} on: the plant "
+            "diverged; start nearer, excite less, take fewer steps, or hold it with Feedback"
         )

@@ -41,7 +41,7 @@ class Expressions(Lifting):
                 "return one expression for each name"
             )
         graph = Graph.trace(ca.Function("expressions", [x], [z]))
-        traced = Traced(graph, self.labels, bound=tuple(states))
+        traced = Traced(graph, self.observables(tuple(states)), bound=tuple(states))
         _ = traced.names
         return traced
 
