@@ -71,7 +71,7 @@ problem = km.Problem(
     lifting=km.State() + km.Fourier(1, states="theta") + km.Constant(),
     cost=km.Cost(Q=[5.0, 10.0, 50.0, 5.0], R=0.01),
     limits=km.Limits(u_min=-40.0, u_max=40.0),
-    horizon=50,
+    horizon=25,
     cases={
         "shift": km.Case(x0=[-1.0, 0.0, np.pi, 0.0], reference=[1.0, 0.0, np.pi, 0.0], steps=240),
         "recover": km.Case(x0=[0.0, 0.0, np.pi - 0.5, 0.0], reference=[0.0, 0.0, np.pi, 0.0], steps=240),
