@@ -10,6 +10,8 @@ import stat
 import subprocess
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
@@ -20,6 +22,7 @@ Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]],
 
 # No fused multiply-adds and no -march: the interpreter's numbers, on any machine of this kind.
 _FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+_STEPS_A_THREAD = 50_000  # some 5 ms, against 0.1 ms for a thread
 _LOOP = """
 #ifdef _WIN32
 __declspec(dllexport)
@@ -133,9 +136,20 @@ def _bound(path: Path) -> Kernel:
     rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
     rollouts.restype = None
 
+    def march(X: np.ndarray, U: np.ndarray) -> None:
+        rollouts(U.shape[0], U.shape[1], X.ctypes.data, U.ctypes.data)
+
     def run(X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
         if not (X.flags.c_contiguous and U.flags.c_contiguous):
             raise AssertionError("machine code reads contiguous arrays only")
-        rollouts(U.shape[0], U.shape[1], X.ctypes.data, U.ctypes.data)
+        episodes, steps = U.shape[:2]
+        threads = min(os.cpu_count() or 1, episodes, episodes * steps // _STEPS_A_THREAD)
+        if threads > 1:
+            ends = [episodes * i // threads for i in range(threads + 1)]
+            parts = [slice(*pair) for pair in pairwise(ends)]
+            with ThreadPoolExecutor(threads) as pool:  # ctypes lets go of the interpreter's lock
+                list(pool.map(march, [X[part] for part in parts], [U[part] for part in parts]))
+        else:
+            march(X, U)
 
     return run

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+Columns = np.ndarray | float
+
 
 class Operation(NamedTuple):
     """One operation, twice: `columns(*operands, out=...)` for numpy and `symbol(*operands)` for CasADi."""
@@ -16,15 +18,15 @@ class Operation(NamedTuple):
     symbol: Callable[..., Any]
 
 
-def _where(condition: np.ndarray, value: np.ndarray, out: np.ndarray) -> None:
+def _where(condition: Columns, value: Columns, out: np.ndarray) -> None:
     out[...] = np.where(condition, value, 0.0)
 
 
-def _twice(a: np.ndarray, out: np.ndarray) -> None:
+def _twice(a: Columns, out: np.ndarray) -> None:
     np.add(a, a, out=out)
 
 
-def _inverse(a: np.ndarray, out: np.ndarray) -> None:
+def _inverse(a: Columns, out: np.ndarray) -> None:
     np.divide(1.0, a, out=out)
 
 

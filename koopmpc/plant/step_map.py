@@ -74,7 +74,7 @@ class StepMap:
         if h is None:
             x = ca.SX.sym("x", nx)
             h = ca.Function("h", [x], [x], ["x"], ["y"])
-            outputs = states if outputs is None else outputs
+            outputs = states or _names(None, "states", "x", nx) if outputs is None else outputs
         _check_signature(h, "h", 1)
         if h.size1_in(0) != nx:
             raise ShapeError(f"h takes {h.size1_in(0)} states, F has {nx}; pass h of the same x")
@@ -107,11 +107,14 @@ class StepMap:
         NaN passes through; where an implicit method finds no x⁺ the answer is NaN, with a RuntimeWarning.
         """
         x, u = _vector(x, "x", len(self.states)), _vector(u, "u", len(self.inputs))
+        (x_place, u_place), (x_next,), evaluate, _ = self._step.slot()
+        x_place[:], u_place[:] = x, u
         try:
-            return self._step(x, u)[0]
+            evaluate()
         except RuntimeError as error:
             warn_of(error, x, u)
             return np.full(self.nx, np.nan)
+        return x_next.copy()
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return y = h(x): (ny,) from x (nx,)."""

@@ -1,0 +1,75 @@
+"""Million RK4 cart-pole steps a second in batches, and one step alone."""
+
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from koopmpc.plant import batch, compiled
+from koopmpc.plant.graph import Graph
+from koopmpc.plant.step_map import discretize
+from tests.plant.models import CartPole
+
+pytestmark = pytest.mark.speed
+EPISODES, STEPS = 5000, 200
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return discretize(CartPole(), 0.02)
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(EPISODES, 4)), 5 * rng.normal(size=(EPISODES, STEPS, 1))
+
+
+def report(benchmark, unit, value):
+    benchmark.extra_info[unit] = value
+    sys.stdout.write(f"\n{benchmark.name}: {value:.3g} {unit}\n")
+
+
+@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
+def test_batch_in_machine_code(benchmark, plant, episodes):
+    plant.rollouts(*episodes)  # compile
+    benchmark.pedantic(plant.rollouts, episodes, rounds=7, warmup_rounds=2)
+    report(benchmark, "million steps/s", EPISODES * STEPS / benchmark.stats.stats.median / 1e6)
+
+
+def test_batch_over_columns(benchmark, plant, episodes):
+    X0, U = episodes
+    graph, X = Graph.trace(plant.F), np.empty((EPISODES, STEPS + 1, 4))
+    X[:, 0] = X0
+    benchmark.pedantic(batch.vectorised, (graph, X, U), rounds=5, warmup_rounds=1)
+    report(benchmark, "million steps/s", EPISODES * STEPS / benchmark.stats.stats.median / 1e6)
+
+
+def test_one_step(benchmark, plant):
+    x, u = np.array([0.0, 0.3, 0.0, 0.0]), np.array([1.0])
+    benchmark(plant, x, u)
+    report(benchmark, "µs a step", benchmark.stats.stats.median * 1e6)
+
+
+def test_one_step_in_a_rollout(benchmark, plant, episodes):
+    X0, U = episodes
+    long = U[:50].reshape(-1, 1)
+    benchmark.pedantic(plant.rollout, (X0[0], long), rounds=7, warmup_rounds=1)
+    report(benchmark, "µs a step", benchmark.stats.stats.median / len(long) * 1e6)
+
+
+def test_linearization_against_one_step(benchmark, plant):
+    x, u = np.array([0.0, 0.3, 0.0, 0.0]), np.array([1.0])
+    plant.linearize(x, u)
+
+    def both():
+        start = time.perf_counter()
+        plant(x, u)
+        middle = time.perf_counter()
+        plant.linearize(x, u)
+        return (time.perf_counter() - middle) / (middle - start)
+
+    ratio = float(np.median([both() for _ in range(500)]))
+    benchmark(plant.linearize, x, u)
+    report(benchmark, "× one step", ratio)
