@@ -8,6 +8,8 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+import tests.typecheck  # noqa: F401  # the hook looks it up by name
+
 if not os.environ.get("KOOPMPC_NO_TYPE_HOOK"):  # tests/speed measures what users run
     install_import_hook("koopmpc", "tests.typecheck.beartyped")
 

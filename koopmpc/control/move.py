@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -65,6 +65,7 @@ class Plan(Value):
     U: Float[np.ndarray, "N nu"]
 
 
+@runtime_checkable
 class Controller(Protocol):
     """y, reference → Move, once every dt."""
 
