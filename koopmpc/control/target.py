@@ -11,7 +11,7 @@ from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.osqp import OSQP
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
-PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000, "polishing": True}
+PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000}
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,12 @@ class Targets:
 
     def _inside(self, alpha: Float[np.ndarray, " na"]) -> Float[np.ndarray, " na"]:
         """Return the nearest α inside all limits, or inside the input limits where there is none."""
+        # H of trace 1: the tolerance is relative to the weight, and cost in other units has the same target
         H = self.weighted.T @ self.weighted
-        H = H + 1e-9 * max(float(np.trace(H)), 1e-300) * np.eye(len(H))
+        H = H / max(float(np.trace(H)), 1e-300) + 1e-9 * np.eye(len(H))
+        q = -H @ alpha
         for count in (len(self.rows), self.hard):
-            qp = QP(H, -H @ alpha, self.rows[:count], self.low[:count], self.high[:count])
+            qp = QP(H, q, self.rows[:count], self.low[:count], self.high[:count])
             solution = OSQP(qp, PRECISE).solve(np.zeros(len(alpha)), np.zeros(count))
             if solution.status is Status.OPTIMAL:
                 return solution.v
@@ -84,6 +86,8 @@ def targets(
     """
     nz, nu = B.shape
     E = np.hstack([A - np.eye(nz), B])
+    if constant is not None:
+        E = np.delete(E, constant, axis=0)  # 1 = 1, whatever a fit has made of it
     free = np.array([i for i in range(nz + nu) if i != constant])
     pinned = np.zeros(nz) if constant is None else -E[:, constant]
     left, sigma, right = np.linalg.svd(E[:, free])
@@ -93,8 +97,7 @@ def targets(
     span[free] = right[rank:].T
     if constant is not None:
         base[constant] = 1.0
-    z0, u0 = np.split(base, [nz])
-    Z, W = np.split(span, [nz])
+    z0, u0, Z, W = base[:nz], base[nz:], span[:nz], span[nz:]
     root = _root(Q)
     weighted = root @ C @ Z
     inverse = np.linalg.pinv(weighted, rcond=TOLERANCE)
@@ -102,8 +105,8 @@ def targets(
     return Targets(
         z0=z0,
         Z=Z,
-        u0=u0 if hold else np.zeros(nu),
-        W=W if hold else np.zeros_like(W),
+        u0=u0 * float(hold),
+        W=W * float(hold),
         from_reference=inverse @ root,
         offset=-inverse @ root @ C @ z0,
         rows=rows,
