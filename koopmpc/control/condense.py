@@ -1,7 +1,7 @@
 """Condense: the whole horizon as matrices of the lifted state and the reference; builds, and never solves.
 
-In Riccati coordinates, u_k = −K_k z_k + v_k + L_k⁻ᵀ w_k with S_k = R + BᵀP_{k+1}B = L_k L_kᵀ, the cost is
-constant + Σ ‖w_k‖²: w = 0 is the unconstrained optimum, and the Hessian is the identity even where the plant is
+In Riccati coordinates, u_k = −K_k z_k + v_k + √unit L_k⁻ᵀ w_k with S_k = R + BᵀP_{k+1}B = L_k L_kᵀ, the cost is
+constant + unit · Σ ‖w_k‖²: w = 0 is the unconstrained optimum, and the Hessian is the identity even where the plant is
 unstable and plain condensing (u as the variable) has lost all its digits.
 """
 
@@ -35,7 +35,9 @@ class Stage:
 class Condensed:
     """The plan and its limited outputs, v = [u_0 … u_{N−1}, G z_1 … G z_N], as v = F_z z₀ + F_r r + F_α α + f + D w.
 
-    r holds the N + 1 reference rows one after the other, α the targets' coordinates of the same rows.
+    r holds the N + 1 reference rows one after the other, α the targets' coordinates of the same rows. Above the
+    unconstrained optimum the cost is unit · ‖w‖², unit the mean diagonal of S_0: w has the size of u, and a cost
+    in other units gives the same QP.
     """
 
     from_state: Float[np.ndarray, "n nz"]
@@ -43,6 +45,7 @@ class Condensed:
     from_target: Float[np.ndarray, "n nT"]
     offset: Float[np.ndarray, " n"]
     deviation: Float[np.ndarray, "n nw"]
+    unit: float
 
 
 def condense(stage: Stage, stages: Stages, targets: Targets) -> Condensed:
@@ -54,6 +57,7 @@ def condense(stage: Stage, stages: Stages, targets: Targets) -> Condensed:
     feedforward = _feedforward(stage, stages, targets)
 
     n = N * nu
+    unit = float((stages.L[0] ** 2).sum()) / nu
     state = np.empty((n + N * ng, nz))
     driven = np.empty((n + N * ng, nR + nT + 1))
     deviation = np.zeros((n + N * ng, n))
@@ -63,10 +67,11 @@ def condense(stage: Stage, stages: Stages, targets: Targets) -> Condensed:
         rows, outputs = slice(k * nu, (k + 1) * nu), slice(n + k * ng, n + (k + 1) * ng)
         K = stages.K[k]
         state[rows], driven[rows], deviation[rows] = -K @ Z, feedforward[k] - K @ F, -K @ D
-        deviation[rows, rows] += scipy.linalg.solve_triangular(stages.L[k], np.eye(nu), lower=True, trans="T")
+        one = np.sqrt(unit) * np.eye(nu)
+        deviation[rows, rows] += scipy.linalg.solve_triangular(stages.L[k], one, lower=True, trans="T")
         Z, F, D = A @ Z + B @ state[rows], A @ F + B @ driven[rows], A @ D + B @ deviation[rows]
         state[outputs], driven[outputs], deviation[outputs] = G @ Z, G @ F, G @ D
-    return Condensed(state, driven[:, :nR], driven[:, nR : nR + nT], driven[:, -1], deviation)
+    return Condensed(state, driven[:, :nR], driven[:, nR : nR + nT], driven[:, -1], deviation, unit)
 
 
 def _feedforward(stage: Stage, stages: Stages, targets: Targets) -> Float[np.ndarray, "N nu nf"]:

@@ -12,13 +12,14 @@ from koopmpc import checks
 from koopmpc.control.condense import Stage, condense
 from koopmpc.control.cost import Cost
 from koopmpc.control.fallback import PlanMemory
-from koopmpc.control.lifted import Tracking, buffered, reference_rows, tracking
+from koopmpc.control.lifted import HUGE, Tracking, buffered, reference_rows, tracking
 from koopmpc.control.limits import Limits, softened
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.control.program import program
 from koopmpc.control.riccati import recursion, stationary
 from koopmpc.control.solvers.osqp import OSQP
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.state import State
 from koopmpc.plant.step_map import StepMap
 from koopmpc.predict.linear import LinearPredictor
 
@@ -89,13 +90,15 @@ class KoopmanMPC:
         )  # the last column: the reference's part
         self._lifted = np.append(np.zeros(nz), 1.0)
         self._z = self._lifted[:-1]
-        self._low = np.concatenate([np.tile(track.inputs.low, N), np.tile(track.outputs.low, N)])
-        self._high = np.concatenate([np.tile(track.inputs.high, N), np.tile(track.outputs.high, N)])
+        low = np.concatenate([np.tile(track.inputs.low, N), np.tile(track.outputs.low, N)])
+        high = np.concatenate([np.tile(track.inputs.high, N), np.tile(track.outputs.high, N)])
+        self._low, self._high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
         self._met = bytearray(2 * nv)
         met = np.frombuffer(self._met, dtype=np.bool_)
         self._met_low, self._met_high = met[:nv], met[nv:]
 
-        self._program = program(self._maps.deviation, track.inputs, track.outputs, N, limits.slack)
+        maps = self._maps
+        self._program = program(maps.deviation, track.inputs, track.outputs, N, limits.slack, maps.unit)
         self._solver = OSQP(self._program.qp, settings)
         self._primal = np.zeros(len(self._program.qp.q) + 1)  # one more, always zero, for the shift
         self._dual = np.zeros(len(self._program.low) + 1)
@@ -103,7 +106,7 @@ class KoopmanMPC:
         self._plan = np.zeros(nv)
         self._spare = np.zeros(nv)
         self._memory = PlanMemory(track.inputs, N)
-        self._reference_key = b""
+        self._reference_key: bytes | None = None
         self._planned = False
         self.reset()
 
@@ -123,8 +126,9 @@ class KoopmanMPC:
         return self._N
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget the last plan and the warm start; `u_prev` is held if the first step fails."""
+        """Forget all earlier steps, so that a run repeats to the bit; `u_prev` is held if the first step fails."""
         self._memory.reset(u_prev)
+        self._solver.reset()
         self._warm = self._planned = False
 
     def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
@@ -194,7 +198,7 @@ class KoopmanMPC:
 
     def _constrained(self, v: Float[np.ndarray, " nv"], applied: ArrayLike | None, start: float) -> Move:
         """Solve the QP for the deviation from the plan v, which breaks a limit or is not finite."""
-        if not np.isfinite(v).all():
+        if not np.abs(v).max() < HUGE:
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
         problem = self._program
         low, high = problem.low.copy(), problem.high.copy()
@@ -264,18 +268,17 @@ def _stage(predictor: LinearPredictor, cost: Cost, track: Tracking, N: int) -> S
     else:
         given = np.asarray(cost.Q_N)
         size = len(given) if given.ndim else nx
+        on_state = size == nx and isinstance(cost.of, State)
+        if size == nx != nz and not on_state:
+            raise ShapeError(
+                f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})"
+            )
         if size not in (nx, nz):
             raise ShapeError(
                 f"Q_N has shape {given.shape}, expected ({nx}, {nx}) on the state or ({nz}, {nz}) on z"
             )
-        Q_N = checks.weight(given, "Q_N", size)
-        if size == nz:
-            P_N = Q_N
-        else:
-            if len(C) != nx:
-                raise ShapeError(
-                    f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference has {len(C)} columns; pass (nz, nz)"
-                )
-            CQ_N = predictor.C.T @ Q_N
-            P_N = CQ_N @ predictor.C
+        P_N = checks.weight(given, "Q_N", size)
+        if on_state:
+            CQ_N = C.T @ P_N
+            P_N = CQ_N @ C
     return Stage(A, B, C, track.G, track.Q, track.R, P_N, CQ_N)

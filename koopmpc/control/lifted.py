@@ -17,6 +17,8 @@ from koopmpc.lifting.state import State
 from koopmpc.plant.buffered import Buffered
 from koopmpc.predict.linear import LinearPredictor
 
+HUGE = 1e30
+
 
 @dataclass(frozen=True)
 class Tracking:
@@ -74,13 +76,16 @@ def buffered(lifting: Lifting) -> Buffered:
 
 
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int) -> Float[np.ndarray, "N1 nr"]:
-    """Return N + 1 rows of a reference (nr,) that is held or (M, nr) whose last row is repeated."""
+    """Return N + 1 rows of a reference (nr,) that is held or (M, nr) whose last row is repeated.
+
+    What is beyond 1e30 comes back as NaN: it is no reference, and its square overflows.
+    """
     R = checks.array(reference, "reference", finite=False)
     if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
         raise ShapeError(
             f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{N}"
         )
-    R = R.reshape(-1, nr)
+    R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
     return np.ascontiguousarray(R[np.minimum(np.arange(N + 1), len(R) - 1)])
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.lifted import buffered, reference_rows, tracking
+from koopmpc.control.lifted import HUGE, buffered, reference_rows, tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import stationary
@@ -47,7 +47,7 @@ class LQR:
         self.gain = stationary(predictor.A, predictor.B, Q, track.R, ITERATIONS)
         self._targets, self._inputs, self._nr = track.targets, track.inputs, len(track.C)
         self._lift = buffered(predictor.lifting)
-        self._reference_key = b""
+        self._reference_key: bytes | None = None
         self._feedforward = np.zeros(self.nu)
         self._last = np.zeros(self.nu)
         self.reset()
@@ -82,9 +82,12 @@ class LQR:
             self._aim(target)
             self._reference_key = key
         if applied is not None:
-            self._last = np.clip(checks.array(applied, "applied", (self.nu,)), *self._inputs)
-        free = self._feedforward - self.gain.K @ self._lift(x)[0]
-        if not np.isfinite(free).all():
+            got = checks.array(applied, "applied", (self.nu,), finite=False)
+            if np.isfinite(got).all():
+                self._last = np.clip(got, *self._inputs)
+        z = self._lift(x)[0]
+        free = self._feedforward - self.gain.K @ z if (np.abs(z) < HUGE).all() else np.full(self.nu, np.nan)
+        if not (np.abs(free) < HUGE).all():
             return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
         u = np.clip(free, *self._inputs)
         status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED

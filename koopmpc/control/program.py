@@ -12,7 +12,9 @@ from koopmpc.control.solvers.base import QP
 
 @dataclass(frozen=True)
 class Program:
-    """½‖w‖² + Σ (linear ε + quadratic ε²) → min over [w (N, nu); ε (N, ng)], low ≤ v + D w ≤ high.
+    """½‖w‖² + Σ (linear ε + quadratic ε²)/(2 unit) → min over [w (N, nu); ε (N, ng)], low ≤ v + D w ≤ high.
+
+    It is the cost unit ‖w‖² + Σ (linear ε + quadratic ε²), divided by 2 unit.
 
     Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v: their bounds
     are `low` and `high` less that entry; the rest are ε ≥ 0. `shift_primal` and `shift_dual` tell where the next
@@ -33,6 +35,7 @@ def program(
     outputs: Box,
     N: int,
     slack: tuple[float, float] | None,
+    unit: float,
 ) -> Program:
     """Return the QP of a horizon of N steps for v = [u_0 … u_{N−1}, g_1 … g_N] and its deviation map D."""
     nu, ng = len(inputs.low), len(outputs.low)
@@ -66,8 +69,8 @@ def program(
             A[first + np.arange(len(block)), block] = sign
             first += len(block)
         A[len(source) :, nw:] = np.eye(ns)
-        P[nw:, nw:] *= 2 * slack[1]
-        q[nw:] = slack[0]
+        P[nw:, nw:] *= slack[1] / unit
+        q[nw:] = slack[0] / (2 * unit)
         counts.append(ng)
     lows, highs = np.concatenate(low), np.concatenate(high)
     return Program(

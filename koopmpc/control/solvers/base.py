@@ -1,7 +1,7 @@
 """The small interface of a QP solver: set up once, update vectors, solve; every outcome has a Status."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse
@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.move import Status
+from koopmpc.errors import ShapeError
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,12 @@ class QP:
             checks.array(getattr(self, name), f"the QP's {name}")
         for name in ("low", "high"):
             checks.array(getattr(self, name), f"the QP's {name}", infinite=True)
+        m, n = self.A.shape
+        if self.P.shape != (n, n) or self.q.shape != (n,) or not self.low.shape == self.high.shape == (m,):
+            raise ShapeError(
+                f"the QP has A {self.A.shape}, P {self.P.shape}, q {self.q.shape}, low {self.low.shape} and"
+                f" high {self.high.shape}; pass A (m, n), P (n, n), q (n,), low and high (m,)"
+            )
         checks.crossed(self.low, self.high, "the QP's")
 
     def sparse(self) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csc_matrix]:
@@ -43,11 +50,16 @@ class QPSolution:
     iterations: int
 
 
+@runtime_checkable
 class QPSolver(Protocol):
     """A QP whose P, q and A stay and whose limits move."""
 
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits."""
+        ...
+
+    def reset(self) -> None:
+        """Forget what earlier solves left behind."""
         ...
 
     def solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"]) -> QPSolution:

@@ -68,7 +68,12 @@ class OSQP:
                 f"OSQP refuses the problem or its settings {dict(settings or {})}: {error}"
             ) from error
         self._solver = self._problem._solver
+        self._rho = self._solver.get_settings().rho
         self._low, self._high = np.empty(self._m), np.empty(self._m)
+
+    def reset(self) -> None:
+        """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""
+        self._solver.update_rho(self._rho)
 
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits; ±inf where there is none.
@@ -84,10 +89,10 @@ class OSQP:
             raise ShapeError(
                 f"the limits have shapes {low.shape} and {high.shape}, the QP has {self._m} rows"
             )
-        if not (low <= high).all():
-            raise DataError("the limits of the QP cross or hold NaN")
         np.maximum(low, -_INFINITY, out=self._low)
         np.minimum(high, _INFINITY, out=self._high)
+        if not (self._low <= self._high).all():
+            raise DataError("the limits of the QP cross, hold NaN, or are beyond 1e30")
         self._solver.update_data_vec(q=None, l=self._low, u=self._high)
 
     def solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"]) -> QPSolution:
