@@ -14,6 +14,7 @@ from koopmpc.bench.prepare import Prepared
 from koopmpc.bench.problem import Case, Problem
 from koopmpc.bench.results import Row, faults, reached
 from koopmpc.control.move import Controller
+from koopmpc.errors import ProblemError
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Observer, simulate
@@ -55,9 +56,15 @@ def sweep(
     Raises
     ------
     ProblemError
-        There is no such controller.
+        There is no such controller, or a case comes twice.
     """
     names, problems, folder = chosen(controllers), list(problems), Path(folder)
+    cases = [f"{problem.name}:{case}" for problem in problems for case in problem.cases]
+    twice = next((case for case in cases if cases.count(case) > 1), None)
+    if twice is not None:
+        raise ProblemError(
+            f"{twice} comes twice, and its logs would have one name; run it once, or rename a file"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     if live and find_viewer() is None:
         live = False
@@ -66,7 +73,7 @@ def sweep(
             UserWarning,
             stacklevel=2,
         )
-    total = sum(len(problem.cases) for problem in problems) * len(names)
+    total = len(cases) * len(names)
     rows: list[Row] = []
     for problem in problems:
         parts = Prepared(problem)

@@ -218,3 +218,12 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
     ):
         sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
     assert list(chosen(None)) == FIVE
+
+
+def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
+    both = [swept[0], swept[0].select("far")]
+    with pytest.raises(ProblemError, match=r"tiny:far comes twice, and its logs would have one name"):
+        sweep(both, folder=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    rows = sweep([swept[0].select("near"), swept[0].select("far")], ["lqr"], folder=tmp_path)
+    assert [row.fault for row in rows] == [None, None]
