@@ -1,6 +1,8 @@
 """A traced CasADi expression as a list of whitelisted operations: over numpy columns, as symbols, as data."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, cast
 
 import casadi as ca
@@ -11,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plant.buffered import dense
-from koopmpc.plant.operations import OPERATIONS
+from koopmpc.plant.operations import OPERATIONS, Operation
 from koopmpc.values import Value
 
 _NAMES = {cast("int", getattr(ca, f"OP_{name.upper()}")): name for name in OPERATIONS} | {
@@ -102,10 +104,9 @@ class Graph(Value):
         """Return y = g(v) row by row: (M, m) from `columns` (M, n)."""
         rows = checks.array(columns, "columns", (None, self.n), finite=False)
         result = np.empty((len(rows), self.m))
-        scratch = self.scratch(min(_CHUNK, len(rows)))
         for start in range(0, len(rows), _CHUNK):
             part = np.ascontiguousarray(rows[start : start + _CHUNK].T)
-            self.run(part, result[start : start + _CHUNK].T, scratch)
+            self.run(part, result[start : start + _CHUNK].T, self.scratch(part.shape[1]))
         return result
 
     def symbolic(self, *arguments: ca.SX) -> ca.SX:
@@ -118,35 +119,40 @@ class Graph(Value):
             results[target] = value
         return ca.vertcat(*results) if results else ca.SX(0, 1)
 
-    def scratch(self, rows: int) -> Float[np.ndarray, "registers rows"]:
-        """Return the registers that `run` needs for up to `rows` columns."""
-        return np.empty((int(self.places[:, 0].max(initial=0)) + 1, rows))
+    def scratch(self, rows: int) -> list[np.ndarray]:
+        """Return the registers that `run` needs for `rows` columns."""
+        return list(np.empty((int(self.places[:, 0].max(initial=0)) + 1, rows)))
 
-    def run(self, inputs: np.ndarray, results: np.ndarray, scratch: np.ndarray) -> None:
+    def run(self, inputs: np.ndarray, results: np.ndarray, scratch: list[np.ndarray]) -> None:
         """Write y = g(v) into `results` (m, M) from `inputs` (n, M): the inner loop of a batch."""
         with np.errstate(all="ignore"):
-            for target, value in self._walk(inputs, scratch[:, : results.shape[1]]):
+            for target, value in self._walk(inputs, scratch):
                 results[target] = value
 
-    def _walk(self, inputs: Any, scratch: np.ndarray | None) -> Any:
+    @cached_property
+    def _program(self) -> list[tuple[str, Operation | None, int, int, int]]:
+        rows = zip(self.steps, self.places.tolist(), strict=True)
+        return [(step, OPERATIONS.get(step), *place) for step, place in rows]
+
+    def _walk(self, inputs: Any, scratch: list[np.ndarray] | None) -> Iterator[tuple[int, Any]]:
         """Yield (result, value) for each output: numpy columns in `scratch`, or symbols where it is None."""
         registers: dict[int, Any] = {}
-        for step, (target, first, second) in zip(self.steps, self.places.tolist(), strict=True):
-            if step == "input":
+        for step, operation, target, first, second in self._program:
+            if operation is not None:
+                one = operation.operands == 1
+                operands = (registers[first],) if one else (registers[first], registers[second])
+                if scratch is None:
+                    registers[target] = operation.symbol(*operands)
+                else:
+                    operation.columns(*operands, scratch[target])
+                    registers[target] = scratch[target]
+            elif step == "input":
                 registers[target] = inputs[first]
             elif step == "constant":
                 constant = float(self.constants[first])
                 registers[target] = ca.SX(constant) if scratch is None else constant
-            elif step == "output":
-                yield target, registers[first]
             else:
-                count, columns, symbol = OPERATIONS[step]
-                operands = [registers[place] for place in (first, second)[:count]]
-                if scratch is None:
-                    registers[target] = symbol(*operands)
-                else:
-                    columns(*operands, out=scratch[target])
-                    registers[target] = scratch[target]
+                yield target, registers[first]
 
 
 def _scalar(function: ca.Function) -> ca.Function:

@@ -11,7 +11,7 @@ Columns = np.ndarray | float
 
 
 class Operation(NamedTuple):
-    """One operation, twice: `columns(*operands, out=...)` for numpy and `symbol(*operands)` for CasADi."""
+    """One operation, twice: `columns(*operands, out)` for numpy and `symbol(*operands)` for CasADi."""
 
     operands: int
     columns: Callable[..., Any]

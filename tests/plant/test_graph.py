@@ -1,4 +1,5 @@
 import json
+import pickle
 
 import casadi as ca
 import numpy as np
@@ -81,6 +82,13 @@ def test_through_json_and_back():
     assert again == GRAPH
     V = np.random.default_rng(0).normal(size=(10, 5))
     assert again.evaluate(V).tobytes() == GRAPH.evaluate(V).tobytes()
+
+
+def test_used_graphs_pickle():
+    GRAPH.evaluate(np.zeros((1, 5)))
+    again = pickle.loads(pickle.dumps(GRAPH))
+    assert again == GRAPH
+    assert again.evaluate(np.ones((2, 5))).tobytes() == GRAPH.evaluate(np.ones((2, 5))).tobytes()
 
 
 def test_matrix_functions_are_written_out():
