@@ -1,10 +1,11 @@
 """Dynamic mode decomposition on the states themselves, without and with inputs."""
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.fit import Regression, fit
 from koopmpc.identify.moments import moments
@@ -40,10 +41,7 @@ def dmd(episodes: Episodes, *, rank: int | None = None) -> LinearPredictor:
     ----------
     Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. Dyn. 1, 2014.
     """
-    autonomous = Episodes(
-        [Episode(X=e.X) for e in episodes] if episodes.nu else episodes.episodes, episodes.dt, episodes.states
-    )
-    return fit(_regression(autonomous, "dmd"), rank=rank)
+    return fit(_regression(episodes, "dmd", inputs=()), rank=rank)
 
 
 def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = None) -> LinearPredictor:
@@ -75,19 +73,22 @@ def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = N
     if episodes.nu == 0:
         raise DataError("the episodes have no inputs; pass them to dmd, or give each Episode its U")
     known = None if B is None else checks.array(B, "B", (episodes.nx, episodes.nu))
-    return fit(_regression(episodes, "dmdc", known), rank=rank)
+    return fit(_regression(episodes, "dmdc", inputs=episodes.inputs, B=known), rank=rank)
 
 
-def _regression(episodes: Episodes, method: str, B: np.ndarray | None = None) -> Regression:
+def _regression(
+    episodes: Episodes, method: str, *, inputs: tuple[str, ...], B: Float[np.ndarray, "nx nu"] | None = None
+) -> Regression:
+    """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
     lifting = State().bind(episodes.states)
-    nx, nu = episodes.nx, episodes.nu
+    nx, nu = episodes.nx, len(inputs)
     pairs = sum(len(e) for e in episodes)
     if pairs < nx + nu:  # the snapshots themselves are the few rows
         data = episodes.snapshots()
-        rows = Rows(np.hstack([data.X, data.U]), data.X_next, np.zeros(nx), pairs)
+        rows = Rows(np.hstack([data.X, data.U[:, :nu]]), data.X_next, np.zeros(nx), pairs)
     else:
         total = moments(episodes, lifting, route="qr")
-        rows = total.rows(total.regressors, total.targets)
+        rows = total.rows(total.regressors[: nx + nu], total.targets)
     return Regression(
         method=method,
         route="svd",
@@ -95,7 +96,7 @@ def _regression(episodes: Episodes, method: str, B: np.ndarray | None = None) ->
         x_next=np.arange(nx),
         lifting=lifting,
         states=episodes.states,
-        inputs=episodes.inputs,
+        inputs=inputs,
         dt=episodes.dt,
         C=None,
         state_residual=np.zeros(nx),
