@@ -17,8 +17,9 @@ from koopmpc.control.lifted import reference_rows
 from koopmpc.control.limits import Box, Limits, softened
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.control.riccati import stationary
-from koopmpc.control.shooting import QUIET, Aim, Shooting
+from koopmpc.control.shooting import QUIET, Aim, Shooting, flat
 from koopmpc.errors import ShapeError
+from koopmpc.lifting.state import State
 from koopmpc.plant.step_map import StepMap
 
 _KEPT = 10_000  # targets remembered before the memory starts anew
@@ -81,19 +82,17 @@ class NonlinearMPC:
         self._Q, self._R = cost.matrices(self._nr, step_map.nu)
         if cost.Q_N is not None:
             checks.weight(cost.Q_N, "Q_N", step_map.nx)
-            if self._nr != step_map.nx:
-                raise ShapeError(
-                    f"Q_N weighs x_N − r_N, but the reference has {self._nr} columns; leave Q_N out"
-                )
+            if not isinstance(tracked, State):
+                raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
         x = ca.SX.sym("x", step_map.nx)
         self._of = ca.Function("of", [x], [ca.densify(tracked.symbolic(x))])
         self._of_jacobian = ca.Function("of_x", [x], [ca.densify(ca.jacobian(tracked.symbolic(x), x))])
-        limited, self._outputs = _limited(self.limits, step_map)
+        self._limited, self._outputs = _limited(self.limits, step_map)
         options = {"ipopt.max_iter": 300, "ipopt.warm_start_init_point": "yes", **(settings or {})}
         self._shooting = Shooting(
             step_map,
             self._of,
-            limited,
+            self._limited,
             self._Q,
             self._R,
             self._inputs,
@@ -146,7 +145,7 @@ class NonlinearMPC:
             return self._fail(applied, found.status, found.iterations, start)
         U = np.clip(found.U, *self._inputs)
         self._memory.keep(U.ravel())
-        self._plan = Plan(np.vstack([x0, found.X]), U)
+        self._plan = Plan(np.vstack([x0, found.X]), U.copy())
         status = Status.SOFTENED if softened(found.slacks, self._outputs) else Status.OPTIMAL
         return Move(U[0].copy(), status, Fallback.NONE, perf_counter() - start, found.iterations)
 
@@ -166,23 +165,28 @@ class NonlinearMPC:
         return self._targets[key]
 
     def _find_target(self, row: Float[np.ndarray, " nr"]) -> _Target:
-        """Minimise ‖of(x) − r‖²_Q over equilibria x = F(x, u) inside the input limits."""
+        """Minimise ‖of(x) − r‖²_Q over equilibria x = F(x, u) inside all limits, or else the input limits."""
         nx, nu = self.step_map.nx, self.step_map.nu
         guess = np.concatenate(
             [row if self._nr == nx else np.zeros(nx), np.clip(np.zeros(nu), *self._inputs)]
         )
-        found = cast(
-            "dict[str, Any]",
-            self._equilibrium(
-                p=row,
-                x0=guess,
-                lbx=np.concatenate([np.full(nx, -np.inf), self._inputs.low]),
-                ubx=np.concatenate([np.full(nx, np.inf), self._inputs.high]),
-                lbg=0,
-                ubg=0,
-            ),
-        )
-        v = found["x"].full().ravel() if self._equilibrium.stats()["success"] else guess
+        v = guess
+        free = np.full(len(self._outputs.low), np.inf)
+        for outputs in (self._outputs, Box(-free, free)):
+            found = cast(
+                "dict[str, Any]",
+                self._equilibrium(
+                    p=row,
+                    x0=guess,
+                    lbx=np.concatenate([np.full(nx, -np.inf), self._inputs.low]),
+                    ubx=np.concatenate([np.full(nx, np.inf), self._inputs.high]),
+                    lbg=np.concatenate([np.zeros(nx), outputs.low]),
+                    ubg=np.concatenate([np.zeros(nx), outputs.high]),
+                ),
+            )
+            if self._equilibrium.stats()["success"]:
+                v = flat(found["x"])
+                break
         x, u = v[:nx], v[nx:]
         held = u if self.cost.u_target == "equilibrium" else np.zeros(nu)
         if self.cost.Q_N is not None:
@@ -198,7 +202,8 @@ class NonlinearMPC:
         error = self._of(x) - r
         least = 1e-8 * max(float(np.trace(self._Q)), 1e-12)  # of all that hold r, the one of least size
         f = ca.mtimes([error.T, ca.DM(self._Q), error]) + least * (ca.sumsqr(u) + ca.sumsqr(x))
-        nlp = {"x": ca.vertcat(x, u), "p": r, "f": f, "g": self.step_map.F(x, u) - x}
+        g = ca.vertcat(self.step_map.F(x, u) - x, self._limited(x))
+        nlp = {"x": ca.vertcat(x, u), "p": r, "f": f, "g": g}
         return ca.nlpsol("equilibrium", "ipopt", nlp, QUIET)
 
 

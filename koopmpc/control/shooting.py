@@ -135,13 +135,13 @@ class Shooting:
         found = cast("dict[str, Any]", self._solver(p=p, **self._bounds, **start))
         stats = self._solver.stats()
         status = _STATUS.get(str(stats["return_status"]), Status.FAILED)
-        primal = _flat(found["x"])
+        primal = flat(found["x"])
         U, X, slacks = self._blocks(primal, self._sizes)
         if status is Status.OPTIMAL:
             self._warm = {
                 "x0": self._moved_on(primal, self._sizes),
-                "lam_x0": self._moved_on(_flat(found["lam_x"]), self._sizes),
-                "lam_g0": self._moved_on(_flat(found["lam_g"]), self._rows),
+                "lam_x0": self._moved_on(flat(found["lam_x"]), self._sizes),
+                "lam_g0": self._moved_on(flat(found["lam_g"]), self._rows),
             }
         else:
             self._warm = None
@@ -158,7 +158,8 @@ class Shooting:
         return np.concatenate([np.vstack([block[1:], block[-1:]]).ravel() for block in blocks])
 
 
-def _flat(matrix: ca.DM) -> Float[np.ndarray, " m"]:
+def flat(matrix: ca.DM) -> Float[np.ndarray, " m"]:
+    """Return the entries as an array."""
     return np.asarray(matrix.full(), dtype=np.float64).ravel()
 
 
