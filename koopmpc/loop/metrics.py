@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.errors import ShapeError
 from koopmpc.loop.run import Run
 from koopmpc.values import Value
 
@@ -87,6 +88,11 @@ def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
     X = _states(run)
     tracked = None if run.cost is None else run.cost.of.bind(run.states)
     outputs = X if tracked is None else tracked(X)
+    if outputs.shape != run.reference.shape:
+        raise ShapeError(
+            f"the reference has shape {run.reference.shape}, what it is for {outputs.shape}; keep the run's cost,"
+            " whose of= says what the reference is for"
+        )
     error = outputs - run.reference
     names = run.states if tracked is None else tracked.names
     for i in run.angles:
@@ -98,7 +104,7 @@ def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
 
 def _states(run: Run) -> Float[np.ndarray, "T1 nx"]:
     """Return the true states, or the measured ones of a plant that hides them and measures them all."""
-    if np.isnan(run.X).all() and run.Y.shape == run.X.shape:
+    if np.isnan(run.X).all() and run.outputs == run.states:
         return run.Y
     return run.X
 

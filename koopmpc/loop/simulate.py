@@ -105,6 +105,14 @@ def simulate(
             f"the controller returns {nu} inputs, the plant takes {len(plant.inputs)} ({plant.inputs})"
         )
     rows = _reference(reference, steps, controller.horizon)
+    nr = rows.shape[1] if cost is None else cost.of.bind(plant.states).nz
+    if rows.shape[1] != nr:
+        raise ShapeError(
+            f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column"
+        )
+    outside = [i for i in angles if not 0 <= i < nx]
+    if outside:
+        raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
     push = _signal(disturbance, "disturbance", steps, nx)
     if push is not None and not isinstance(plant, SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
@@ -121,6 +129,10 @@ def simulate(
     for k in range(steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, rows.shape[1]))
         move = controller(Y[k].copy(), ahead, U[k - 1] if k else None)
+        if np.shape(move.u) != (nu,):
+            raise ShapeError(
+                f"the controller returned u of shape {np.shape(move.u)} at step {k}, expected ({nu},)"
+            )
         if not np.isfinite(move.u).all():
             raise DataError(f"the controller returned u = {move.u} at step {k}; every input must be finite")
         U[k] = move.u
