@@ -1,6 +1,7 @@
 """load_run: a log back into the Run that was written, to the bit."""
 # pyright: basic
 
+import json
 import struct
 import tempfile
 import warnings
@@ -8,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -36,13 +38,18 @@ def load_run(path: str | Path) -> Run:
     """
     path = Path(path)
     log = _read(path)
+    try:
+        return _run(log, path)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise LogError(f"{path} is damaged: {error}") from error
+
+
+def _run(log: "_Log", path: Path) -> Run:
     about, planned_steps = _about(log, path)
     X, reference = log.vectors("/state"), log.vectors("/reference")
     U = log.vectors("/control/u")
-    seconds, iterations = (
-        log.column("/solver/time_ms", "seconds"),
-        log.column("/solver/time_ms", "iterations"),
-    )
+    seconds = log.column("/solver/time_ms", "seconds")
+    iterations = log.column("/solver/time_ms", "iterations")
     counts = [len(X) - 1, len(seconds)]
     counts += [len(U)] if about.inputs else []
     counts += [len(reference) - 1] if len(reference) else []
@@ -57,7 +64,11 @@ def load_run(path: str | Path) -> Run:
             f"{path} ends after step {steps}{of}: the file was cut short or its writer did not close it; "
             "the run holds what is there",
             UserWarning,
-            stacklevel=2,
+            stacklevel=3,
+        )
+    elif changed := log.changed():
+        raise LogError(
+            f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy"
         )
     status, fallback = _statuses(log, steps, path)
     return Run(
@@ -80,6 +91,8 @@ class _Log:
     def __init__(self, chunks: Any) -> None:
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
         for chunk in chunks:
+            if not chunk.is_static and "step" not in chunk.timeline_names:
+                continue  # of no log of ours
             batch = chunk.to_record_batch()
             k = (
                 None
@@ -104,6 +117,8 @@ class _Log:
         parts = self._parts.get((entity, component), [])
         if not parts:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+        if parts[0][0] is None:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), parts[-1][1].flatten()
         k = np.concatenate([k for k, _ in parts])
         lists = pa.concat_arrays([column for _, column in parts])
         order = np.argsort(k, kind="stable")
@@ -129,6 +144,27 @@ class _Log:
         """Return one number a row: 0, 1, … up to the first that is missing."""
         k, values = self.matrix(entity, component)
         return values[: _whole(k)].reshape(-1)
+
+    def changed(self) -> list[str]:
+        """Return the columns that are no longer what was written: the end of the log holds a checksum of each."""
+        sums: dict[str, int] = json.loads(self.static("/metrics", "sums"))
+        return [
+            key
+            for key, total in sums.items()
+            if (data := self._data(key)) is not None and crc32(data) != total
+        ]
+
+    def _data(self, key: str) -> Any:
+        """Return the bytes that a checksum is made of; None for what is not read."""
+        import pyarrow as pa
+
+        entity, component = key.split(":")
+        if entity not in _ENTITIES:
+            return None
+        values = self.rows(entity, component)[2]
+        if isinstance(values, pa.StringArray):
+            return "".join(values.to_pylist()).encode()
+        return np.ascontiguousarray(values).data
 
 
 def _whole(k: np.ndarray) -> int:
@@ -184,7 +220,9 @@ def _whole_messages(path: Path) -> Iterator[Path]:
 def _about(log: _Log, path: Path) -> tuple[About, int | None]:
     text = log.static("/description", "json")
     if text is None:
-        raise LogError(f"{path} is a Rerun recording, but no log of koopmpc: it has no description")
+        raise LogError(
+            f"{path} is a Rerun recording, but no log of koopmpc: it has no description, or was cut before it"
+        )
     return from_json(text)
 
 

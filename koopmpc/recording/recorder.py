@@ -2,12 +2,9 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Event, Thread
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +18,12 @@ from koopmpc.loop.simulate import Step
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.connect import PORT, find_viewer
 from koopmpc.recording.description import About
-from koopmpc.recording.rows import Rows, rows_of_run, rows_of_steps, run_of_rows
+from koopmpc.recording.rows import rows_of_run
 from koopmpc.recording.scenes import Scene
+from koopmpc.recording.stream import Stream
 from koopmpc.recording.writer import Writer
 
-_BATCH = 0.2  # time between two batches [s]
-_PATIENCE = 20.0  # longest wait for the thread at the end [s]
-_NOTHING = np.empty((0, 0, 0))
+_PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
 
 
 def record(
@@ -57,9 +53,9 @@ def record(
 class Recorder:
     """A context manager that writes a log while a loop runs; call it once a step, with a `Step`.
 
-    A call puts copies of small arrays into a queue and returns within microseconds. A thread writes them to `path`
-    and, with `live`, to the viewer that is up at this machine's port 9876, or to one that is opened. A viewer that
-    is missing or dies costs one UserWarning, and no step.
+    A call puts copies of small arrays into a queue and returns within microseconds. A thread writes them to `path`,
+    and with `live` another one to the viewer that is up at this machine's port 9876, or that is opened. A viewer that
+    is missing, slow or dies costs one UserWarning, and no step.
 
     It is an observer: ``with km.Recorder("run.rrd", dt=…) as recorder: km.simulate(…, observers=[recorder])``. In a
     loop of one's own, k, y, u and reference of a Step are enough; give the last Step its y_next too, for a Run ends
@@ -115,82 +111,51 @@ class Recorder:
         )
         self._path, self._live, self._port = None if path is None else Path(path), live, port
         self._scene, self._model = scene, model
-        self._queue: SimpleQueue[Step] = SimpleQueue()
-        self._closing = Event()
-        self._thread: Thread | None = None
-        self._failure: Exception | None = None
+        self._streams: dict[str, Stream] = {}
+        self._open = False
 
-    def __enter__(self) -> Self:
-        """Find the viewer, open the log and start the thread."""
-        viewer = find_viewer(self._port) if self._live else None
-        if self._live and viewer is None:
-            kept = "the run is recorded all the same" if self._path else "nothing is recorded"
-            warnings.warn(
-                f"no Rerun viewer is up at 127.0.0.1:{self._port}, and there is no display to open one on; {kept}",
-                UserWarning,
-                stacklevel=2,
-            )
-        writer = None
-        if self._path is not None or viewer is not None:
-            writer = Writer(self._about, path=self._path, viewer=viewer, scene=self._scene, model=self._model)
-        self._thread = Thread(target=self._work, args=(writer,), name="koopmpc-recorder", daemon=True)
-        self._thread.start()
+    def __enter__(self) -> "Recorder":
+        """Open the log, and find the viewer."""
+        if self._path is not None:
+            self._streams[str(self._path)] = self._stream(self._path, None)
+        if self._live:
+            viewer = find_viewer(self._port)
+            if viewer is not None:
+                self._streams[viewer] = self._stream(None, viewer)
+            else:
+                kept = "the log is written all the same" if self._path else "nothing is recorded"
+                warnings.warn(
+                    f"no Rerun viewer listens at 127.0.0.1:{self._port}, and none could be opened; {kept}",
+                    UserWarning,
+                    stacklevel=2,
+                )
+        self._open = True
         return self
 
     def __call__(self, step: Step) -> None:
         """Queue one step."""
-        if self._thread is None:
+        if not self._open:
             raise DataError("the Recorder is not open; call it inside `with Recorder(...) as recorder:`")
-        self._queue.put(_copied(step))
+        own = _copied(step)
+        for stream in self._streams.values():
+            stream.put(own)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Write what is queued, the metrics and the end, and close."""
-        thread, self._thread = self._thread, None
-        if thread is None:
-            return
-        self._closing.set()
-        thread.join(_PATIENCE)
-        if thread.is_alive():
-            self._failure = TimeoutError(f"not written after {_PATIENCE:g} s")
-        if self._failure is not None:
-            where = "the live viewer" if self._path is None else self._path
-            warnings.warn(
-                f"the recording to {where} is not complete: {self._failure}", UserWarning, stacklevel=2
-            )
+        self._open = False
+        for name, stream in self._streams.items():
+            failure = stream.close(_PATIENCE_FILE if name == str(self._path) else _PATIENCE_VIEWER)
+            if failure is not None:
+                warnings.warn(
+                    f"the recording to {name} is not complete: {failure}", UserWarning, stacklevel=2
+                )
+        self._streams = {}
 
-    def _work(self, writer: Writer | None) -> None:
-        """Write batches until the end; a failure is kept for `__exit__`, and what follows it is dropped."""
-        blocks: list[Rows] = []
-        last: list[Step] = []  # held back, for the state that it led to may come with the end
-        closing = False
-        while not closing:
-            closing = self._closing.wait(_BATCH)  # the thread wakes at its own pace, never at a step's
-            steps = last + _drained(self._queue)
-            if writer is None or self._failure is not None:
-                continue
-            try:
-                ready, last = (steps, []) if closing else (steps[:-1], steps[-1:])
-                if ready:
-                    rows = rows_of_steps(ready, len(self._about.states), end=closing)
-                    blocks.append(replace(rows, planned=rows.planned[:0], plan_X=_NOTHING, plan_U=_NOTHING))
-                    writer.write(rows)
-                    writer.flush()
-                if closing:
-                    writer.end(run_of_rows(blocks, self._about))
-            except Exception as error:  # whatever a scene, a disk or a viewer raises must not reach the loop
-                self._failure = error
-
-
-def _drained(queue: SimpleQueue[Step]) -> list[Step]:
-    """Return all that is in the queue now."""
-    steps: list[Step] = []
-    while True:
-        try:
-            steps.append(queue.get_nowait())
-        except Empty:
-            return steps
+    def _stream(self, path: Path | None, viewer: str | None) -> Stream:
+        writer = Writer(self._about, path=path, viewer=viewer, scene=self._scene, model=self._model)
+        return Stream(self._about, writer)
 
 
 def _copied(step: Step) -> Step:

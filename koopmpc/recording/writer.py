@@ -1,7 +1,9 @@
 """Writer: the one way in which rows become a Rerun recording."""
 # pyright: basic
 
+import json
 import uuid
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,7 +47,14 @@ class Writer:
         self._bounds = Bounds()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
+        self._sums: dict[
+            str, int
+        ] = {}  # of all bytes of an entity so far: a damaged log must not read as a whole one
         self._u: np.ndarray | None = None
+        page, data = (
+            to_markdown(about),
+            to_json(about, steps),
+        )  # what cannot be saved is refused before a file is made
         self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
         sinks: list[Any] = []
         if path is not None:
@@ -55,8 +64,9 @@ class Writer:
             sinks.append(rr.GrpcSink(viewer))
         self._rec.set_sinks(*sinks, default_blueprint=self._blueprint())
         self._rec.send_recording_name(about.title)
-        text = rr.TextDocument(to_markdown(about), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log("description", text, rr.AnyValues(json=to_json(about, steps)), static=True)
+        text = rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN)
+        self._sum("/description:json", data.encode())
+        self._rec.log("description", text, rr.AnyValues(json=data), static=True)
         if model is not None:
             self._eigenvalues(model)
 
@@ -87,6 +97,8 @@ class Writer:
                 "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
             )
             scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
+            self._sum("/solver/time_ms:seconds", np.ascontiguousarray(rows.solve_time).data)
+            self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
             self._rec.send_columns("solver/time_ms", self._times(k[:m]), [*scalars, *exact])
             self._statuses(rows)
         self._vectors("state", k, rows.X)
@@ -99,7 +111,7 @@ class Writer:
         """Write the metrics of the whole `run` and close; the log says from now on that it is complete."""
         import rerun as rr
 
-        numbers: dict[str, Any] = {"steps": 0}
+        numbers: dict[str, Any] = {"steps": 0, "sums": json.dumps(self._sums)}
         text = "No step was recorded."
         if run is not None:
             numbers["steps"] = run.steps
@@ -135,9 +147,13 @@ class Writer:
             return
         width = values[0].size
         columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(len(k), width))
+        self._sum(f"/{entity}:scalars", np.ascontiguousarray(values).data)
         if values.ndim > 2:
             self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
         self._rec.send_columns(entity, self._times(k), columns)
+
+    def _sum(self, column: str, data: Any) -> None:
+        self._sums[column] = zlib.crc32(data, self._sums.get(column, 0))
 
     def _style(self, entity: str, style: Any) -> None:
         """Log what holds for the whole run, once."""
@@ -154,6 +170,7 @@ class Writer:
         self._status = pairs[-1]
         if changed:
             words = [_word(*pairs[i]) for i in changed]
+            self._sum("/solver/status:state", "".join(words).encode())
             times = self._times(rows.k + np.array(changed))
             self._rec.send_columns("solver/status", times, rr.StateChange.columns(state=words))
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]

@@ -1,0 +1,144 @@
+"""Damaged logs: what is whole is read and said to be a part; the rest is refused, and never read as a whole."""
+
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from koopmpc.errors import LogError
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.recorder import Recorder, record
+from tests.recording.runs import about, make_run, steps_of
+
+
+def test_a_log_that_is_no_log(tmp_path: Path) -> None:
+    text, empty, folder = tmp_path / "notes.rrd", tmp_path / "empty.rrd", tmp_path / "folder.rrd"
+    text.write_text("these are notes")
+    empty.touch()
+    folder.mkdir()
+    for path in (text, empty):
+        with pytest.raises(
+            LogError, match=rf"{path.name} is no log of koopmpc: it does not start as an \.rrd file does"
+        ):
+            load_run(path)
+    for path in (folder, tmp_path / "nowhere.rrd"):
+        with pytest.raises(LogError, match=rf"{path.name} does not exist; pass the \.rrd of a run"):
+            load_run(path)
+
+
+def test_a_recording_of_something_else(tmp_path: Path) -> None:
+    import rerun as rr
+
+    other = rr.RecordingStream("something_else")
+    other.save(tmp_path / "other.rrd")
+    other.log("state", rr.Scalars([1.0]))
+    other.flush()
+    other.disconnect()
+    with pytest.raises(
+        LogError, match=r"other\.rrd is a Rerun recording, but no log of koopmpc: it has no description"
+    ):
+        load_run(tmp_path / "other.rrd")
+
+
+def test_a_log_without_a_step(tmp_path: Path) -> None:
+    run = make_run()
+    with Recorder(tmp_path / "none.rrd", **about(run)):
+        pass
+    with Recorder(tmp_path / "half.rrd", **about(run)) as recorder:
+        recorder(steps_of(run)[0].__class__(0, run.Y[0], run.U[0], run.reference[0]))
+    for name in ("none", "half"):
+        with pytest.raises(
+            LogError, match=rf"{name}\.rrd holds no whole step; its run ended before the second state"
+        ):
+            load_run(tmp_path / f"{name}.rrd")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of 60 steps, written as it happens in three batches."""
+    path = tmp_path_factory.mktemp("logs") / "run.rrd"
+    run = make_run(T=60)
+    import time
+
+    with Recorder(path, **about(run)) as recorder:
+        for step in steps_of(run):
+            recorder(step)
+            time.sleep(0.5 if step.k in (19, 39) else 0.0)
+    return path
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_log_cut_before_its_description_is_refused(written: Path, tmp_path: Path, share: float) -> None:
+    whole = written.read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(whole[: int(share * whole.find(b"koopmpc-log-1"))])
+    with pytest.raises(LogError, match=r"cut\.rrd .*(No recording|or was cut before it)"):
+        load_run(tmp_path / "cut.rrd")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 0.999, 1.0])
+def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(
+    written: Path, tmp_path: Path, share: float
+) -> None:
+    path, whole = tmp_path / "cut.rrd", written.read_bytes()
+    run = make_run(T=60)
+    start = whole.find(run.plans.X[25].tobytes())  # the plans come first in a batch: the first batch is whole
+    assert start > 0
+    path.write_bytes(whole[: int(start + share * (len(whole) - start))])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read = load_run(path)
+    k = read.steps
+    assert np.array_equal(read.X, run.X[: k + 1])
+    assert np.array_equal(read.Y, run.Y[: k + 1])
+    assert np.array_equal(read.U, run.U[:k])
+    assert np.array_equal(read.plans.U, run.plans.U[:k])
+    assert read.status == run.status[:k]
+    if caught:
+        assert [str(w.message) for w in caught] == [
+            f"{path} ends after step {k}: the file was cut short or its writer did not close it; "
+            "the run holds what is there"
+        ]
+    else:
+        assert read == run
+
+
+def test_a_log_cut_in_a_batch_ends_with_the_batch_before(written: Path, tmp_path: Path) -> None:
+    """The bytes of the states of the last batch are lost; the log says that it is a part."""
+    run, whole = make_run(T=60), written.read_bytes()
+    place = whole.rfind(run.X[50].tobytes())
+    assert place > 0
+    (tmp_path / "cut.rrd").write_bytes(whole[:place])
+    with pytest.warns(UserWarning, match=r"cut\.rrd ends after step \d+: "):
+        read = load_run(tmp_path / "cut.rrd")
+    assert 0 < read.steps < 50
+
+
+@pytest.mark.parametrize("column", ["X", "U", "solve_time"])
+def test_a_changed_number_is_not_read_as_the_run(tmp_path: Path, column: str) -> None:
+    run, path = make_run(T=60), tmp_path / "run.rrd"
+    record(run, path)
+    data = bytearray(path.read_bytes())
+    place = data.find(np.ascontiguousarray(getattr(run, column)[30]).tobytes()[:8])
+    if place < 0:
+        pytest.skip("the numbers were written compressed")
+    data[place + 3] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(
+        LogError, match=r"run\.rrd is damaged: /\w+.* no longer hold what was written; take another copy"
+    ):
+        load_run(path)
+
+
+def test_a_log_of_another_format_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    record(make_run(), path)
+    shutil.copy(path, tmp_path / "new.rrd")
+    data = path.read_bytes()
+    assert b'"koopmpc-log-1"' in data
+    (tmp_path / "new.rrd").write_bytes(data.replace(b'"koopmpc-log-1"', b'"koopmpc-log-9"'))
+    with pytest.raises(
+        LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-1'"
+    ):
+        load_run(tmp_path / "new.rrd")

@@ -1,0 +1,201 @@
+"""Recorder: step by step it writes what `record` writes at once, and nothing that happens to it reaches the loop."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from koopmpc.errors import DataError
+from koopmpc.loop.run import Run
+from koopmpc.loop.simulate import Step
+from koopmpc.recording import connect
+from koopmpc.recording.connect import start_viewer
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.recorder import Recorder, record
+from koopmpc.recording.scene import Disk
+from koopmpc.recording.viewer import free_port
+from tests.recording.runs import about, make_run, steps_of
+
+
+def test_a_recorder_and_record_write_the_same_run(tmp_path: Path) -> None:
+    for i, run in enumerate((make_run(nu=2, odd=1.0), make_run(N=None, ny=1, cost=False), make_run(T=1))):
+        path = tmp_path / f"{i}.rrd"
+        with Recorder(
+            path, **about(run), scene=lambda x, u: [Disk("d", (float(x[0]), 0.0), 1.0)]
+        ) as recorder:
+            for step in steps_of(run):
+                recorder(step)
+                time.sleep(0.02)  # so that there are several batches
+        record(run, tmp_path / "once.rrd")
+        assert load_run(path) == run
+        assert load_run(tmp_path / "once.rrd") == run
+
+
+def test_steps_without_a_plan_leave_a_gap_in_the_plans(tmp_path: Path) -> None:
+    run = make_run(T=6, N=2)
+    run.plans.X[[0, 3]], run.plans.U[[0, 3]] = np.nan, np.nan
+    with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+        for step in steps_of(run):
+            recorder(replace(step, plan=None) if step.k in (0, 3) else step)
+    assert load_run(tmp_path / "run.rrd") == run
+
+
+def test_a_loop_of_ones_own_needs_only_y_u_and_the_reference(tmp_path: Path) -> None:
+    run = make_run()
+    y, u = np.zeros(2), np.zeros(1)
+    with Recorder(tmp_path / "run.rrd", dt=0.1, states=run.states, inputs=run.inputs) as recorder:
+        for k in range(run.steps):
+            y[:], u[:] = run.Y[k], run.U[k]  # the same arrays again: the Recorder keeps copies
+            recorder(Step(k, y, u, run.reference[k], y_next=run.Y[-1] if k == run.steps - 1 else None))
+    read = load_run(tmp_path / "run.rrd")
+    assert np.array_equal(read.Y, run.Y)
+    assert np.array_equal(read.U, run.U)
+    assert np.isnan(read.X).all()
+    assert read.outputs == run.states
+
+
+def test_without_the_last_measurement_the_run_ends_a_step_before(tmp_path: Path) -> None:
+    run = make_run()
+    with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+        for step in steps_of(run):
+            recorder(replace(step, x_next=None, y_next=None))
+    assert load_run(tmp_path / "run.rrd").steps == run.steps - 1
+
+
+def feed(recorder: Recorder, run: Run) -> None:
+    for step in steps_of(run):
+        recorder(step)
+
+
+def test_no_viewer_costs_one_warning_and_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connect, "has_display", lambda: False)
+    run, port = make_run(), free_port()
+    start = time.monotonic()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
+            feed(recorder, run)
+        with Recorder(live=True, port=port, **about(run)) as recorder:
+            feed(recorder, run)
+    assert time.monotonic() - start < 4.0  # Rerun would wait five seconds for a viewer, twice
+    assert [w.category for w in caught] == [UserWarning, UserWarning]
+    listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and none could be opened"
+    assert str(caught[0].message) == f"{listens}; the log is written all the same"
+    assert str(caught[1].message) == f"{listens}; nothing is recorded"
+    assert load_run(tmp_path / "run.rrd") == run
+
+
+def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
+    run, port = make_run(), free_port()
+    viewer = start_viewer("--save", str(tmp_path / "seen.rrd"), port=port)
+    try:
+        with Recorder(live=True, port=port, **about(run)) as recorder:
+            feed(recorder, run)
+    finally:
+        time.sleep(0.5)
+        viewer.send_signal(signal.SIGINT)
+        viewer.wait(10)
+    assert load_run(tmp_path / "seen.rrd") == run
+
+
+def test_a_viewer_that_dies_costs_one_warning_and_no_step(tmp_path: Path) -> None:
+    run, port = make_run(T=40), free_port()
+    viewer = start_viewer("--serve-grpc", port=port)
+
+    def loop() -> None:
+        with Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
+            for step in steps_of(run):
+                recorder(step)
+                time.sleep(0.02)
+                if step.k == 15:
+                    viewer.kill()
+                    viewer.wait()
+
+    with pytest.warns(UserWarning, match=rf"the recording to .*{port}/proxy is not complete") as caught:
+        loop()
+    assert len(caught) == 1
+    assert load_run(tmp_path / "run.rrd") == run
+
+
+def test_a_scene_that_raises_is_told_and_does_not_reach_the_loop(tmp_path: Path) -> None:
+    def scene(x: np.ndarray, u: np.ndarray) -> list[Disk]:
+        raise ZeroDivisionError("no such place")
+
+    run = make_run()
+    with pytest.warns(UserWarning, match=r"run\.rrd is not complete: no such place"):  # noqa: SIM117
+        with Recorder(tmp_path / "run.rrd", scene=scene, **about(run)) as recorder:
+            feed(recorder, run)
+
+
+def test_an_exception_in_the_loop_still_closes_the_log(tmp_path: Path) -> None:
+    run = make_run()
+
+    def loop() -> None:
+        with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+            for step in steps_of(run)[:9]:
+                recorder(step)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        loop()
+    read = load_run(tmp_path / "run.rrd")
+    assert read.steps == 9
+    assert np.array_equal(read.X, run.X[:10])
+
+
+_KILLED = """
+import sys, time
+sys.path.insert(0, {root!r})
+from tests.recording.runs import about, make_run, steps_of
+from koopmpc.recording.recorder import Recorder
+run = make_run(T=200)
+with Recorder({path!r}, **about(run)) as recorder:
+    for step in steps_of(run)[:100]:
+        recorder(step)
+    time.sleep(1.0)
+    for step in steps_of(run)[100:]:
+        recorder(step)
+    print("written", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_killed_writer_keeps_what_was_flushed(tmp_path: Path) -> None:
+    path, root = tmp_path / "run.rrd", str(Path(__file__).parents[2])
+    code = _KILLED.format(root=root, path=str(path))
+    writer = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": root}
+    )
+    assert writer.stdout is not None
+    writer.stdout.readline()
+    writer.kill()
+    writer.wait()
+    writer.stdout.close()
+    with pytest.warns(
+        UserWarning, match=r"run\.rrd ends after step \d+: the file was cut short or its writer"
+    ):
+        read = load_run(path)
+    run = make_run(T=200)
+    assert read.steps >= 98  # the hundredth was held back for what follows it
+    assert np.array_equal(read.X, run.X[: read.steps + 1])
+    assert np.array_equal(read.plans.X, run.plans.X[: read.steps])
+    assert read.status == run.status[: read.steps]
+
+
+def test_a_recorder_needs_a_place_and_a_with_block(tmp_path: Path) -> None:
+    run = make_run()
+    with pytest.raises(
+        DataError, match="a Recorder needs somewhere to write: pass a path, live=True, or both"
+    ):
+        Recorder(**about(run))
+    with pytest.raises(DataError, match=r"dt is 0 s; it must be above zero"):
+        Recorder(tmp_path / "run.rrd", **about(run) | {"dt": 0.0})
+    with pytest.raises(DataError, match=r"the Recorder is not open; call it inside `with Recorder"):
+        Recorder(tmp_path / "run.rrd", **about(run))(steps_of(run)[0])

@@ -1,0 +1,86 @@
+"""Scenes: shapes become lines that cover what they stand for, y down."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from koopmpc.recording.scene import Box, Disk, Line, Shape
+from koopmpc.recording.scenes import Bounds, draw, draw_ahead, stages
+
+coordinate = st.floats(-10, 10)
+
+
+def strips(columns: object) -> list[list[list[tuple[float, float]]]]:
+    """Return the strips of every row of a drawing."""
+    column = next(c for c in columns if "strips" in str(c.component_descriptor()))
+    return column.as_arrow_array().to_pylist()
+
+
+@given(x=coordinate, y=coordinate, angle=st.floats(-4, 4), width=st.floats(0.1, 3), height=st.floats(0.1, 3))
+def test_a_box_is_covered_and_no_more(x: float, y: float, angle: float, width: float, height: float) -> None:
+    box = Box("box", (x, y), (width, height), angle)
+    drawing = draw([[box]], Bounds())["box"]
+    path = np.array(strips(drawing.columns)[0][0]) * (1, -1) - (x, y)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    local, r = path @ turn, min(width, height) / 8
+    reach = np.abs(local).max(axis=0) + r
+    np.testing.assert_allclose(reach, [width / 2, height / 2], atol=1e-4)
+    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2)) * (np.array([width, height]) - 2 * r)
+    assert max(distance(point, local) for point in inside) <= r + 1e-4
+
+
+def distance(point: np.ndarray, path: np.ndarray) -> float:
+    """Return the least distance of a point from a polyline."""
+    a, d = path[:-1], np.diff(path, axis=0)
+    t = np.clip(np.einsum("ij,ij->i", point - a, d) / np.maximum(np.einsum("ij,ij->i", d, d), 1e-12), 0, 1)
+    return float(np.linalg.norm(point - a - t[:, None] * d, axis=1).min())
+
+
+def test_up_in_the_scene_is_up_in_the_viewer() -> None:
+    columns = draw([[Line("rod", [(0.0, 0.0), (1.0, 2.0)])]], Bounds())["rod"].columns
+    assert np.array(strips(columns)).tolist() == [[[[0.0, 0.0], [1.0, -2.0]]]]
+
+
+@pytest.mark.parametrize(
+    ("shape", "low", "high"),
+    [
+        (Line("s", [(-1.0, 0.0), (3.0, 1.0)], width=0.2), (-1.1, -0.1), (3.1, 1.1)),
+        (Disk("s", (1.0, 2.0), 0.5), (0.5, 1.5), (1.5, 2.5)),
+        (Box("s", (0.0, 0.0), (2.0, 4.0), np.pi / 2), (-2.0, -1.0), (2.0, 1.0)),
+    ],
+)
+def test_bounds_hold_every_shape_whole(shape: Shape, low: tuple, high: tuple) -> None:
+    bounds = Bounds()
+    draw([[shape], []], bounds)
+    np.testing.assert_allclose(bounds.low, low, atol=1e-3)
+    np.testing.assert_allclose(bounds.high, high, atol=1e-3)
+    (x0, x1), (y0, y1) = bounds.ranges()
+    assert x0 < low[0] < high[0] < x1
+    assert y0 < -high[1] < -low[1] < y1
+
+
+def test_nothing_drawn_has_no_bounds() -> None:
+    bounds = Bounds()
+    draw([[Line("nowhere", [(np.nan, 0.0), (0.0, 0.0)])]], bounds)
+    assert bounds.ranges() is None
+
+
+def test_only_what_moves_is_drawn_ahead_and_fades() -> None:
+    rail, cart = Line("rail", [(0.0, 0.0), (1.0, 0.0)]), Disk("cart", (0.0, 0.0), 0.1, color=(0, 0, 0))
+    ahead = [[rail, Disk("cart", (float(i), 0.0), 0.1, color=(0, 0, 0))] for i in (1, 2)]
+    drawings = draw_ahead([[rail, cart], [rail, cart]], [ahead, []])
+    assert [len(row) for row in strips(drawings["rail"].columns)] == [0, 0]
+    assert [len(row) for row in strips(drawings["cart"].columns)] == [2, 0]
+    colors = next(c for c in drawings["cart"].columns if "colors" in str(c.component_descriptor()))
+    far, near = (value >> 24 for value in colors.as_arrow_array().to_pylist()[0])
+    assert 0 < near < far < 247
+
+
+@given(horizon=st.integers(1, 200))
+def test_the_last_stage_is_always_among_those_drawn(horizon: int) -> None:
+    drawn = stages(horizon)
+    assert drawn[-1] == horizon
+    assert drawn == sorted(set(drawn))
+    assert 1 <= len(drawn) <= 4
+    assert drawn[0] >= 1
