@@ -1,7 +1,7 @@
 """The one place that words messages about shapes, dtypes, NaN and definiteness."""
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from koopmpc.errors import DataError, DefinitenessError, ShapeError
 
 
 def array(
-    value: ArrayLike | tuple[Any, ...],
+    value: ArrayLike,
     name: str,
     shape: Sequence[int | None] | None = None,
     *,
@@ -71,9 +71,7 @@ def array(
     return result
 
 
-def vector(
-    value: ArrayLike | tuple[Any, ...], name: str, length: int, *, infinite: bool = False
-) -> Float[np.ndarray, " n"]:
+def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) -> Float[np.ndarray, " n"]:
     """Return `value` as a vector of `length`; a scalar is repeated."""
     result = array(value, name, infinite=infinite)
     if result.ndim == 0:
@@ -84,7 +82,7 @@ def vector(
 
 
 def weight(
-    value: ArrayLike | tuple[Any, ...], name: str, size: int | None = None, *, definite: bool = False
+    value: ArrayLike, name: str, size: int | None = None, *, definite: bool = False
 ) -> Float[np.ndarray, "n n"]:
     """Return a symmetric positive (semi)definite matrix; a scalar or a 1-D `value` is a diagonal."""
     result = array(value, name)

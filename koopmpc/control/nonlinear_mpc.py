@@ -218,5 +218,5 @@ def _limited(limits: Limits, step_map: StepMap) -> tuple[ca.Function, Box]:
         values = ca.vertcat(x, of.symbolic(x))
         low, high = np.concatenate([low, y.low]), np.concatenate([high, y.high])
     kept = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
-    function = ca.Function("limited", [x], [ca.densify(values[kept.tolist()])])
+    function = ca.Function("limited", [x], [ca.densify(values[kept.tolist(), :])])
     return function, Box(low[kept], high[kept])
