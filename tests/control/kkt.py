@@ -1,0 +1,46 @@
+"""OSQP with every answer checked: stationarity, feasibility and the signs of the multipliers of each QP."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from koopmpc.control.move import Status
+from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.osqp import DEFAULTS, OSQP
+
+
+class CheckedOSQP(OSQP):
+    """Raises where an answer that is called optimal does not meet the KKT conditions to its own tolerance."""
+
+    checked: ClassVar[int] = 0
+
+    def __init__(self, qp, settings=None):
+        super().__init__(qp, settings)
+        self.qp = qp
+        options = {**DEFAULTS, **(settings or {})}
+        self.eps = options["eps_abs"], options["eps_rel"]
+
+    def update(self, low, high):
+        super().update(low, high)
+        self.qp = QP(self.qp.P, self.qp.q, self.qp.A, low.copy(), high.copy())
+
+    def solve(self, v, y):
+        solution = super().solve(v, y)
+        if solution.status is Status.OPTIMAL:
+            meets_kkt(self.qp, solution, *self.eps)
+            CheckedOSQP.checked += 1
+        return solution
+
+
+def meets_kkt(qp, solution, eps_abs, eps_rel):
+    """Assert P v + q + Aᵀy = 0, low ≤ A v ≤ high, y ≥ 0 only at high and ≤ 0 only at low, as OSQP measures them."""
+    v, y = solution.v, solution.y
+    Av, Pv, Ay = qp.A @ v, qp.P @ v, qp.A.T @ y
+    size = lambda *parts: max(float(np.abs(part).max(initial=0.0)) for part in parts)  # noqa: E731
+    near = np.clip(Av, qp.low, qp.high)
+    primal = 1.01 * (eps_abs + eps_rel * size(Av, near))
+    assert size(Av - near) <= primal
+    assert size(Pv + qp.q + Ay) <= 1.01 * (eps_abs + eps_rel * size(Pv, Ay, qp.q))
+    pushed = np.abs(y) > 10 * (eps_abs + eps_rel * size(y))
+    end = np.where(y > 0, qp.high, qp.low)
+    assert (np.abs(Av - end)[pushed] <= 3 * primal + 1e-9).all()

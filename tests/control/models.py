@@ -1,0 +1,145 @@
+"""Small systems, and the finite-horizon problem written a second and a third time: dense, and in CVXPY."""
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+import koopmpc as km
+from koopmpc.control.riccati import stationary
+
+PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
+
+
+def random_pair(rng, nx, nu, radius=1.05):
+    A = rng.normal(size=(nx, nx))
+    return A * radius / np.abs(np.linalg.eigvals(A)).max(), rng.normal(size=(nx, nu))
+
+
+def linear(A, B, dt=0.1, constant=None):
+    """x⁺ = A x + B u (+ c) as a predictor on State() or State() + Constant()."""
+    nx, nu = np.shape(B)
+    states, inputs = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
+    if constant is None:
+        return km.LinearPredictor(np.array(A), np.array(B), np.eye(nx), km.State(), dt, states, inputs)
+    whole = scipy.linalg.block_diag(A, 1.0)
+    whole[:nx, nx] = constant
+    return km.LinearPredictor(
+        whole,
+        np.vstack([B, np.zeros((1, nu))]),
+        np.eye(nx, nx + 1),
+        km.State() + km.Constant(),
+        dt,
+        states,
+        inputs,
+    )
+
+
+def step_map(A, B, dt=0.1, constant=None):
+    nx, nu = np.shape(B)
+    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
+    c = np.zeros(nx) if constant is None else np.asarray(constant)
+    return km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u + ca.DM(c)]), dt)
+
+
+def equilibrium(A, B, C, Q, r, constant=None):
+    """(z_r, u_r) by a null space and least squares; the index `constant` is pinned to 1."""
+    nz = len(A)
+    E = np.hstack([A - np.eye(nz), B])
+    keep = [i for i in range(nz) if i != constant]
+    free = keep + list(range(nz, E.shape[1]))
+    base = np.zeros(E.shape[1])
+    span = np.zeros((E.shape[1], 0))
+    E = E[keep]
+    basis = scipy.linalg.null_space(E[:, free])
+    span = np.zeros((len(base), basis.shape[1]))
+    span[free] = basis
+    if constant is not None:
+        base[constant] = 1.0
+        base[free] = np.linalg.lstsq(E[:, free], -E[:, constant], rcond=None)[0]
+    S = scipy.linalg.sqrtm(Q).real
+    alpha = np.linalg.lstsq(S @ C @ span[:nz], S @ (r - C @ base[:nz]), rcond=None)[0]
+    v = base + span @ alpha
+    return v[:nz], v[nz:]
+
+
+def terminal(model, cost, C, N):
+    """(P, weighs_state) of the cost's terminal term."""
+    Q, R = cost.matrices(len(C), model.nu)
+    if cost.Q_N is None:
+        return stationary(model.A, model.B, C.T @ Q @ C, R, 10 * N).P, False
+    return np.atleast_2d(cost.Q_N), len(np.atleast_2d(cost.Q_N)) == model.nx
+
+
+def dense_plan(model, cost, z0, rows, targets, C=None):
+    """The unconstrained plan U (N, nu) as one least-squares problem in the inputs."""
+    C = model.C if C is None else C
+    A, B = model.A, model.B
+    N, nu = len(rows) - 1, model.nu
+    Q, R = cost.matrices(len(C), nu)
+    root = lambda M: scipy.linalg.sqrtm(M).real  # noqa: E731
+    P, weighs_state = terminal(model, cost, C, N)
+    blocks, right = [], []
+    Z, D = np.array(z0), np.zeros((len(A), N * nu))
+    for k in range(N):
+        pick = np.eye(nu, N * nu, k * nu)
+        blocks.append(root(R) @ pick)
+        right.append(root(R) @ targets[k][1])
+        Z, D = A @ Z, A @ D + B @ pick
+        if k + 1 < N:
+            blocks.append(root(Q) @ C @ D)
+            right.append(root(Q) @ (rows[k + 1] - C @ Z))
+        elif weighs_state:
+            blocks.append(root(P) @ C @ D)
+            right.append(root(P) @ (rows[N] - C @ Z))
+        else:
+            blocks.append(root(P) @ D)
+            right.append(root(P) @ (targets[N][0] - Z))
+    return np.linalg.lstsq(np.vstack(blocks), np.concatenate(right), rcond=None)[0].reshape(N, nu)
+
+
+def cvxpy_plan(model, cost, limits, z0, rows, targets, C=None, of=None):
+    """The plan U (N, nu) with the lifted states as variables, by CLARABEL; None where there is none."""
+    import cvxpy as cp
+
+    C = model.C if C is None else C
+    N, nu, nz = len(rows) - 1, model.nu, model.nz
+    Q, R = cost.matrices(len(C), nu)
+    P, weighs_state = terminal(model, cost, C, N)
+    psd = cp.psd_wrap
+    Z, U = cp.Variable((N + 1, nz)), cp.Variable((N, nu))
+    box = limits.inputs(nu)
+    G, low, high = model.C, *limits.states(model.nx)
+    if of is not None:
+        y = limits.outputs(len(of))
+        G, low, high = np.vstack([G, of]), np.append(low, y.low), np.append(high, y.high)
+    held = [Z[0] == z0]
+    objective = 0
+    for k in range(N):
+        held += [Z[k + 1] == model.A @ Z[k] + model.B @ U[k]]
+        for i in np.flatnonzero(np.isfinite(box.low)):
+            held += [U[k, i] >= box.low[i]]
+        for i in np.flatnonzero(np.isfinite(box.high)):
+            held += [U[k, i] <= box.high[i]]
+        objective += cp.quad_form(U[k] - targets[k][1], psd(R))
+        if k + 1 < N:
+            objective += cp.quad_form(C @ Z[k + 1] - rows[k + 1], psd(Q))
+    end = C @ Z[N] - rows[N] if weighs_state else Z[N] - targets[N][0]
+    objective += cp.quad_form(end, psd(P))
+    limited = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+    for i in limited:
+        values = Z[1:] @ G[i]
+        slack = 0
+        if limits.slack is not None:
+            slack = cp.Variable(N, nonneg=True)
+            objective += limits.slack[0] * cp.sum(slack) + limits.slack[1] * cp.sum_squares(slack)
+        if np.isfinite(low[i]):
+            held += [values + slack >= low[i]]
+        if np.isfinite(high[i]):
+            held += [values - slack <= high[i]]
+    problem = cp.Problem(cp.Minimize(objective), held)
+    tight = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
+    try:
+        problem.solve(cp.CLARABEL, **tight)
+    except cp.error.SolverError:
+        return None
+    return U.value if problem.status in ("optimal", "optimal_inaccurate") else None

@@ -1,0 +1,221 @@
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.integrate
+from hypothesis import given
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.control.riccati import recursion, stationary
+from tests.control.models import random_pair
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def weights(rng, nx, nu):
+    root = rng.normal(size=(nx, nx))
+    half = rng.normal(size=(nu, nu))
+    return root @ root.T + 1e-2 * np.eye(nx), half @ half.T + 1e-2 * np.eye(nu)
+
+
+@given(seed=SEEDS, nx=st.integers(1, 6), nu=st.integers(1, 3))
+def test_care_residual_and_stability(seed, nx, nu):
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(nx, nx)), rng.normal(size=(nx, nu))
+    Q, R = weights(rng, nx, nu)
+    K, P = km.lqr(A, B, Q, R)
+    residual = A.T @ P + P @ A - P @ B @ np.linalg.solve(R, B.T @ P) + Q
+    assert np.abs(residual).max() <= 1e-8 * (1 + np.abs(P).max()) ** 2
+    np.testing.assert_allclose(R @ K, B.T @ P, rtol=1e-8, atol=1e-8 * np.abs(P).max())
+    assert np.linalg.eigvals(A - B @ K).real.max() < 0
+
+
+@given(seed=SEEDS, nx=st.integers(1, 6), nu=st.integers(1, 3))
+def test_dare_residual_and_stability(seed, nx, nu):
+    rng = np.random.default_rng(seed)
+    A, B = random_pair(rng, nx, nu, radius=rng.uniform(0.5, 1.5))
+    Q, R = weights(rng, nx, nu)
+    K, P = km.dlqr(A, B, Q, R)
+    residual = Q + A.T @ P @ (A - B @ K) - P
+    assert np.abs(residual).max() <= 1e-8 * (1 + np.abs(P).max()) ** 2
+    assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
+    limit = stationary(A, B, Q, R, 10_000)
+    np.testing.assert_allclose(limit.K, K, atol=1e-5 * (1 + np.abs(K).max()))
+
+
+def jacobian(rhs, x, u):
+    X, U = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
+    f = ca.vertcat(*rhs(X, U))
+    both = ca.Function("J", [X, U], [ca.jacobian(f, X), ca.jacobian(f, U)])(x, u)
+    return both[0].full(), both[1].full()
+
+
+def pendulum(sign):
+    """θ̈ = sign (g/L) sin θ + u / (m L²), m = 1, L = 2; sign −1 hangs at θ = 0."""
+    return lambda x, u: [x[1], sign * 9.81 / 2.0 * ca.sin(x[0]) + u[0] / 4.0]
+
+
+def cart_pole(g, damping=0.0, m=1.0, M=5.0, L=2.0):
+    """Pole mass m at the end of a rod L, θ = 0 hanging."""
+
+    def rhs(x, u):
+        S, C = ca.sin(x[2]), ca.cos(x[2])
+        D = m * L**2 * (M + m * (1 - C**2))
+        push = m * L * x[3] ** 2 * S - damping * x[1]
+        return [
+            x[1],
+            (-(m**2) * L**2 * g * C * S + m * L**2 * push) / D + m * L**2 * u[0] / D,
+            x[3],
+            ((m + M) * m * g * L * S - m * L * C * push) / D - m * L * C * u[0] / D,
+        ]
+
+    return rhs
+
+
+def upright(g, damping=0.0):
+    """The same plant, its angle measured so that π is upright."""
+    rhs = cart_pole(-g, damping)
+    return jacobian(rhs, [0, 0, np.pi, 0], [0])
+
+
+@pytest.mark.parametrize(("sign", "expected"), [(-1, [0, 3.1623]), (1, [39.24, 17.998])])
+def test_gains_of_the_founding_pendulum(sign, expected):
+    # Snyder & Song: Q = diag(0, 10), R = 1; hanging, pure damping √10, and upright.
+    K = km.lqr(*jacobian(pendulum(sign), [0, 0], [0]), [0, 10], 1).K
+    np.testing.assert_allclose(K, [expected], atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("g", "expected"),
+    [
+        (9.81, [-2.2361, -7.9534, 175.6827, 74.7644]),
+        (10.0, [-2.2361, -7.9351, 178.4349, 75.1935]),
+    ],
+)
+def test_gains_of_the_founding_cart_pole(g, expected):
+    # Snyder & Song: 2 m shift upright, Q = diag(5, 10, 0, 0), R = 1.
+    K = km.lqr(*upright(g), [5, 10, 0, 0], 1).K
+    np.testing.assert_allclose(K, [expected], atol=5e-5)
+
+
+def test_gains_of_the_databook():
+    # Brunton & Kutz, 8.7: g = 10, damping 1, Q = I, R = 1e-4; the exact Jacobian, and the matrix as printed.
+    A, B = upright(10.0, damping=1.0)
+    np.testing.assert_allclose(km.lqr(A, B, 1, 1e-4).K, [[-100, -197.537, 1491.281, 668.445]], atol=5e-4)
+    printed = A.copy()
+    printed[1, 2] *= -1
+    np.testing.assert_allclose(
+        km.lqr(printed, B, 1, 1e-4).K, [[-100, -183.179, 1683.180, 646.613]], atol=5e-4
+    )
+
+
+def test_the_slow_manifold():
+    # Brunton et al. 2016: μ = −0.1, λ = 1, x₀ = [−5, 5], Q = I, R = 1, costs over 50 s.
+    mu, lam = -0.1, 1.0
+    A, B = np.array([[mu, 0, 0], [0, lam, -lam], [0, 0, 2 * mu]]), np.array([[0.0], [1], [0]])
+    local = km.lqr(A[:2, :2], B[:2], 1, 1).K[0]
+    lifted, P = km.lqr(A, B, [1, 1, 0], 1)
+    np.testing.assert_allclose(local, [0, 2.414214], atol=5e-7)
+    np.testing.assert_allclose(lifted, [[0, 2.414214, -1.495597]], atol=5e-7)
+    z0 = np.array([-5.0, 5, 25])
+    assert z0 @ P @ z0 == pytest.approx(990.180, abs=5e-4)
+
+    def cost(feedback):
+        def flow(t, s):
+            u = feedback(s[0], s[1])
+            return [mu * s[0], lam * (s[1] - s[0] ** 2) + u, s[0] ** 2 + s[1] ** 2 + u**2]
+
+        return scipy.integrate.solve_ivp(flow, (0, 50), [-5, 5, 0], rtol=1e-10, atol=1e-12).y[2, -1]
+
+    assert cost(lambda a, b: -local @ [a, b]) == pytest.approx(4485.19, abs=5e-3)
+    assert cost(lambda a, b: -lifted[0] @ [a, b, a**2]) == pytest.approx(990.174, abs=5e-4)
+    assert cost(lambda a, b: lam * a**2 - local[1] * b) == pytest.approx(1373.95, abs=5e-3)
+
+
+def with_uncontrollable(rng, nc, nu, modes):
+    """A controllable pair, maybe unstable, driven by modes that u does not move, in mixed coordinates."""
+    Ac, Bc = random_pair(rng, nc, nu, radius=rng.uniform(0.9, 1.2))
+    m = len(modes)
+    A = np.block([[Ac, rng.normal(size=(nc, m))], [np.zeros((m, nc)), modes]])
+    B = np.vstack([Bc, np.zeros((m, nu))])
+    T = np.linalg.qr(rng.normal(size=(nc + m, nc + m)))[0]
+    return Ac, Bc, T, T @ A @ T.T, T @ B
+
+
+@given(
+    seed=SEEDS,
+    nc=st.integers(1, 4),
+    nu=st.integers(1, 2),
+    kind=st.sampled_from(["one", "turning", "unstable"]),
+)
+def test_the_difference_equation_is_never_refused(seed, nc, nu, kind):
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0, np.pi)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    modes = {"one": np.eye(1), "turning": rotation, "unstable": rng.uniform(1.01, 2.0) * rotation}[kind]
+    Ac, Bc, T, A, B = with_uncontrollable(rng, nc, nu, modes)
+    K, P = stationary(A, B, np.eye(len(A)), np.eye(nu), 10_000)
+    assert np.isfinite(P).all()
+    Kc = (K @ T)[:, :nc]
+    assert np.abs(np.linalg.eigvals(Ac - Bc @ Kc)).max() < 1
+    np.testing.assert_allclose(Kc, km.dlqr(Ac, Bc, 1, 1).K, atol=1e-4 * (1 + np.abs(Kc).max()))
+
+
+def test_a_weight_may_take_long_to_reach_an_input():
+    # x₀⁺ = 1.2 x₀ + x₁ behind a chain of delays: BᵀQA = 0 for as many steps as the chain is long.
+    n = 12
+    A = np.diag(np.ones(n - 1), 1)
+    A[0, 0] = 1.2
+    B = np.eye(n, 1, -n + 1)
+    K = stationary(A, B, np.diag([1.0] + [0.0] * (n - 1)), np.eye(1), 10_000).K
+    assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
+
+
+def test_an_input_may_cost_nothing():
+    A, B = np.array([[1.1, 0.1], [0, 0.9]]), np.array([[0.0], [1]])
+    K, P = stationary(A, B, np.eye(2), np.zeros((1, 1)), 10_000)
+    np.testing.assert_allclose(np.eye(2) + A.T @ P @ (A - B @ K), P, atol=1e-6)
+    assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
+
+
+@given(seed=SEEDS, nx=st.integers(1, 5), nu=st.integers(1, 2), N=st.integers(1, 6))
+def test_the_recursion_is_a_bellman_equation(seed, nx, nu, N):
+    """From P_N = 0 and R ≻ 0 the first gain minimises the cost of N steps, by least squares in u."""
+    rng = np.random.default_rng(seed)
+    A, B = random_pair(rng, nx, nu)
+    Q, R = weights(rng, nx, nu)
+    P_N, _ = weights(rng, nx, nu)
+    stages = recursion(A, B, Q, R, P_N, N)
+    assert stages.K.shape == (N, nu, nx)
+    P = P_N
+    for k in range(N - 1, -1, -1):
+        S = R + B.T @ P @ B
+        np.testing.assert_allclose(stages.L[k] @ stages.L[k].T, S, rtol=1e-9)
+        closed = A - B @ stages.K[k]
+        P_k = Q + stages.K[k].T @ R @ stages.K[k] + closed.T @ P @ closed  # value of the policy
+        lower = Q + A.T @ P @ A - A.T @ P @ B @ np.linalg.solve(S, B.T @ P @ A)  # least value
+        np.testing.assert_allclose(P_k, lower, rtol=1e-7, atol=1e-9 * np.abs(P_k).max())
+        P = P_k
+
+
+def test_messages():
+    A, B = np.array([[1.1, 0], [0, 0.5]]), np.array([[1.0], [0]])
+    with pytest.raises(km.DefinitenessError, match=r"R \+ BᵀPB is not positive definite: .* is 0; raise R"):
+        stationary(A, B, np.diag([0.0, 1]), np.zeros((1, 1)), 10)
+    with pytest.raises(km.DefinitenessError, match=r"R is not positive definite: .* is 0; raise it"):
+        km.lqr(A, B, 1, 0)
+    with pytest.raises(
+        km.DefinitenessError, match=r"Q is indefinite: its least eigenvalue is -1; weights must be"
+    ):
+        km.dlqr(A, B, [1, -1], 1)
+    with pytest.raises(km.DefinitenessError, match=r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"):
+        km.dlqr(A, B, [[1, 1], [0, 1]], 1)
+    with pytest.raises(km.ShapeError, match=r"Q has shape \(3,\), expected \(2, 2\) or its diagonal"):
+        km.lqr(A, B, [1, 1, 1], 1)
+    with pytest.raises(km.ShapeError, match=r"B has shape \(3, 1\), expected \(2, any\)"):
+        km.lqr(A, np.ones((3, 1)), 1, 1)
+    with pytest.raises(km.ShapeError, match=r"A has shape \(2, 3\), expected \(2, 2\)"):
+        km.lqr(np.ones((2, 3)), B, 1, 1)
+    for solve, unstable in ((km.lqr, [[1.0, 0], [0, 1]]), (km.dlqr, [[0.5, 0], [0, 1.1]])):
+        with pytest.raises(km.DataError, match=r"no stabilising solution: .* not stabilisable"):
+            solve(unstable, B, 1, 1)
