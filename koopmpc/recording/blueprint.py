@@ -3,14 +3,16 @@
 
 from typing import Any
 
+from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.description import About
+from koopmpc.recording.eigenvalues import reach
 from koopmpc.recording.scenes import BACKGROUND, Bounds
 from koopmpc.recording.styles import input_limits
 
 _SEPARATE = 4  # up to so many states have a plot each
 
 
-def blueprint(about: About, *, bounds: Bounds | None, eigenvalues: bool) -> Any:
+def blueprint(about: About, *, bounds: Bounds | None, model: LinearPredictor | None) -> Any:
     """Return the layout of one run: what the data cannot fill has no view.
 
     `bounds` is what the animation shows, None where there is no scene.
@@ -40,7 +42,7 @@ def blueprint(about: About, *, bounds: Bounds | None, eigenvalues: bool) -> Any:
         rrb.TextDocumentView(origin="description", name="Description"),
         rrb.TextLogView(origin="log", name="Log"),
     )
-    lower = rrb.Horizontal(_eigenvalues(), texts) if eigenvalues else texts
+    lower = texts if model is None else rrb.Horizontal(_eigenvalues(reach(model)), texts)
     right = lower if bounds is None else rrb.Vertical(_animation(bounds), lower, row_shares=[3.0, 2.0])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.0, 1.0]),
@@ -91,14 +93,14 @@ def _animation(bounds: Bounds) -> Any:
     )
 
 
-def _eigenvalues() -> Any:
+def _eigenvalues(size: float) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.Spatial2DView(
         origin="model",
         name="Eigenvalues of A and the unit circle",
         background=list(BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[-1.2, 1.2], y_range=[-1.2, 1.2]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-size, size], y_range=[-size, size]),
     )
 
 

@@ -1,29 +1,21 @@
 """load_run: a log back into the Run that was written, to the bit."""
 # pyright: basic
 
-import json
-import struct
-import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-from zlib import crc32
 
 import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError
 from koopmpc.loop.run import Plans, Run
+from koopmpc.recording.columns import Columns, read_columns
 from koopmpc.recording.description import About, from_json
 
 _ENTITIES = (
     "/state", "/reference", "/measurement", "/control/u", "/solver/time_ms", "/solver/status",
     "/prediction/x", "/prediction/u", "/description", "/metrics",
 )  # fmt: skip
-_MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
-_FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
 
 
 def load_run(path: str | Path) -> Run:
@@ -37,14 +29,14 @@ def load_run(path: str | Path) -> Run:
         The file is missing, no log of koopmpc, damaged, or holds no whole step.
     """
     path = Path(path)
-    log = _read(path)
+    log = read_columns(path, _ENTITIES)
     try:
         return _run(log, path)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise LogError(f"{path} is damaged: {error}") from error
 
 
-def _run(log: "_Log", path: Path) -> Run:
+def _run(log: Columns, path: Path) -> Run:
     about, planned_steps = _about(log, path)
     X, reference = log.vectors("/state"), log.vectors("/reference")
     U = log.vectors("/control/u")
@@ -85,139 +77,7 @@ def _run(log: "_Log", path: Path) -> Run:
     )
 
 
-class _Log:
-    """The columns of a recording: rows in order of their step, by (entity, component)."""
-
-    def __init__(self, chunks: Any) -> None:
-        self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
-        for chunk in chunks:
-            if not chunk.is_static and "step" not in chunk.timeline_names:
-                continue  # of no log of ours
-            batch = chunk.to_record_batch()
-            k = (
-                None
-                if chunk.is_static
-                else batch.column("step").to_numpy(zero_copy_only=False).astype(np.int64)
-            )
-            for name in batch.schema.names:
-                metadata = batch.schema.field(name).metadata or {}
-                if metadata.get(b"rerun:kind") == b"data":
-                    key = (chunk.entity_path, name.split(":")[-1])
-                    self._parts.setdefault(key, []).append((k, batch.column(name)))
-
-    def static(self, entity: str, component: str) -> Any:
-        """Return the one value that does not change, or None."""
-        parts = self._parts.get((entity, component))
-        return None if parts is None else parts[-1][1].to_pylist()[-1][0]
-
-    def rows(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Return the steps, the width, and the flat values of a component, in order of the steps."""
-        import pyarrow as pa
-
-        parts = self._parts.get((entity, component), [])
-        if not parts:
-            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
-        if parts[0][0] is None:
-            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), parts[-1][1].flatten()
-        k = np.concatenate([k for k, _ in parts])
-        lists = pa.concat_arrays([column for _, column in parts])
-        order = np.argsort(k, kind="stable")
-        if (np.diff(k) < 0).any():
-            k, lists = k[order], lists.take(pa.array(order))
-        widths = lists.value_lengths().to_numpy(zero_copy_only=False)
-        return k, widths, lists.flatten()
-
-    def matrix(self, entity: str, component: str = "scalars") -> tuple[np.ndarray, np.ndarray]:
-        """Return the steps and one row of values each."""
-        k, widths, values = self.rows(entity, component)
-        flat = values if isinstance(values, np.ndarray) else values.to_numpy(zero_copy_only=False)
-        if len(widths) and (widths != widths[0]).any():
-            raise LogError(f"{entity} has rows of different lengths; the log was not written by koopmpc")
-        return k, np.array(flat).reshape(len(k), int(widths[0]) if len(widths) else 0)
-
-    def vectors(self, entity: str) -> np.ndarray:
-        """Return the rows 0, 1, … up to the first that is missing."""
-        k, values = self.matrix(entity)
-        return values[: _whole(k)]
-
-    def column(self, entity: str, component: str) -> np.ndarray:
-        """Return one number a row: 0, 1, … up to the first that is missing."""
-        k, values = self.matrix(entity, component)
-        return values[: _whole(k)].reshape(-1)
-
-    def changed(self) -> list[str]:
-        """Return the columns that are no longer what was written: the end of the log holds a checksum of each."""
-        sums: dict[str, int] = json.loads(self.static("/metrics", "sums"))
-        return [
-            key
-            for key, total in sums.items()
-            if (data := self._data(key)) is not None and crc32(data) != total
-        ]
-
-    def _data(self, key: str) -> Any:
-        """Return the bytes that a checksum is made of; None for what is not read."""
-        import pyarrow as pa
-
-        entity, component = key.split(":")
-        if entity not in _ENTITIES:
-            return None
-        values = self.rows(entity, component)[2]
-        if isinstance(values, pa.StringArray):
-            return "".join(values.to_pylist()).encode()
-        return np.ascontiguousarray(values).data
-
-
-def _whole(k: np.ndarray) -> int:
-    """Return how many of 0, 1, 2, … stand at the head of `k`."""
-    gaps = np.flatnonzero(k != np.arange(len(k)))
-    return int(gaps[0]) if len(gaps) else len(k)
-
-
-def _read(path: Path) -> _Log:
-    from rerun.chunk import RrdReader
-
-    if not path.is_file():
-        raise LogError(f"{path} does not exist; pass the .rrd of a run")
-    try:
-        with _whole_messages(path) as whole, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Rerun's word on a missing footer: load_run has its own
-            return _Log(RrdReader(whole).stream().filter(content=list(_ENTITIES)).to_chunks())
-    except LogError:
-        raise
-    except Exception as error:  # the reader of Rerun raises whatever its own parts raise
-        raise LogError(f"{path} is no log, or is damaged: {error}") from error
-
-
-@contextmanager
-def _whole_messages(path: Path) -> Iterator[Path]:
-    """Yield a file that ends with a whole message: `path` itself, or a copy without its last, torn message.
-
-    An .rrd is a header of 12 bytes and then messages, each with a header of 16 bytes (kind and length, little-endian).
-    """
-    size, end = path.stat().st_size, _FILE_HEADER
-    with path.open("rb") as file:
-        if file.read(4) != _MAGIC:
-            raise LogError(f"{path} is no log of koopmpc: it does not start as an .rrd file does")
-        file.seek(max(size - 12, 0))
-        closed = file.read(8) == _FOOTER
-        while not closed and end + _MESSAGE_HEADER <= size:
-            file.seek(end)
-            kind, length = struct.unpack("<QQ", file.read(_MESSAGE_HEADER))
-            if not _END < kind <= _LAST_KIND or end + _MESSAGE_HEADER + length > size:
-                break
-            end += _MESSAGE_HEADER + length
-        if closed or end == size:
-            yield path
-            return
-        file.seek(0)
-        head = file.read(end)
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "whole.rrd"
-        copy.write_bytes(head)
-        yield copy
-
-
-def _about(log: _Log, path: Path) -> tuple[About, int | None]:
+def _about(log: Columns, path: Path) -> tuple[About, int | None]:
     text = log.static("/description", "json")
     if text is None:
         raise LogError(
@@ -226,7 +86,7 @@ def _about(log: _Log, path: Path) -> tuple[About, int | None]:
     return from_json(text)
 
 
-def _measured(log: _Log, X: np.ndarray) -> np.ndarray:
+def _measured(log: Columns, X: np.ndarray) -> np.ndarray:
     """Return the measurements: the states, but for the rows that were written apart."""
     k, values = log.matrix("/measurement")
     if not len(k):
@@ -239,7 +99,7 @@ def _measured(log: _Log, X: np.ndarray) -> np.ndarray:
     return Y
 
 
-def _statuses(log: _Log, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
+def _statuses(log: Columns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
     """Return what each step ended with: the last change at or before it."""
     k, _, words = log.rows("/solver/status", "state")
     if not len(k) or k[0] != 0:
@@ -259,7 +119,7 @@ def _pair(word: str) -> tuple[Status, Fallback]:
     return Status[status], Fallback[fallback or "NONE"]
 
 
-def _plans(log: _Log, steps: int) -> Plans | None:
+def _plans(log: Columns, steps: int) -> Plans | None:
     """Return the plans, NaN where a step had none; None where no step had one."""
     parts = []
     for entity in ("/prediction/x", "/prediction/u"):

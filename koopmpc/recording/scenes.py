@@ -23,12 +23,15 @@ class Drawing(NamedTuple):
     columns: Any
 
 
-@dataclass
+@dataclass(eq=False)
 class Bounds:
     """The least box around everything drawn so far, y up [m]."""
 
     low: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(2, np.inf))
     high: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(2, -np.inf))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Bounds) and self.ranges() == other.ranges()
 
     def include(self, shape: Shape) -> None:
         """Widen the box by one shape."""
@@ -60,12 +63,14 @@ def draw(scenes: Sequence[Sequence[Shape]], bounds: Bounds) -> dict[str, Drawing
 
 
 def draw_ahead(
-    scenes: Sequence[Sequence[Shape]], ahead: Sequence[Sequence[Sequence[Shape]]]
+    scenes: Sequence[Sequence[Shape]], ahead: Sequence[Sequence[Sequence[Shape]]], bounds: Bounds
 ) -> dict[str, Drawing]:
     """Return a drawing by name for the predicted scenes of each row, the later the fainter.
 
     A shape that does not move within the plan is not drawn again.
     """
+    for shape in (shape for row in ahead for scene in row for shape in scene):
+        bounds.include(shape)
     drawings: dict[str, Drawing] = {}
     for name in {shape.name: None for scene in scenes for shape in scene}:
         rows: list[list[tuple[Shape, Color]]] = []

@@ -5,6 +5,7 @@ import json
 import uuid
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from koopmpc.loop.run import Run
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.blueprint import blueprint
 from koopmpc.recording.description import About, metrics_to_markdown, to_json, to_markdown
+from koopmpc.recording.eigenvalues import draw_eigenvalues
 from koopmpc.recording.rows import Rows
 from koopmpc.recording.scenes import Bounds, Drawing, Scene, draw, draw_ahead, stages
 from koopmpc.recording.styles import input_limits, styles
@@ -40,47 +42,40 @@ class Writer:
         model: LinearPredictor | None = None,
         steps: int | None = None,
     ) -> None:
-        """Open the sinks; `viewer` is the address of a viewer that is up."""
+        """Check what is told; `viewer` is the address of a viewer that is up."""
         import rerun as rr
 
         self._about, self._scene, self._model = about, scene, model
-        self._bounds = Bounds()
+        self._page, self._json = to_markdown(about), to_json(about, steps)  # refuses what cannot be saved
+        self._path, self._viewer = path, viewer
+        self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
+        self._opened, self._ahead = False, False  # ahead: whether a plan was ever drawn
+        self._bounds, self._shown = Bounds(), Bounds()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
         self._sums: dict[
             str, int
-        ] = {}  # of all bytes of an entity so far: a damaged log must not read as a whole one
+        ] = {}  # of each column's bytes so far: a damaged log must not read as a whole one
         self._u: np.ndarray | None = None
-        page, data = (
-            to_markdown(about),
-            to_json(about, steps),
-        )  # what cannot be saved is refused before a file is made
-        self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
-        sinks: list[Any] = []
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            sinks.append(rr.FileSink(path))
-        if viewer is not None:
-            sinks.append(rr.GrpcSink(viewer))
-        self._rec.set_sinks(*sinks, default_blueprint=self._blueprint())
-        self._rec.send_recording_name(about.title)
-        text = rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN)
-        self._sum("/description:json", data.encode())
-        self._rec.log("description", text, rr.AnyValues(json=data), static=True)
-        if model is not None:
-            self._eigenvalues(model)
+            path.touch()
 
     def write(self, rows: Rows) -> None:
         """Write one block."""
         import rerun as rr
 
+        drawings = self._drawings(rows)
+        if not self._opened:
+            self._open()
         n, m = len(rows.X), len(rows.U)
         k = rows.k + np.arange(n)
-        if not self._styled:
+        if "state" not in self._styled:
             for entity, style in styles(self._about, rows).items():
                 self._style(entity, style)
-        if self._scene is not None:
-            self._draw(rows)
+        for entity, drawing in drawings.items():
+            self._style(entity, drawing.style)
+            self._rec.send_columns(entity, self._times(k), drawing.columns)
         if len(rows.planned):
             self._vectors("prediction/x", rows.planned, rows.plan_X)
             self._vectors("prediction/u", rows.planned, rows.plan_U)
@@ -111,7 +106,7 @@ class Writer:
         """Write the metrics of the whole `run` and close; the log says from now on that it is complete."""
         import rerun as rr
 
-        numbers: dict[str, Any] = {"steps": 0, "sums": json.dumps(self._sums)}
+        numbers: dict[str, Any] = {"steps": 0}
         text = "No step was recorded."
         if run is not None:
             numbers["steps"] = run.steps
@@ -122,16 +117,35 @@ class Writer:
                 numbers |= {"cost": found.cost, "effort": found.effort, "violation": found.violation}
             except (KoopmpcError, ValueError) as error:
                 text = f"The metrics cannot be computed: {error}"
+        if not self._opened:
+            self._open()
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-        self._rec.log("metrics", document, rr.AnyValues(**numbers), static=True)
-        if self._scene is not None:
+        self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
+        if self._bounds != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
         self._rec.flush(timeout_sec=_FLUSH)
         self._rec.disconnect()
 
+    def _open(self) -> None:
+        """Open the sinks, once the first drawings say how large the animation is, and write what is static."""
+        import rerun as rr
+
+        self._opened = True
+        sinks: list[Any] = [] if self._path is None else [rr.FileSink(self._path)]
+        sinks += [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
+        self._rec.set_sinks(*sinks, default_blueprint=self._blueprint())
+        self._rec.send_recording_name(self._about.title)
+        self._sum("/description:json", self._json.encode())
+        text = rr.TextDocument(self._page, media_type=rr.MediaType.MARKDOWN)
+        self._rec.log("description", text, rr.AnyValues(json=self._json), static=True)
+        if self._model is not None:
+            for entity, drawing in draw_eigenvalues(self._model).items():
+                self._style(entity, drawing)
+
     def _blueprint(self) -> Any:
+        self._shown = replace(self._bounds)
         bounds = self._bounds if self._scene is not None else None
-        return blueprint(self._about, bounds=bounds, eigenvalues=self._model is not None)
+        return blueprint(self._about, bounds=bounds, model=self._model)
 
     def _times(self, k: np.ndarray) -> list[Any]:
         import rerun as rr
@@ -179,10 +193,11 @@ class Writer:
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
             self._rec.send_columns("log", self._times(rows.k + np.array(fallen)), columns)
 
-    def _draw(self, rows: Rows) -> None:
-        """Draw the scene of every row, and of a few stages of its plan."""
+    def _drawings(self, rows: Rows) -> dict[str, Drawing]:
+        """Return the scene of every row, and of a few stages of its plan, by entity."""
         scene = self._scene
-        assert scene is not None
+        if scene is None:
+            return {}
         ahead: dict[int, list[Any]] = {}
         for k, X, U in zip(rows.planned, rows.plan_X, rows.plan_U, strict=True):
             if np.isfinite(X).all() and np.isfinite(U).all():
@@ -192,41 +207,14 @@ class Writer:
             self._u = rows.U[i] if i < len(rows.U) else self._u
             x = y if np.isnan(x).any() and len(y) == len(x) else x
             now.append([] if self._u is None or not np.isfinite(x).all() else list(scene(x, self._u)))
-        k = rows.k + np.arange(len(now))
-        self._place("world", k, draw(now, self._bounds))
-        if ahead or "world/prediction" in self._styled:
-            self._styled.add("world/prediction")
-            self._place("world/prediction", k, draw_ahead(now, [ahead.get(int(i), []) for i in k]))
-
-    def _place(self, parent: str, k: np.ndarray, drawings: dict[str, Drawing]) -> None:
-        import rerun as rr
-
-        for name, drawing in drawings.items():
-            entity = f"{parent}/{rr.escape_entity_path_part(name)}"
-            self._style(entity, drawing.style)
-            self._rec.send_columns(entity, self._times(k), drawing.columns)
-
-    def _eigenvalues(self, model: LinearPredictor) -> None:
-        """Draw the eigenvalues of A over the unit circle; those outside it are red."""
-        import rerun as rr
-
-        values = np.asarray(model.eigenvalues)
-        turn = np.linspace(0, 2 * np.pi, 181)
-        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        axes = [[(-1.15, 0), (1.15, 0)], [(0, -1.15), (0, 1.15)]]
-        outside = np.abs(values) > 1 + 1e-9
-        colors = np.where(outside[:, None], [214, 60, 60], [40, 110, 200]).astype(np.uint8)
-        log = self._rec.log
-        log(
-            "model/axes",
-            rr.LineStrips2D(axes, radii=0.003, colors=[205, 210, 216], draw_order=1),
-            static=True,
-        )
-        log("model/circle", rr.LineStrips2D([circle], radii=0.006, colors=[120, 130, 145]), static=True)
-        points = np.stack([np.real(values), -np.imag(values)], axis=1)
-        labels = [f"|λ| = {abs(v):.4f}" for v in values]
-        dots = rr.Points2D(points, radii=0.03, colors=colors, labels=labels, show_labels=False)
-        log("model/eigenvalues", dots, static=True)
+        found = {f"world/{name}": drawing for name, drawing in draw(now, self._bounds).items()}
+        if ahead or self._ahead:
+            self._ahead = True
+            futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
+            found |= {
+                f"world/prediction/{name}": d for name, d in draw_ahead(now, futures, self._bounds).items()
+            }
+        return found
 
 
 def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:

@@ -69,12 +69,13 @@ def test_nothing_drawn_has_no_bounds() -> None:
 def test_only_what_moves_is_drawn_ahead_and_fades() -> None:
     rail, cart = Line("rail", [(0.0, 0.0), (1.0, 0.0)]), Disk("cart", (0.0, 0.0), 0.1, color=(0, 0, 0))
     ahead = [[rail, Disk("cart", (float(i), 0.0), 0.1, color=(0, 0, 0))] for i in (1, 2)]
-    drawings = draw_ahead([[rail, cart], [rail, cart]], [ahead, []])
+    drawings = draw_ahead([[rail, cart], [rail, cart]], [ahead, []], bounds := Bounds())
     assert [len(row) for row in strips(drawings["rail"].columns)] == [0, 0]
     assert [len(row) for row in strips(drawings["cart"].columns)] == [2, 0]
     colors = next(c for c in drawings["cart"].columns if "colors" in str(c.component_descriptor()))
     far, near = (value >> 24 for value in colors.as_arrow_array().to_pylist()[0])
     assert 0 < near < far < 247
+    assert bounds.high[0] == pytest.approx(2.1, abs=1e-3)
 
 
 @given(horizon=st.integers(1, 200))
