@@ -12,6 +12,7 @@ from koopmpc.recording.scene import Box, Color, Disk, Line, Shape
 
 Scene = Callable[[np.ndarray, np.ndarray], Sequence[Shape]]
 BACKGROUND: Color = (247, 248, 250)
+_FAR = 0.25  # how far beyond what was drawn a prediction is shown, as a share of it: some predictions diverge
 _STAGES = 4  # how many future stages of a plan are drawn
 _STROKES = np.linspace(-1.0, 1.0, 5)  # a box is filled by a line to and fro: where its strokes lie
 
@@ -23,15 +24,12 @@ class Drawing(NamedTuple):
     columns: Any
 
 
-@dataclass(eq=False)
-class Bounds:
-    """The least box around everything drawn so far, y up [m]."""
+@dataclass
+class Box2D:
+    """The least box around some points, y up [m]; empty at first."""
 
     low: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(2, np.inf))
     high: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(2, -np.inf))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Bounds) and self.ranges() == other.ranges()
 
     def include(self, shape: Shape) -> None:
         """Widen the box by one shape."""
@@ -40,12 +38,22 @@ class Bounds:
             self.low = np.minimum(self.low, points.min(axis=0) - _radius(shape))
             self.high = np.maximum(self.high, points.max(axis=0) + _radius(shape))
 
+
+@dataclass
+class Bounds:
+    """What the animation shows: all that was drawn, and what was predicted as far as that is not far off."""
+
+    drawn: Box2D = field(default_factory=Box2D)
+    predicted: Box2D = field(default_factory=Box2D)
+
     def ranges(self) -> tuple[list[float], list[float]] | None:
         """Return the ranges of x and of Rerun's y (down), with a margin; None before anything was drawn."""
-        if not np.isfinite(self.low).all():
+        low, high = self.drawn.low, self.drawn.high
+        if not np.isfinite(low).all():
             return None
-        margin = 0.06 * float((self.high - self.low).max()) + 1e-9
-        (x0, y0), (x1, y1) = self.low - margin, self.high + margin
+        size = float((high - low).max())
+        (x0, y0) = np.minimum(low, np.maximum(self.predicted.low, low - _FAR * size)) - 0.06 * size - 1e-9
+        (x1, y1) = np.maximum(high, np.minimum(self.predicted.high, high + _FAR * size)) + 0.06 * size + 1e-9
         return [float(x0), float(x1)], [-float(y1), -float(y0)]
 
 
@@ -54,7 +62,7 @@ def draw(scenes: Sequence[Sequence[Shape]], bounds: Bounds) -> dict[str, Drawing
     order: dict[str, int] = {}
     for scene in scenes:
         for i, shape in enumerate(scene):
-            bounds.include(shape)
+            bounds.drawn.include(shape)
             order.setdefault(shape.name, i)
     return {
         name: _drawing([[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i)
@@ -70,7 +78,7 @@ def draw_ahead(
     A shape that does not move within the plan is not drawn again.
     """
     for shape in (shape for row in ahead for scene in row for shape in scene):
-        bounds.include(shape)
+        bounds.predicted.include(shape)
     drawings: dict[str, Drawing] = {}
     for name in {shape.name: None for scene in scenes for shape in scene}:
         rows: list[list[tuple[Shape, Color]]] = []
@@ -97,8 +105,10 @@ def _drawing(rows: Sequence[Sequence[tuple[Shape, Color]]], order: float) -> Dra
     import rerun as rr
 
     flat = [pair for row in rows for pair in row]
+    with np.errstate(over="ignore"):
+        strips = [(_points(s) * (1.0, -1.0)).astype(np.float32) for s, _ in flat]  # Rerun's y points down
     columns = rr.LineStrips2D.columns(
-        strips=[(_points(s) * (1.0, -1.0)).astype(np.float32) for s, _ in flat],  # Rerun's y points down
+        strips=strips,
         radii=np.array([_radius(s) for s, _ in flat], dtype=np.float32),
         colors=np.array([c for _, c in flat], dtype=np.uint8).reshape(-1, 3),
     )

@@ -5,7 +5,6 @@ import json
 import uuid
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,7 @@ class Writer:
         self._path, self._viewer = path, viewer
         self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
         self._opened, self._ahead = False, False  # ahead: whether a plan was ever drawn
-        self._bounds, self._shown = Bounds(), Bounds()
+        self._bounds, self._shown = Bounds(), Bounds().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
         self._sums: dict[
@@ -121,7 +120,7 @@ class Writer:
             self._open()
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
-        if self._bounds != self._shown:
+        if self._bounds.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
         self._rec.flush(timeout_sec=_FLUSH)
         self._rec.disconnect()
@@ -143,7 +142,7 @@ class Writer:
                 self._style(entity, drawing)
 
     def _blueprint(self) -> Any:
-        self._shown = replace(self._bounds)
+        self._shown = self._bounds.ranges()
         bounds = self._bounds if self._scene is not None else None
         return blueprint(self._about, bounds=bounds, model=self._model)
 

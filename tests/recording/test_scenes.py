@@ -53,8 +53,8 @@ def test_up_in_the_scene_is_up_in_the_viewer() -> None:
 def test_bounds_hold_every_shape_whole(shape: Shape, low: tuple, high: tuple) -> None:
     bounds = Bounds()
     draw([[shape], []], bounds)
-    np.testing.assert_allclose(bounds.low, low, atol=1e-3)
-    np.testing.assert_allclose(bounds.high, high, atol=1e-3)
+    np.testing.assert_allclose(bounds.drawn.low, low, atol=1e-3)
+    np.testing.assert_allclose(bounds.drawn.high, high, atol=1e-3)
     (x0, x1), (y0, y1) = bounds.ranges()
     assert x0 < low[0] < high[0] < x1
     assert y0 < -high[1] < -low[1] < y1
@@ -75,7 +75,7 @@ def test_only_what_moves_is_drawn_ahead_and_fades() -> None:
     colors = next(c for c in drawings["cart"].columns if "colors" in str(c.component_descriptor()))
     far, near = (value >> 24 for value in colors.as_arrow_array().to_pylist()[0])
     assert 0 < near < far < 247
-    assert bounds.high[0] == pytest.approx(2.1, abs=1e-3)
+    assert bounds.predicted.high[0] == pytest.approx(2.1, abs=1e-3)
 
 
 @given(horizon=st.integers(1, 200))
@@ -85,3 +85,19 @@ def test_the_last_stage_is_always_among_those_drawn(horizon: int) -> None:
     assert drawn == sorted(set(drawn))
     assert 1 <= len(drawn) <= 4
     assert drawn[0] >= 1
+
+
+def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight() -> None:
+    bounds, now, near, far = (
+        Bounds(),
+        [[Disk("d", (0.0, 0.0), 1.0)]],
+        Disk("d", (0.2, 0.0), 1.0),
+        Disk("d", (1e6, 0.0), 1.0),
+    )
+    draw(now, bounds)
+    alone = bounds.ranges()
+    draw_ahead(now, [[[near]]], bounds)
+    assert bounds.ranges()[0][1] - alone[0][1] == pytest.approx(0.2, abs=1e-3)
+    draw_ahead(now, [[[far]]], bounds)
+    assert 0.2 < bounds.ranges()[0][1] - alone[0][1] < 1.0
+    assert bounds.ranges()[0][0] == alone[0][0]
