@@ -91,8 +91,9 @@ def _case(title: str, rows: list[Row]) -> Table:
 
 
 def _cells(row: Row, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
-    yield f"{figures.cost:.4g}"
-    yield f"{figures.cost / oracle:.3g}" if oracle > 0 else "–"
+    yield f"{figures.cost:.1f}" if figures.cost < 1e5 else f"{figures.cost:.2g}"
+    ratio = figures.cost / oracle if oracle > 0 else np.nan
+    yield "–" if np.isnan(ratio) else f"{ratio:.3f}" if ratio < 100 else f"{ratio:.1g}"
     if not row.reached:
         yield "does not reach"
     else:
