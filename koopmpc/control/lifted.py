@@ -70,9 +70,14 @@ def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr n
 
 
 def buffered(lifting: Lifting) -> Buffered:
-    """Return ψ as a function of one state, at about a microsecond a call."""
+    """Return ψ as a function of one state, at about a microsecond a call.
+
+    One state that is NaN, or beyond 1e30, makes all of them NaN: a bad measurement shows in every product with z,
+    and NaN, unlike inf, passes through products in silence.
+    """
     x = ca.SX.sym("x", len(lifting.bound or ()))
-    return Buffered(ca.Function("psi", [x], [ca.densify(lifting.symbolic(x))], {"cse": True}))
+    measured = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
+    return Buffered(ca.Function("psi", [x], [ca.densify(lifting.symbolic(measured))], {"cse": True}))
 
 
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int) -> Float[np.ndarray, "N1 nr"]:

@@ -85,8 +85,7 @@ class LQR:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
             if np.isfinite(got).all():
                 self._last = np.clip(got, *self._inputs)
-        z = self._lift(x)[0]
-        free = self._feedforward - self.gain.K @ z if (np.abs(z) < HUGE).all() else np.full(self.nu, np.nan)
+        free = self._feedforward - self.gain.K @ self._lift(x)[0]
         if not (np.abs(free) < HUGE).all():
             return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
         u = np.clip(free, *self._inputs)
