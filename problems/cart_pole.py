@@ -42,7 +42,7 @@ def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
     """Draw the rail with a tick at each metre, the cart, the pole, and the force as a bar of 1 m for 40 N."""
     position, theta, L = float(x[0]), float(x[2]), cart_pole.L
     tip = (position + L * float(np.sin(theta)), -L * float(np.cos(theta)))
-    ticks = [(float(metre), depth) for metre in range(-3, 4) for depth in (-0.2, -0.35, -0.2)]
+    ticks = [(float(metre), depth) for metre in range(-3, 8) for depth in (-0.2, -0.35, -0.2)]
     return [
         km.Line("rail", ticks, width=0.03, color=(150, 160, 170)),
         km.Box("cart", (position, 0.0), (0.8, 0.4)),
