@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.control.limits import softened
+from tests.control.bare import shown
+
+
+def test_a_scalar_and_a_vector_are_diagonals():
+    Q, R = km.Cost(Q=2, R=[1, 3]).matrices(3, 2)
+    np.testing.assert_array_equal(Q, 2 * np.eye(3))
+    np.testing.assert_array_equal(R, np.diag([1, 3]))
+
+
+def test_costs_that_make_no_sense():
+    for kwargs, error, text in (
+        (
+            {"Q": [1, -1], "R": 1},
+            km.DefinitenessError,
+            r"Q is indefinite: its least eigenvalue is -1; weights must be ⪰ 0",
+        ),
+        (
+            {"Q": 1, "R": [[1, 2], [2, 1]]},
+            km.DefinitenessError,
+            r"R is indefinite: its least eigenvalue is -1",
+        ),
+        ({"Q": [[1, 1], [0, 1]], "R": 1}, km.DefinitenessError, r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"),
+        ({"Q": 1, "R": [[1, 0.5], [0, 1]]}, km.DefinitenessError, r"R is not symmetric"),
+        ({"Q": 1, "R": 1, "Q_N": -1}, km.DefinitenessError, r"Q_N is indefinite"),
+        (
+            {"Q": np.ones((2, 3)), "R": 1},
+            km.ShapeError,
+            r"Q has shape \(2, 3\), expected a square matrix or its diagonal",
+        ),
+        ({"Q": [1, np.nan], "R": 1}, km.DataError, r"Q holds 1 NaN or inf, the first at \(1,\)"),
+        ({"Q": "much", "R": 1}, km.DataError, r"Q is not an array of numbers: got str"),
+    ):
+        with pytest.raises(error, match=text):
+            km.Cost(**kwargs)
+    with pytest.raises(km.ShapeError, match=r"R has shape \(3,\), expected \(2, 2\) or its diagonal"):
+        km.Cost(1, [1, 1, 1]).matrices(2, 2)
+
+
+def test_limits_that_make_no_sense():
+    for kwargs, error, text in (
+        (
+            {"u_min": 1, "u_max": -1},
+            km.DataError,
+            r"input limits cross at index 0: lower 1 is above upper -1; swap or widen",
+        ),
+        (
+            {"x_min": [0, 2], "x_max": 1},
+            km.DataError,
+            r"state limits cross at index 1: lower 2 is above upper 1",
+        ),
+        ({"of": km.State(), "y_min": 1, "y_max": 0}, km.DataError, r"output limits cross at index 0"),
+        ({"y_max": 1}, km.DataError, r"y_min and y_max limit observables; say which with of="),
+        (
+            {"u_min": np.inf},
+            km.DataError,
+            r"u_min is \+inf or u_max is −inf somewhere; use −inf, \+inf where there is no",
+        ),
+        ({"x_max": [1, -np.inf]}, km.DataError, r"x_min is \+inf or x_max is −inf"),
+        ({"u_min": np.nan}, km.DataError, r"u_min holds NaN; use ±inf where there is no limit"),
+        (
+            {"x_min": [0, 0], "x_max": [1, 1, 1]},
+            km.ShapeError,
+            r"x_min has shape \(2,\) and x_max \(3,\); pass one limit a row",
+        ),
+        (
+            {"slack": (-1.0, 0.0)},
+            km.DataError,
+            r"slack is \(-1.0, 0.0\); pass weights \(linear, quadratic\) ≥ 0, one above zero, or None",
+        ),
+        ({"slack": (0.0, 0.0)}, km.DataError, r"slack is \(0.0, 0.0\); pass weights"),
+        ({"slack": (np.nan, 1.0)}, km.DataError, r"slack holds 1 NaN or inf"),
+        ({"slack": (np.inf, 1.0)}, km.DataError, r"slack holds 1 NaN or inf"),
+    ):
+        with pytest.raises(error, match=text):
+            km.Limits(**kwargs)
+    with pytest.raises(km.ShapeError, match=r"x_max has shape \(3,\), expected \(2,\) or a scalar"):
+        km.Limits(x_max=[1, 1, 1]).states(2)
+
+
+def test_a_slack_is_reported_above_its_tolerance():
+    box = km.Limits(x_min=-1, x_max=9).states(2)
+    assert not softened(np.zeros((3, 0)), box)
+    assert not softened(np.full((3, 2), 0.9e-3), box)
+    assert softened(np.array([[0, 0], [0, 1.1e-3]]), box)
+
+
+def test_choices_of_a_name():
+    """What the type hook of the tests would catch first, as users see it."""
+    lines = shown(
+        """
+model = km.LinearPredictor(np.eye(1), np.eye(1), np.eye(1), km.State(), 0.1, ("x",), ("u",))
+show(lambda: km.Cost(1, 1, u_target="rest"))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), solver="simplex"))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), horizon=2.5))
+show(lambda: km.Limits(slack=5))
+"""
+    )
+    assert lines == [
+        """DataError u_target is 'rest'; pass "equilibrium" or "zero\"""",
+        """DataError solver is 'simplex'; there is "osqp\"""",
+        "DataError horizon is 2.5; pass a whole number",
+        "ShapeError slack has shape (), expected (2,)",
+    ]

@@ -1,0 +1,80 @@
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+from tests.control.models import linear
+
+A, B = np.array([[1.05, 0.1], [0.08, 1.0]]), np.array([[0.005], [0.1]])
+
+
+def test_the_feedback_law_and_its_limits():
+    lqr = km.LQR(linear(A, B), km.Cost([2, 1], 0.1), km.Limits(-0.5, 0.7, x_max=0.01))
+    K = km.dlqr(A, B, [2, 1], 0.1).K
+    np.testing.assert_allclose(lqr.gain.K, K, atol=1e-7)
+    for x in ([0.05, 0.02], [0.3, 0.1], [-0.6, 0.4]):
+        move, free = lqr(x, [0, 0]), -K @ x
+        np.testing.assert_allclose(move.u, np.clip(free, -0.5, 0.7), atol=1e-6)
+        inside = -0.5 <= free[0] <= 0.7
+        assert move.status is (km.Status.UNCONSTRAINED if inside else km.Status.SATURATED)
+        assert move.fallback is km.Fallback.NONE
+        assert move.iterations == 0
+    assert (lqr.dt, lqr.nu, lqr.horizon) == (0.1, 1, 0)
+
+
+def test_nan_holds_the_last_input():
+    lqr = km.LQR(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5))
+    for bad in ([np.nan, 0], [np.inf, 0], [0, 1e31]):
+        move = lqr(bad, [0, 0])
+        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.HOLD)
+        np.testing.assert_array_equal(move.u, [0.0])
+    u = lqr([0.02, 0.01], [0, 0]).u
+    assert u[0] != 0
+    for reference in ([0, 0], [np.nan, 0]):
+        held = lqr([np.nan, 0], reference).u
+        np.testing.assert_array_equal(held, u)
+        held[:] = 99.0
+    np.testing.assert_array_equal(lqr([np.nan, 0], [0, 0], applied=[np.nan]).u, u)
+    np.testing.assert_array_equal(lqr([np.nan, 0], [0, 0], applied=[3.0]).u, [0.5])
+    lqr.reset(u_prev=[-9.0])
+    np.testing.assert_array_equal(lqr([np.nan, 0], [0, 0]).u, [-0.5])
+    lqr.reset()
+    np.testing.assert_array_equal(lqr([np.nan, 0], [0, 0]).u, [0.0])
+
+
+def test_an_affine_model_reaches_its_own_equilibrium():
+    """Linearised at a point that is no equilibrium, the law still drives the affine model to the reference."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    f = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.1 * (ca.sin(x[0]) + u))
+    plant = km.StepMap(ca.Function("F", [x, u], [f]), 0.1)
+    model = km.LinearPredictor.local(plant, [0.9, 0.4], [0.3])
+    affine = plant.linearize([0.9, 0.4], [0.3])
+    lqr = km.LQR(model, km.Cost([2, 1], 0.1))
+    state = np.array([0.2, 0.1])
+    for _ in range(300):
+        state = affine.A @ state + affine.B @ lqr(state, [0.8, 0]).u + affine.c
+    np.testing.assert_allclose(state, [0.8, 0], atol=1e-6)
+    rest = lqr(state, [0.8, 0]).u
+    np.testing.assert_allclose(affine.A @ state + affine.B @ rest + affine.c, state, atol=1e-6)
+
+
+def test_messages():
+    lqr = km.LQR(linear(A, B), km.Cost(1, 0.1))
+    for error, text, call in (
+        (km.ShapeError, r"y has shape \(3,\), expected \(2,\)", lambda: lqr([0, 0, 0], [0, 0])),
+        (km.ShapeError, r"reference has shape \(1,\), expected \(2,\)", lambda: lqr([0, 0], [0])),
+        (km.ShapeError, r"applied has shape \(2,\), expected \(1,\)", lambda: lqr([0, 0], [0, 0], [0, 0])),
+        (km.ShapeError, r"u_prev has shape \(2,\), expected \(1,\)", lambda: lqr.reset(u_prev=[0, 0])),
+        (
+            km.ObservableError,
+            r"the lifting lacks",
+            lambda: km.LQR(linear(A, B), km.Cost(1, 1, of=km.Constant())),
+        ),
+        (
+            km.DefinitenessError,
+            r"R \+ BᵀPB is not positive definite: its least eigenvalue is 0; raise R, or weight a state",
+            lambda: km.LQR(linear(A, B), km.Cost(0, 0)),
+        ),
+    ):
+        with pytest.raises(error, match=text):
+            call()

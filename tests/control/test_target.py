@@ -1,0 +1,86 @@
+import cvxpy as cp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from koopmpc.control.limits import Box
+from koopmpc.control.target import targets
+from tests.control.models import equilibrium
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def system(seed, nz, nu, constant):
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(nz, nz)), rng.normal(size=(nz, nu))
+    if constant:
+        A = np.block([[A, rng.normal(size=(nz, 1))], [np.zeros((1, nz)), np.ones((1, 1))]])
+        B = np.vstack([B, np.zeros((1, nu))])
+    nr = int(rng.integers(1, nz + 1))
+    half = rng.normal(size=(nr, nr))
+    Q = (half @ half.T + 0.1 * np.eye(nr)) * 10 ** rng.uniform(-4, 3)
+    return rng, A, B, rng.normal(size=(nr, len(A))), Q, nz if constant else None
+
+
+def is_equilibrium(A, B, z, u, constant):
+    residual = np.abs(A @ z + B @ u - z)
+    assert residual.max() <= 1e-7 * (1 + np.abs(z).max() + np.abs(u).max())
+    if constant is not None:
+        assert z[constant] == 1.0
+
+
+@given(seed=SEEDS, nz=st.integers(1, 5), nu=st.integers(1, 2), constant=st.booleans())
+def test_without_limits_it_is_the_nearest_equilibrium(seed, nz, nu, constant):
+    rng, A, B, C, Q, pinned = system(seed, nz, nu, constant)
+    nothing = np.zeros((0, len(A)))
+    free, no = Box(np.full(nu, -np.inf), np.full(nu, np.inf)), Box(np.zeros(0), np.zeros(0))
+    found = targets(A, B, C, Q, free, nothing, no, pinned, hold=True)
+    R = rng.normal(size=(3, len(C)))
+    for r, alpha in zip(R, found.coordinates(R), strict=True):
+        z, u = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
+        is_equilibrium(A, B, z, u, pinned)
+        other, _ = equilibrium(A, B, C, Q, r, pinned)
+        distance = lambda v, r=r: (C @ v - r) @ Q @ (C @ v - r)  # noqa: E731
+        assert distance(z) <= distance(other) * (1 + 1e-6) + 1e-9 * np.trace(Q)
+    at_zero = targets(A, B, C, Q, free, nothing, no, pinned, hold=False)
+    assert not at_zero.u0.any()
+    assert not at_zero.W.any()
+    np.testing.assert_array_equal(at_zero.coordinates(R), found.coordinates(R))
+
+
+@given(seed=SEEDS, nz=st.integers(1, 5), nu=st.integers(1, 2), size=st.sampled_from([0.1, 1.0, 100.0]))
+def test_with_limits_it_is_the_nearest_inside_them(seed, nz, nu, size):
+    """The Q-distance equals CVXPY's; references far outside come back to the limits."""
+    rng, A, B, C, Q, _ = system(seed, nz, nu, constant=False)
+    G = rng.normal(size=(int(rng.integers(0, 3)), nz))
+    inputs = Box(-(high := rng.uniform(0.1, 1, nu)), high)
+    outputs = Box(-(high := rng.uniform(0.1, 2, len(G))), high)
+    found = targets(A, B, C, Q, inputs, G, outputs, None, hold=True)
+    r = size * rng.normal(size=len(C))
+    alpha = found.coordinates(r[None])[0]
+    z, u = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
+    is_equilibrium(A, B, z, u, None)
+    for values, (low, high) in ((u, inputs), (G @ z, outputs)):
+        assert (values >= low - 1e-6).all()
+        assert (values <= high + 1e-6).all()
+    Z, U = cp.Variable(nz), cp.Variable(nu)
+    held = [A @ Z + B @ U == Z, cp.abs(U) <= inputs.high]
+    if len(G):
+        held += [cp.abs(G @ Z) <= outputs.high]
+    root = np.linalg.cholesky(Q / np.trace(Q)).T
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(root @ (C @ Z - r))), held)
+    problem.solve(cp.CLARABEL)
+    error = root @ (C @ z - r)
+    assert error @ error <= problem.value + 1e-5 * (r @ r + 1)
+
+
+def test_where_no_equilibrium_meets_the_state_limits_the_inputs_still_hold():
+    """Rest at 4 ≤ x ≤ 5 would take |u| > 1: the target is the nearest that the inputs hold."""
+    A, B = np.array([[0.5]]), np.array([[1.0]])
+    state = Box(np.array([4.0]), np.array([5.0]))  # x = 2 u at rest
+    found = targets(
+        A, B, np.eye(1), np.eye(1), Box(-np.ones(1), np.ones(1)), np.eye(1), state, None, hold=True
+    )
+    alpha = found.coordinates(np.array([[4.5]]))[0]
+    np.testing.assert_allclose(found.z0 + found.Z @ alpha, [2.0], atol=1e-6)
+    np.testing.assert_allclose(found.u0 + found.W @ alpha, [1.0], atol=1e-6)
