@@ -3,7 +3,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.limits import softened
-from tests.control.bare import shown
+from tests.bare import shown
 
 
 def test_a_scalar_and_a_vector_are_diagonals():

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.osqp import OSQP
-from tests.control.bare import shown
+from tests.bare import shown
 from tests.control.kkt import meets_kkt
 
 TIGHT = {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 100_000}

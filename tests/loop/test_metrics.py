@@ -1,0 +1,140 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import koopmpc as km
+
+STATES = ("theta [rad]", "omega [rad/s]")
+
+
+def random_run(rng, T=12, cost=None, limits=None, nr=2, angles=(), dt=0.1):
+    statuses = rng.choice(list(km.Status), T)
+    fallbacks = rng.choice(list(km.Fallback), T)
+    X = 4 * rng.normal(size=(T + 1, 2))
+    return km.Run(
+        X=X,
+        Y=X + 0.1 * rng.normal(size=X.shape),
+        U=rng.normal(size=(T, 1)),
+        reference=rng.normal(size=(T + 1, nr)),
+        status=tuple(statuses),
+        fallback=tuple(fallbacks),
+        solve_time=rng.uniform(0, 0.2, T),
+        iterations=rng.integers(0, 9, T),
+        cost=cost,
+        limits=limits,
+        dt=dt,
+        states=STATES,
+        inputs=("u",),
+        outputs=STATES,
+        angles=angles,
+    )
+
+
+def wrapped(angle):
+    while angle > np.pi:
+        angle -= 2 * np.pi
+    while angle <= -np.pi:
+        angle += 2 * np.pi
+    return angle
+
+
+@given(seed=st.integers(0, 2**32 - 1), angles=st.sampled_from([(), (0,), (0, 1)]))
+def test_against_loops(seed, angles):
+    rng = np.random.default_rng(seed)
+    Q, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[0.7]])
+    of = km.Fourier(1, states=["theta"])
+    limits = km.Limits(-1, 0.8, x_min=[-3, -np.inf], x_max=[2, 5], of=of, y_max=[0.5, 0.9])
+    run = random_run(rng, cost=km.Cost(Q, R), limits=limits, angles=angles)
+    found = km.metrics(run)
+    T, cost, squares, violation, over, effort = run.steps, 0.0, np.zeros(2), 0.0, 0.0, 0.0
+    for k in range(T + 1):
+        error = run.X[k] - run.reference[k]
+        error = np.array([wrapped(e) if i in angles else e for i, e in enumerate(error)])
+        if k:
+            cost += error @ Q @ error
+            squares += error**2
+            theta, omega = run.X[k]
+            violation = max(
+                violation, -3 - theta, theta - 2, omega - 5, np.sin(theta) - 0.5, np.cos(theta) - 0.9
+            )
+        if k < T:
+            u = run.U[k]
+            cost += u @ R @ u
+            over = max(over, u[0] - 0.8, -1 - u[0])
+            effort += u @ u * run.dt
+    assert found.cost == pytest.approx(cost)
+    np.testing.assert_allclose(found.tracking_rmse, np.sqrt(squares / T))
+    np.testing.assert_allclose(found.final_error, error)
+    assert found.violation == pytest.approx(violation)
+    assert found.input_violation == pytest.approx(over)
+    assert found.effort == pytest.approx(effort)
+    assert found.late == sum(t > run.dt for t in run.solve_time)
+    assert found.solve_time_max == max(run.solve_time)
+    assert found.solve_time_p50 == pytest.approx(np.median(run.solve_time))
+    assert found.solve_time_p50 <= found.solve_time_p99 <= found.solve_time_max
+    for counts, kinds in ((found.status, run.status), (found.fallback, run.fallback)):
+        assert sum(counts.values()) == T
+        assert all(counts[kind.name] == kinds.count(kind) for kind in kinds)
+
+
+def test_an_angle_a_turn_away_is_no_error():
+    rng = np.random.default_rng(0)
+    cost = km.Cost([1, 0], 0)
+    run = random_run(rng, cost=cost, angles=(0,))
+    turned = replace(run, X=run.X + np.array([2 * np.pi, 0]))
+    assert km.metrics(turned).cost == pytest.approx(km.metrics(run).cost)
+    assert km.metrics(replace(turned, angles=())).cost > km.metrics(replace(run, angles=())).cost + 1
+    for error, expected in ((np.pi, np.pi), (-np.pi, np.pi), (3.0, 3.0), (3.2, 3.2 - 2 * np.pi)):
+        one = replace(run, X=np.tile([error, 0], (13, 1)), reference=np.zeros((13, 2)))
+        np.testing.assert_allclose(km.metrics(one).final_error, [expected, 0], atol=1e-9)
+
+
+def test_tracked_observables_wrap_only_where_they_are_the_angle():
+    rng = np.random.default_rng(1)
+    of = km.Expressions(lambda x: [x[1]], ["rate"])
+    run = random_run(rng, cost=km.Cost(1, 0, of=of), nr=1, angles=(0,))
+    np.testing.assert_allclose(km.metrics(run).final_error, run.X[-1, 1:] - run.reference[-1])
+    both = random_run(rng, cost=km.Cost(1, 0, of=of + km.State()), nr=3, angles=(0,))
+    error = both.X[-1, 0] - both.reference[-1, 1]
+    np.testing.assert_allclose(km.metrics(both).final_error[1], wrapped(error))
+
+
+@pytest.mark.parametrize(
+    ("errors", "settled"),
+    [
+        ([1, 0.5, 0.019, 0.01, 0], 0.2),
+        ([1, 0.01, 0.5, 0.01, 0], 0.3),
+        ([1, 0.5, 0.3, 0.2, 0.021], np.inf),
+        ([1, 0, 0, 0, 0], 0.1),
+        ([0, 0, 0, 0, 0], 0.0),
+        ([0, 0, 1, 0, 0], 0.3),
+        ([1, np.nan, 0, 0, 0], 0.2),
+        ([np.nan, 0, 0, 0, 0], np.inf),
+    ],
+)
+def test_settling_time(errors, settled):
+    run = random_run(np.random.default_rng(2), T=4, cost=km.Cost(1, 0))
+    X = np.column_stack([errors, np.zeros(5)])
+    assert km.metrics(replace(run, X=X, reference=np.zeros((5, 2)))).settling_time == pytest.approx(settled)
+
+
+def test_without_a_cost_and_with_a_hidden_state():
+    rng = np.random.default_rng(3)
+    run = random_run(rng)
+    found = km.metrics(run)
+    assert np.isnan(found.cost)
+    assert (found.violation, found.input_violation) == (0.0, 0.0)
+    np.testing.assert_allclose(found.final_error, run.X[-1] - run.reference[-1])
+    hidden = replace(run, X=np.full_like(run.X, np.nan), cost=km.Cost(1, 1))
+    assert km.metrics(hidden).cost == km.metrics(replace(run, X=run.Y, cost=km.Cost(1, 1))).cost
+    blind = replace(hidden, outputs=("cos", "sin"))
+    assert np.isnan(km.metrics(blind).cost)
+
+
+def test_a_reference_that_does_not_fit_the_cost():
+    run = random_run(np.random.default_rng(4), nr=1)
+    with pytest.raises(km.ShapeError, match=r"the reference has shape \(13, 1\), what it is for \(13, 2\)"):
+        km.metrics(run)
