@@ -3,12 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import Lifting
 
 ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
+
+_NONE = np.zeros(0, dtype=np.intp)
 
 
 class Piece(NamedTuple):
@@ -36,19 +38,28 @@ def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
     return result
 
 
-def table(episodes: Episodes, lifting: Lifting, chunk: list[Piece]) -> Float[np.ndarray, "M nd"]:
-    """Return the rows [ψ(x) u ψ(x⁺)] of one chunk; each state is lifted once."""
+def table(
+    episodes: Episodes, lifting: Lifting, chunk: list[Piece], products: Int[np.ndarray, " np"] = _NONE
+) -> Float[np.ndarray, "M nd"]:
+    """Return the rows [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one chunk; each state is lifted once.
+
+    `products` are the observables that u is multiplied with; without them the rows are [ψ(x) u ψ(x⁺)].
+    """
     of = episodes.episodes
     states = [of[i].X[first : last + 1] for i, first, last in chunk]
     Z = lifting(states[0] if len(states) == 1 else np.concatenate(states))
     nz, nu = lifting.nz, episodes.nu
-    D = np.empty((len(Z) - len(chunk), 2 * nz + nu))
+    last = nz + nu + nu * len(products)
+    D = np.empty((len(Z) - len(chunk), last + nz))
     if len(chunk) == 1:
-        D[:, :nz], D[:, nz + nu :] = Z[:-1], Z[1:]
+        D[:, :nz], D[:, last:] = Z[:-1], Z[1:]
     else:
         ends = np.cumsum([len(X) for X in states]) - 1
         now = np.delete(np.arange(len(Z)), ends)
-        D[:, :nz], D[:, nz + nu :] = Z[now], Z[now + 1]
+        D[:, :nz], D[:, last:] = Z[now], Z[now + 1]
     if nu:
-        D[:, nz : nz + nu] = np.concatenate([of[i].U[first:last] for i, first, last in chunk])
+        U = D[:, nz : nz + nu]
+        U[:] = np.concatenate([of[i].U[first:end] for i, first, end in chunk])
+        for i, first in enumerate(range(nz + nu, last, max(len(products), 1))):
+            np.multiply(U[:, i : i + 1], D[:, products], out=D[:, first : first + len(products)])
     return D

@@ -81,7 +81,7 @@ def fit(task: Regression, *, ridge: float = 0.0, rank: int | None = None) -> Lin
     A, B, C, lifting, residual, state_residual, modes = whole
     report = FitReport(
         method=task.method,
-        route=f"{task.route}, {_cut(task, rows, ridge, rank)}",
+        route=f"{task.route}, {cut(task, rows, ridge, rank)}",
         samples=rows.samples,
         condition=condition,
         rank=used,
@@ -150,7 +150,8 @@ def _reduced(
     return (A, B, C, Projected(task.lifting, basis), residual, state_residual, modes), r
 
 
-def _cut(task: Regression, rows: Rows, ridge: float, rank: int | None) -> str:
+def cut(task: Regression, rows: Rows, ridge: float, rank: int | None) -> str:
+    """Return what the solve cut or added, in words."""
     if rank is not None:
         return f"truncated SVD of unscaled columns at rank {rank}"
     if ridge > 0:

@@ -1,4 +1,4 @@
-"""Second moments of the rows [ψ(x) u ψ(x⁺)]: all that the linear regressions need of the snapshots."""
+"""Second moments of the rows [ψ(x) u ψ(x⁺)], or [ψ(x) u u⊗ψ(x) ψ(x⁺)]: all that the regressions need."""
 
 import warnings
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.chunks import ROWS, chunks, table
 from koopmpc.identify.solve import Rows, norms
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.state import State
 from koopmpc.values import Value
 
@@ -45,6 +46,8 @@ class Moments(Value):
         "gram" for raw sums of products, "qr" for the triangular factor: twice the digits, six times the cost.
     sums
         G or R, (nd, nd).
+    bilinear
+        The rows are [ψ(x) u u⊗ψ(x) ψ(x⁺)]; a Constant is left out of the products, for u times it is u.
     """
 
     lifting: Lifting
@@ -53,6 +56,7 @@ class Moments(Value):
     samples: int
     route: str
     sums: Float[np.ndarray, "nd nd"]
+    bilinear: bool = False
 
     @cached_property
     def full(self) -> Lifting:
@@ -65,20 +69,27 @@ class Moments(Value):
         return self.lifting.nz
 
     @property
+    def products(self) -> Int[np.ndarray, " np"]:
+        """Observables in u⊗ψ(x): all but a Constant, or none."""
+        return _products(self.lifting, self.bilinear)
+
+    @property
     def regressors(self) -> Int[np.ndarray, " n"]:
-        """Columns of ψ(x) and u."""
-        full = self.full.nz
-        return np.concatenate([np.arange(self.nz), np.arange(full, full + len(self.inputs))])
+        """Columns of ψ(x), u and u⊗ψ(x)."""
+        return np.concatenate([np.arange(self.nz), np.arange(self.full.nz, self._first)])
 
     @property
     def targets(self) -> Int[np.ndarray, " n"]:
         """Columns of ψ(x⁺), the appended states last."""
-        first = self.full.nz + len(self.inputs)
-        return np.arange(first, first + self.full.nz)
+        return np.arange(self._first, self._first + self.full.nz)
+
+    @property
+    def _first(self) -> int:
+        return self.full.nz + len(self.inputs) * (1 + len(self.products))
 
     @property
     def condition(self) -> float:
-        """Condition number of [ψ(x) u] on unit-norm columns, those that are 0 throughout left out."""
+        """Condition number of the regressors on unit-norm columns, those that are 0 throughout left out."""
         columns = self.rows(self.regressors, self.targets[:0]).P
         size = norms(columns)
         s = np.linalg.svd(columns[:, size > 0] / size[size > 0], compute_uv=False)
@@ -88,9 +99,11 @@ class Moments(Value):
 
     def __add__(self, other: "Moments") -> "Moments":
         """Return the moments of both data sets; R + G becomes G and warns, for it loses R's digits."""
-        if (self.lifting, self.inputs, self.dt) != (other.lifting, other.inputs, other.dt):
+        mine = (self.lifting, self.inputs, self.dt, self.bilinear)
+        if mine != (other.lifting, other.inputs, other.dt, other.bilinear):
             raise DataError(
-                "the moments differ in lifting, inputs or dt; add moments of one plant in one lifting only"
+                "the moments differ in lifting, inputs or dt, or one is bilinear; "
+                "add moments of one plant in one lifting only"
             )
         samples = self.samples + other.samples
         if self.route == other.route == "qr":
@@ -127,7 +140,9 @@ class Moments(Value):
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
 
 
-def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None) -> Moments:
+def moments(
+    episodes: Episodes, lifting: Lifting, *, route: Route | None = None, bilinear: bool = False
+) -> Moments:
     """Return Σ dᵀd, or its triangular factor, over the rows d = [ψ(x) u ψ(x⁺)] of all snapshot pairs.
 
     Chunks of fixed size are lifted, added in order and forgotten: memory does not grow with the data, and
@@ -143,6 +158,8 @@ def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None)
     route
         "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a
         pilot of sampled chunks chooses: Gram up to 1e6, else QR; if the whole is worse, it is read again.
+    bilinear
+        Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
 
     Raises
     ------
@@ -152,15 +169,16 @@ def moments(episodes: Episodes, lifting: Lifting, *, route: Route | None = None)
     bound = lifting.bind(episodes.states)
     pieces = chunks(episodes)
     if route is not None:
-        return _read(episodes, bound, range(len(pieces)), route)
-    width = bound.nz + episodes.nu
+        return _read(episodes, bound, range(len(pieces)), route, bilinear)
+    width = bound.nz + episodes.nu * (1 + len(_products(bound, bilinear)))
     pilot = _spread(len(pieces), max(_PILOT, -(-4 * width // ROWS)))
-    first = _read(episodes, bound, pilot, "gram")
+    first = _read(episodes, bound, pilot, "gram", bilinear)
     if first.condition <= _WELL_CONDITIONED:
-        total = first if len(pilot) == len(pieces) else _read(episodes, bound, range(len(pieces)), "gram")
+        whole = range(len(pieces))
+        total = first if len(pilot) == len(pieces) else _read(episodes, bound, whole, "gram", bilinear)
         if total.condition <= _WELL_CONDITIONED:
             return total
-    return _read(episodes, bound, range(len(pieces)), "qr")
+    return _read(episodes, bound, range(len(pieces)), "qr", bilinear)
 
 
 def _spread(total: int, wanted: int) -> list[int]:
@@ -168,17 +186,25 @@ def _spread(total: int, wanted: int) -> list[int]:
     return sorted({round(i * (total - 1) / (wanted - 1)) for i in range(wanted)})
 
 
-def _read(episodes: Episodes, lifting: Lifting, which: Sequence[int], route: Route) -> Moments:
-    full, pieces, nu = _with_states(lifting), chunks(episodes), episodes.nu
-    width = 2 * full.nz + nu
+def _read(
+    episodes: Episodes, lifting: Lifting, which: Sequence[int], route: Route, bilinear: bool
+) -> Moments:
+    full, pieces, products = _with_states(lifting), chunks(episodes), _products(lifting, bilinear)
+    width = 2 * full.nz + episodes.nu * (1 + len(products))
     sums, samples = np.zeros((width, width)), 0
     for i in which:
-        D = table(episodes, full, pieces[i])
+        D = table(episodes, full, pieces[i], products)
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
             sums = sums + D.T @ D if route == "gram" else _absorbed(sums, D)
         samples += len(D)
-        _require_finite(sums.diagonal() if route == "gram" else np.abs(D).max(axis=0), full, episodes.inputs)
-    return Moments(lifting, episodes.inputs, episodes.dt, samples, route, sums)
+        size = sums.diagonal() if route == "gram" else np.abs(D).max(axis=0)
+        _require_finite(size, full, episodes.inputs, products)
+    return Moments(lifting, episodes.inputs, episodes.dt, samples, route, sums, bilinear)
+
+
+def _products(lifting: Lifting, bilinear: bool) -> Int[np.ndarray, " np"]:
+    one = Constant().bind(lifting._states).names[0]
+    return np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
 
 
 def _absorbed(R: Float[np.ndarray, "nd nd"], rows: Float[np.ndarray, "m nd"]) -> Float[np.ndarray, "nd nd"]:
@@ -194,14 +220,24 @@ def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
     return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
 
 
-def _require_finite(size: Float[np.ndarray, " nd"], full: Lifting, inputs: tuple[str, ...]) -> None:
+def _require_finite(
+    size: Float[np.ndarray, " nd"], full: Lifting, inputs: tuple[str, ...], which: Int[np.ndarray, " np"]
+) -> None:
     bad = np.flatnonzero(~np.isfinite(size))
     if bad.size:
-        name = (*full.names, *inputs, *full.names)[int(bad[0])]
+        products = product_names(full, inputs, which)
+        name = (*full.names, *inputs, *products, *full.names)[int(bad[0])]
         raise DataError(
             f"the observable {name!r} is NaN, infinite or above 1e154 on these data; "
             "drop it, or the episodes where it is"
         )
+
+
+def product_names(
+    lifting: Lifting, inputs: tuple[str, ...], products: Int[np.ndarray, " np"]
+) -> tuple[str, ...]:
+    """Return ``"force [N] * theta [rad]"``, …, in the order of u⊗ψ(x)."""
+    return tuple(f"{u} * {lifting.names[int(i)]}" for u in inputs for i in products)
 
 
 def _with_states(lifting: Lifting) -> Lifting:

@@ -15,7 +15,7 @@ class FitReport(Value):
     Attributes
     ----------
     method
-        The function that made it: "dmd", "dmdc", "edmd".
+        The function that made it: "dmd", "dmdc", "edmd", "bilinear_edmd".
     route
         How the least squares was solved: "gram", "qr", "svd", and what was cut or added.
     samples
