@@ -61,6 +61,8 @@ class KoopmanMPC:
     control", Automatica 93, 2018.
     """
 
+    solver_fails = False  # set by fault injection alone, see control.move.Fallible
+
     def __init__(
         self,
         predictor: LinearPredictor,
@@ -212,6 +214,8 @@ class KoopmanMPC:
             solution = self._solver.solve(
                 np.zeros(len(problem.shift_primal)), np.zeros(len(problem.shift_dual))
             )
+        if self.solver_fails:
+            solution.status = Status.FAILED
         if solution.status is not Status.OPTIMAL:
             return self._fail(v[: self._nu], applied, solution.status, solution.iterations, start)
         self._primal[:-1], self._dual[:-1] = solution.v, solution.y

@@ -66,6 +66,14 @@ class Plan(Value):
 
 
 @runtime_checkable
+class Fallible(Protocol):
+    """A controller whose solver can be made to fail, to see what it does then."""
+
+    solver_fails: bool
+    """While True, the solver runs, but its answer is lost and the step is FAILED."""
+
+
+@runtime_checkable
 class Controller(Protocol):
     """y, reference → Move, once every dt."""
 

@@ -64,6 +64,8 @@ class NonlinearMPC:
     nonlinear programming", Math. Prog. 106, 2006.
     """
 
+    solver_fails = False  # set by fault injection alone, see control.move.Fallible
+
     def __init__(
         self,
         step_map: StepMap,
@@ -141,6 +143,8 @@ class NonlinearMPC:
         targets = [self._target(row) for row in R]
         aim = Aim(R[1:], np.array([t.u for t in targets[:-1]]), targets[-1].x, targets[-1].P)
         found = self._shooting.solve(x0, aim)
+        if self.solver_fails:
+            found = found._replace(status=Status.FAILED)
         if found.status is not Status.OPTIMAL:
             return self._fail(applied, found.status, found.iterations, start)
         U = np.clip(found.U, *self._inputs)

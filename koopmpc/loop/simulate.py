@@ -13,6 +13,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Move, Plan
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.loop.injection import Fault, Injections, Wiring, call
 from koopmpc.loop.run import Plans, Run
 from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import StepMap
@@ -53,6 +54,7 @@ def simulate(
     limits: Limits | None = None,
     disturbance: Signal | None = None,
     noise: Signal | None = None,
+    faults: Sequence[Fault] = (),
     rng: np.random.Generator | int = 0,
     observers: Sequence[Observer] = (),
     plans: bool = False,
@@ -77,6 +79,10 @@ def simulate(
         d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
     noise
         n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
+    faults
+        What breaks, see `koopmpc.loop.faults`; a signal passes through them in order, y_k after its noise. Run.Y is
+        what the controller got and Run.U what the plant got, which the controller is told at the next step; the
+        metadata name them under "faults".
     observers
         Called once a step with a Step.
     plans
@@ -87,7 +93,7 @@ def simulate(
     Raises
     ------
     ShapeError, DataError
-        Sizes do not fit, or a controller returned a u that is not finite.
+        Sizes do not fit, or a controller returned a u that is not finite, or a fault does not fit.
     """
     steps = checks.count(steps, "steps")
     rng = checks.generator(rng)
@@ -117,6 +123,11 @@ def simulate(
     if push is not None and not isinstance(plant, SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
     jitter = _noise(noise, steps, ny)
+    injected = None
+    if faults:
+        box = (limits or Limits()).inputs(nu)
+        injected = Injections(faults, Wiring(ny, box), rng)
+        metadata = {**(metadata or {}), "faults": [str(fault) for fault in faults]}
 
     X, Y, U = np.full((steps + 1, nx), np.nan), np.empty((steps + 1, ny)), np.empty((steps, nu))
     moves: list[Move] = []
@@ -124,18 +135,24 @@ def simulate(
     look_ahead = getattr(controller, "plan", None)
     N = controller.horizon
     Y[0] = y if jitter is None else y + jitter(0, rng)
+    if injected is not None:
+        Y[0] = injected.measured(0, Y[0].copy())
     _store(X, 0, plant.state)
     controller.reset(x0)
     for k in range(steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, rows.shape[1]))
-        move = controller(Y[k].copy(), ahead, U[k - 1] if k else None)
+        applied = U[k - 1] if k else None
+        if injected is None:
+            move = controller(Y[k].copy(), ahead, applied)
+        else:
+            move = call(controller, Y[k].copy(), ahead, applied, solver_fails=injected.solver_fails(k))
         if np.shape(move.u) != (nu,):
             raise ShapeError(
                 f"the controller returned u of shape {np.shape(move.u)} at step {k}, expected ({nu},)"
             )
         if not np.isfinite(move.u).all():
             raise DataError(f"the controller returned u = {move.u} at step {k}; every input must be finite")
-        U[k] = move.u
+        U[k] = move.u if injected is None else injected.applied(k, move.u)
         moves.append(move)
         plan = look_ahead() if look_ahead is not None and (plans or observers) else None
         kept.append(plan if plans else None)
@@ -144,6 +161,8 @@ def simulate(
         else:
             y = _measured(plant.step(U[k].copy()))
         Y[k + 1] = y if jitter is None else y + jitter(k + 1, rng)
+        if injected is not None:
+            Y[k + 1] = injected.measured(k + 1, Y[k + 1].copy())
         _store(X, k + 1, plant.state)
         if observers:
             step = Step(k, Y[k], U[k], rows[k], move, X[k], plan, X[k + 1], Y[k + 1], rows[k + 1])
