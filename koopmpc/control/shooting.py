@@ -4,163 +4,185 @@ Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal cont
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Box
+from koopmpc.control.equilibrium import Goal, flat
 from koopmpc.control.move import Status
+from koopmpc.control.outputs import Outputs
 from koopmpc.plant.step_map import StepMap
 
-QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
+Solver = Literal["ipopt", "fatrop", "sqpmethod"]
+_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "ipopt": {
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.max_iter": 300,
+        "ipopt.warm_start_init_point": "yes",
+    },
+    "fatrop": {"fatrop.print_level": 0, "fatrop.max_iter": 300, "structure_detection": "manual"},
+    "sqpmethod": {
+        "qpsol": "qrqp",
+        "max_iter": 100,
+        "convexify_strategy": "eigen-clip",
+        "print_header": False,
+        "print_iteration": False,
+        "print_status": False,
+        "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
+    },
+}
 _STATUS = {
     "Solve_Succeeded": Status.OPTIMAL,
     "Solved_To_Acceptable_Level": Status.OPTIMAL,
     "Maximum_Iterations_Exceeded": Status.MAX_ITERATIONS,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
     "Maximum_CpuTime_Exceeded": Status.TIME_LIMIT,
     "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
-    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+    "SOLVER_RET_SUCCESS": Status.OPTIMAL,
+    "SOLVER_RET_LIMITED": Status.MAX_ITERATIONS,
+    "SOLVER_RET_INFEASIBLE": Status.INFEASIBLE,
 }
 
 
 class Horizon(NamedTuple):
-    """A solution: inputs, states and slacks, stage by stage, and how the solver ended."""
+    """A solution: inputs, states and slacks, stage by stage, its cost, and how the solver ended."""
 
     U: Float[np.ndarray, "N nu"]
     X: Float[np.ndarray, "N nx"]
     slacks: Float[np.ndarray, "N ns"]
+    cost: float
     status: Status
     iterations: int
 
 
 class Aim(NamedTuple):
-    """What a horizon tracks: reference rows of x_1 … x_N, inputs u_r, and ‖x_N − x_r‖²_P at its end."""
+    """What a horizon tracks: reference rows of x_1 … x_N, inputs u_r, and the goal at its end."""
 
     R: Float[np.ndarray, "N nr"]
     U: Float[np.ndarray, "N nu"]
-    x: Float[np.ndarray, " nx"]
-    P: Float[np.ndarray, "nx nx"]
+    goal: Goal
+
+
+class Start(NamedTuple):
+    """Where a solver begins: variables, and multipliers of their bounds and of the constraints."""
+
+    v: Float[np.ndarray, " n"]
+    bounds: Float[np.ndarray, " n"]
+    constraints: Float[np.ndarray, " m"]
 
 
 class Shooting:
-    """Variables [U; X; slacks], constraints x_{k+1} = F(x_k, u_k) and the limits; solved by IPOPT.
+    """Variables (u_k, x_{k+1}, ε_{k+1}) stage by stage, constraints x_{k+1} = F(x_k, u_k) and the limits.
 
     Parameters
     ----------
     step_map
         F.
-    tracked, limited
-        CasADi functions of x: the tracked outputs, and the outputs that `outputs` limits.
-    Q, R
-        Stage weights.
-    inputs, outputs
-        Their limits; `slack` (linear, quadratic) relaxes those of the outputs, None does not.
+    outputs
+        What is tracked and limited; `slack` (linear, quadratic) relaxes the limits on states, None does not.
     N
         Steps.
-    options
-        CasADi's options of the solver.
+    solver, options
+        CasADi's solver, and its options by CasADi's names.
     """
 
     def __init__(
         self,
         step_map: StepMap,
-        tracked: ca.Function,
-        limited: ca.Function,
-        Q: Float[np.ndarray, "nr nr"],
-        R: Float[np.ndarray, "nu nu"],
-        inputs: Box,
-        outputs: Box,
+        outputs: Outputs,
         slack: tuple[float, float] | None,
         N: int,
+        solver: Solver,
         options: Mapping[str, Any],
     ) -> None:
-        nx, nu, nr, ng = step_map.nx, step_map.nu, len(Q), len(outputs.low)
+        nx, nu, nr, ng = step_map.nx, step_map.nu, len(outputs.Q), len(outputs.box.low)
         ns = 0 if slack is None else ng
-        U, X, E = ca.MX.sym("U", nu, N), ca.MX.sym("X", nx, N), ca.MX.sym("E", ns, N)
+        W = ca.MX.sym("W", nu + nx + ns, N)
+        U, X, E = W[:nu, :], W[nu : nu + nx, :], W[nu + nx :, :]
         x0, r, u_r = ca.MX.sym("x0", nx), ca.MX.sym("r", nr, N), ca.MX.sym("u_r", nu, N)
-        x_r, P = ca.MX.sym("x_r", nx), ca.MX.sym("P", nx, nx)
+        M, L, m = (ca.MX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1))
 
-        gaps = step_map.F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) - X
-        end = X[:, N - 1] - x_r
-        f = _weighted(U - u_r, R) + ca.mtimes([end.T, P, end])
+        gaps = X - step_map.F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U)  # the sign that fatrop wants
+        end = M @ outputs.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
+        f = _weighted(U - u_r, outputs.R) + ca.sumsqr(end)
         if N > 1:
-            f += _weighted(tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], Q)
-        g, low, high = [ca.vec(gaps)], [np.zeros(N * nx)], [np.zeros(N * nx)]
-        self._rows = [nx]  # entries of each block of constraints, a stage
+            f += _weighted(outputs.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], outputs.Q)
+        paths, low, high = [ca.MX(0, N)], [np.zeros(0)], [np.zeros(0)]
         if ng:
-            values = limited.map(N)(X)
-            infinite = np.full(N * ng, np.inf)
-            tiled = np.tile(outputs.low, N), np.tile(outputs.high, N)
+            values, infinite = outputs.limited.map(N)(X), np.full(ng, np.inf)
             if slack is None:
-                g, low, high = [*g, ca.vec(values)], [*low, tiled[0]], [*high, tiled[1]]
-                self._rows += [ng]
+                paths, low, high = [values], [outputs.box.low], [outputs.box.high]
             else:
                 f += slack[0] * ca.sum1(ca.vec(E)) + slack[1] * ca.sumsqr(E)
-                g += [ca.vec(values - E), ca.vec(values + E)]
-                low, high = [*low, -infinite, tiled[0]], [*high, tiled[1], infinite]
-                self._rows += [ng, ng]
-        self._sizes = [nu, nx, ns]
-        self._N = N
-        free = np.full(N * nx, np.inf)
-        self._bounds = {
-            "lbx": np.concatenate([np.tile(inputs.low, N), -free, np.zeros(N * ns)]),
-            "ubx": np.concatenate([np.tile(inputs.high, N), free, np.full(N * ns, np.inf)]),
-            "lbg": np.concatenate(low),
-            "ubg": np.concatenate(high),
-        }
-        nlp = {
-            "x": ca.vertcat(ca.vec(U), ca.vec(X), ca.vec(E)),
-            "p": ca.vertcat(x0, ca.vec(r), ca.vec(u_r), x_r, ca.vec(P)),
-            "f": f,
-            "g": ca.vertcat(*g),
-        }
-        expand = step_map.F.is_a("SXFunction")
-        self._solver = ca.nlpsol("shooting", "ipopt", nlp, {**QUIET, **options, "expand": expand})
-        self._rest = np.clip(np.zeros(nu), *inputs)
-        self._warm: dict[str, Float[np.ndarray, ...]] | None = None
-
-    def reset(self) -> None:
-        """Forget the last solution: the next start is rest at x_0."""
-        self._warm = None
-
-    def solve(self, x0: Float[np.ndarray, " nx"], aim: Aim) -> Horizon:
-        """Solve from the last solution moved on by one step, multipliers included."""
-        p = np.concatenate([x0, aim.R.ravel(), aim.U.ravel(), aim.x, aim.P.ravel()])
-        N = self._N
-        start = self._warm or {
-            "x0": np.concatenate([np.tile(self._rest, N), np.tile(x0, N), np.zeros(N * self._sizes[2])])
-        }
-        found = cast("dict[str, Any]", self._solver(p=p, **self._bounds, **start))
-        stats = self._solver.stats()
-        status = _STATUS.get(str(stats["return_status"]), Status.FAILED)
-        primal = flat(found["x"])
-        U, X, slacks = self._blocks(primal, self._sizes)
-        if status is Status.OPTIMAL:
-            self._warm = {
-                "x0": self._moved_on(primal, self._sizes),
-                "lam_x0": self._moved_on(flat(found["lam_x"]), self._sizes),
-                "lam_g0": self._moved_on(flat(found["lam_g"]), self._rows),
-            }
-        else:
-            self._warm = None
-        return Horizon(U, X, slacks, status, int(stats.get("iter_count", 0)))
-
-    def _blocks(self, values: Float[np.ndarray, " m"], sizes: list[int]) -> list[Float[np.ndarray, "N n"]]:
-        ends = np.cumsum([self._N * size for size in sizes])[:-1]
-        return [
-            block.reshape(self._N, size) for block, size in zip(np.split(values, ends), sizes, strict=True)
+                paths = [values - E, values + E]
+                low, high = [-infinite, outputs.box.low], [outputs.box.high, infinite]
+        path = ca.vertcat(*paths)
+        npath = path.shape[0]
+        # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N: the order in which fatrop finds the stages
+        g = [
+            gaps[:, k] if part == 0 else path[:, k - part]
+            for k in range(N + 1)
+            for part in (0, 1)
+            if part <= k < N + part and (npath or part == 0)
         ]
+        places = np.arange(N)[:, None] * (nx + npath)
+        gap_at = places - npath + np.arange(nx)
+        gap_at[0] += npath
+        path_at = places + nx + nx + np.arange(npath)
+        path_at[-1] -= nx
+        self._next_g = np.empty(N * (nx + npath), dtype=np.intp)
+        for at in (gap_at, path_at):
+            self._next_g[at] = np.vstack([at[1:], at[-1:]])
+        stages = np.arange(W.numel()).reshape(N, -1)
+        self._next_v = np.vstack([stages[1:], stages[-1:]]).ravel()
+        lows, highs = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
+        lows[path_at], highs[path_at] = np.concatenate(low), np.concatenate(high)
+        unlimited, zero = np.full(nx, np.inf), np.zeros(ns)
+        self._bounds = {
+            "lbx": np.tile(np.concatenate([outputs.inputs.low, -unlimited, zero]), N),
+            "ubx": np.tile(np.concatenate([outputs.inputs.high, unlimited, np.full(ns, np.inf)]), N),
+            "lbg": lows,
+            "ubg": highs,
+        }
+        parameters = ca.vertcat(x0, ca.vec(r), ca.vec(u_r), ca.vec(M), ca.vec(L), m)
+        nlp = {"x": ca.vec(W), "p": parameters, "f": f, "g": ca.vertcat(*g)}
+        given: dict[str, Any] = {"expand": step_map.F.is_a("SXFunction"), "error_on_fail": False}
+        if solver == "fatrop":
+            given |= {
+                "N": N,
+                "nx": [0] + [nx] * N,
+                "nu": [nu] + [ns + nu] * (N - 1) + [ns],
+                "ng": [0] + [npath] * N,
+            }
+        self._solver = ca.nlpsol(
+            "shooting", solver, nlp, {"print_time": False, **_OPTIONS[solver], **given, **options}
+        )
+        self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
 
-    def _moved_on(self, values: Float[np.ndarray, " m"], sizes: list[int]) -> Float[np.ndarray, " m"]:
-        blocks = self._blocks(values, sizes)
-        return np.concatenate([np.vstack([block[1:], block[-1:]]).ravel() for block in blocks])
+    def at(self, X: Float[np.ndarray, "N nx"], U: Float[np.ndarray, "N nu"]) -> Start:
+        """Return a start with these states x_1 … x_N and inputs."""
+        W = np.zeros(self._shape)
+        W[:, : self._split[0]], W[:, self._split[0] : self._split[1]] = U, X
+        return Start(W.ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
 
-
-def flat(matrix: ca.DM) -> Float[np.ndarray, " m"]:
-    """Return the entries as an array."""
-    return np.asarray(matrix.full(), dtype=np.float64).ravel()
+    def solve(self, x0: Float[np.ndarray, " nx"], aim: Aim, start: Start) -> tuple[Horizon, Start]:
+        """Solve from `start`; return the solution, and the start that it leaves for the next step."""
+        goal = aim.goal
+        p = [x0, aim.R.ravel(), aim.U.ravel(), goal.M.ravel("F"), goal.L.ravel("F"), goal.m]
+        begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
+        found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
+        stats = self._solver.stats()
+        unified = str(stats.get("unified_return_status"))
+        status = _STATUS.get(str(stats["return_status"]), _STATUS.get(unified, Status.FAILED))
+        v = flat(found["x"])
+        if not np.isfinite(v).all():
+            status = Status.FAILED
+        U, X, slacks = np.split(v.reshape(self._shape), self._split, axis=1)
+        after = Start(v[self._next_v], flat(found["lam_x"])[self._next_v], flat(found["lam_g"])[self._next_g])
+        return Horizon(U, X, slacks, float(found["f"]), status, int(stats.get("iter_count", 0))), after
 
 
 def _weighted(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:

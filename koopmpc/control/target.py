@@ -1,66 +1,97 @@
 """Targets: the equilibrium (z_r, u_r) that holds a reference, or comes nearest to it inside the limits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.osqp import OSQP
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000}
+KEPT = 10_000  # coordinates remembered before the memory starts anew
 
 
 @dataclass(frozen=True)
 class Targets:
-    """All equilibria z = A z + B u as z = z₀ + Z α, u = u₀ + W α, and the map from a reference to its α.
+    """All equilibria z = A z + B u + e as z = z₀ + z_e e + Z α, u = u₀ + u_e e + W α, and a reference's α.
 
-    With a Constant observable its coordinate is 1 in z₀ and 0 in Z. α(r) minimises ‖C z − r‖²_Q; where u, or a
-    limited output G z, would leave its limits, it minimises the same inside them.
+    e is what disturbances push, zero by default. With a Constant observable its coordinate is 1 in z₀ and 0 in Z.
+    α(r, e) minimises ‖C z − r‖²_Q; where u, or a limited output G z, would leave its limits, it minimises the same
+    inside them: low ≤ rows α + from_push e ≤ high.
     """
 
     z0: Float[np.ndarray, " nz"]
     Z: Float[np.ndarray, "nz na"]
     u0: Float[np.ndarray, " nu"]
     W: Float[np.ndarray, "nu na"]
+    z_push: Float[np.ndarray, "nz nz"]
+    u_push: Float[np.ndarray, "nu nz"]
     from_reference: Float[np.ndarray, "na nr"]
     offset: Float[np.ndarray, " na"]
     rows: Float[np.ndarray, "nl na"]
+    rows_push: Float[np.ndarray, "nl nz"]
     low: Float[np.ndarray, " nl"]
     high: Float[np.ndarray, " nl"]
     hard: int
     weighted: Float[np.ndarray, "nr na"]
+    from_push: Float[np.ndarray, "na nz"]
+    _known: dict[bytes, Float[np.ndarray, " na"]] = field(default_factory=dict[bytes, Float[np.ndarray, " na"]])
+    _solvers: dict[int, QPSolver] = field(default_factory=dict[int, QPSolver])
 
-    def coordinates(self, R: Float[np.ndarray, "T nr"]) -> Float[np.ndarray, "T na"]:
-        """Return α for each row of references."""
+    def nearest(
+        self, R: Float[np.ndarray, "T nr"], e: Float[np.ndarray, " nz"] | None = None
+    ) -> Float[np.ndarray, "T na"]:
+        """Return α for each row of references as if there were no limits."""
         alpha = R @ self.from_reference.T + self.offset
+        return alpha if e is None else alpha + self.from_push @ e
+
+    def coordinates(
+        self, R: Float[np.ndarray, "T nr"], e: Float[np.ndarray, " nz"] | None = None
+    ) -> Float[np.ndarray, "T na"]:
+        """Return α for each row of references, inside the limits."""
+        alpha = self.nearest(R, e)
+        pushed = np.zeros(len(self.rows)) if e is None else self.rows_push @ e
         values = alpha @ self.rows.T
-        slack = 1e-9 * (1 + np.abs(values))
-        outside = ((values < self.low - slack) | (values > self.high + slack)).any(axis=1)
-        if outside.any():
-            known: dict[bytes, Float[np.ndarray, " na"]] = {}
-            for k in np.flatnonzero(outside):
-                key = R[k].tobytes()
-                if key not in known:
-                    known[key] = self._inside(alpha[k])
-                alpha[k] = known[key]
+        slack = margin(values)
+        low, high = self.low - pushed, self.high - pushed
+        outside = ((values < low - slack) | (values > high + slack)).any(axis=1)
+        for k in np.flatnonzero(outside):
+            key = R[k].tobytes() + (b"" if e is None else e.tobytes())
+            if key not in self._known:
+                if len(self._known) >= KEPT:
+                    self._known.clear()
+                self._known[key] = self._inside(alpha[k], low, high)
+            alpha[k] = self._known[key]
         return alpha
 
-    def _inside(self, alpha: Float[np.ndarray, " na"]) -> Float[np.ndarray, " na"]:
+    def _inside(
+        self, alpha: Float[np.ndarray, " na"], low: Float[np.ndarray, " nl"], high: Float[np.ndarray, " nl"]
+    ) -> Float[np.ndarray, " na"]:
         """Return the nearest α inside all limits, or inside the input limits where there is none."""
-        # H of trace 1: the tolerance is relative to the weight, and cost in other units has the same target
-        H = self.weighted.T @ self.weighted
-        H = H / max(float(np.trace(H)), 1e-300) + 1e-9 * np.eye(len(H))
-        q = -H @ alpha
+        moved = self.rows @ alpha
         for count in (len(self.rows), self.hard):
-            qp = QP(H, q, self.rows[:count], self.low[:count], self.high[:count])
-            solution = OSQP(qp, PRECISE).solve(np.zeros(len(alpha)), np.zeros(count))
+            solver = self._solver(count)
+            solver.reset()
+            solver.update(low[:count] - moved[:count], high[:count] - moved[:count])
+            solution = solver.solve(np.zeros(len(alpha)), np.zeros(count))
             if solution.status is Status.OPTIMAL:
-                return solution.v
+                return alpha + solution.v
         return np.zeros_like(alpha)
+
+    def _solver(self, count: int) -> QPSolver:
+        """Return the solver of ‖weighted β‖² → min within limits on the first `count` rows of β."""
+        if count not in self._solvers:
+            # H of trace 1: the tolerance is relative to the weight, and cost in other units has the same target
+            H = self.weighted.T @ self.weighted
+            H = H / max(float(np.trace(H)), 1e-300) + 1e-9 * np.eye(len(H))
+            free = np.full(count, np.inf)
+            qp = QP(H, np.zeros(len(H)), self.rows[:count], -free, free)
+            self._solvers[count] = OSQP(qp, PRECISE)
+        return self._solvers[count]
 
 
 def targets(
@@ -86,38 +117,49 @@ def targets(
     """
     nz, nu = B.shape
     E = np.hstack([A - np.eye(nz), B])
-    if constant is not None:
-        E = np.delete(E, constant, axis=0)  # 1 = 1, whatever a fit has made of it
+    push = np.eye(nz)
+    if constant is not None:  # 1 = 1, whatever a fit has made of it
+        E, push = np.delete(E, constant, axis=0), np.delete(push, constant, axis=0)
     free = np.array([i for i in range(nz + nu) if i != constant])
     pinned = np.zeros(nz) if constant is None else -E[:, constant]
     left, sigma, right = np.linalg.svd(E[:, free])
     rank = int((sigma > TOLERANCE * max(float(sigma[0]), 1e-300)).sum())
-    base, span = np.zeros(nz + nu), np.zeros((nz + nu, len(free) - rank))
-    base[free] = right[:rank].T @ ((left[:, :rank].T @ pinned) / sigma[:rank])
-    span[free] = right[rank:].T
+    inverse = right[:rank].T @ (left[:, :rank].T / sigma[:rank, None])
+    base, span, pushed = np.zeros(nz + nu), np.zeros((nz + nu, len(free) - rank)), np.zeros((nz + nu, nz))
+    base[free], span[free], pushed[free] = inverse @ pinned, right[rank:].T, -inverse @ push
     if constant is not None:
         base[constant] = 1.0
     z0, u0, Z, W = base[:nz], base[nz:], span[:nz], span[nz:]
-    root = _root(Q)
-    weighted = root @ C @ Z
-    inverse = np.linalg.pinv(weighted, rcond=TOLERANCE)
+    S = root(Q)
+    weighted = S @ C @ Z
+    back = np.linalg.pinv(weighted, rcond=TOLERANCE) @ S
     rows, values = np.vstack([W, G @ Z]), np.concatenate([u0, G @ z0])
+    rows_push = np.vstack([pushed[nz:], G @ pushed[:nz]])
     return Targets(
         z0=z0,
         Z=Z,
         u0=u0 * float(hold),
         W=W * float(hold),
-        from_reference=inverse @ root,
-        offset=-inverse @ root @ C @ z0,
+        z_push=pushed[:nz],
+        u_push=pushed[nz:] * float(hold),
+        from_reference=back,
+        offset=-back @ C @ z0,
         rows=rows,
+        rows_push=rows_push,
         low=np.concatenate([inputs.low, outputs.low]) - values,
         high=np.concatenate([inputs.high, outputs.high]) - values,
         hard=nu,
         weighted=weighted,
+        from_push=-back @ C @ pushed[:nz],
     )
 
 
-def _root(Q: Float[np.ndarray, "nr nr"]) -> Float[np.ndarray, "nr nr"]:
+def margin(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return by how much a target may stand outside its limits before it is moved: rounding."""
+    return 1e-9 * (1 + np.abs(values))
+
+
+def root(Q: Float[np.ndarray, "nr nr"]) -> Float[np.ndarray, "nr nr"]:
     """Return a matrix S with SᵀS = Q."""
     values, vectors = np.linalg.eigh(Q)
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
