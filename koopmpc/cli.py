@@ -27,6 +27,9 @@ app = typer.Typer(
 _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
 Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
 Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
+Faults = Annotated[
+    bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")
+]
 Controllers = Annotated[
     list[str] | None,
     typer.Option("--controller", "-c", help="One of the five; may be repeated. Default: all."),
@@ -51,6 +54,7 @@ def list_() -> None:
 def run(
     problem: Annotated[str, typer.Argument(help=_PROBLEM)],
     controller: Controllers = None,
+    faults: Faults = False,
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
@@ -59,7 +63,7 @@ def run(
 
     with _friendly():
         loaded = load_problem(problem)
-        _sweep([loaded], controller, live, logs, loaded.name)
+        _sweep([loaded], controller, faults, live, logs, loaded.name)
 
 
 @app.command()
@@ -68,6 +72,7 @@ def bench(
         list[str] | None, typer.Argument(help=_PROBLEM + " Default: all shipped problems.")
     ] = None,
     controller: Controllers = None,
+    faults: Faults = False,
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
@@ -75,7 +80,7 @@ def bench(
     from koopmpc.bench.library import load_problem, shipped
 
     with _friendly():
-        _sweep([load_problem(p) for p in problems or shipped()], controller, live, logs, "bench")
+        _sweep([load_problem(p) for p in problems or shipped()], controller, faults, live, logs, "bench")
 
 
 @app.command()
@@ -91,7 +96,7 @@ def inspect(log: Annotated[Path, typer.Argument(help="A .rrd that koopmpc wrote.
         out.print(
             " ".join(
                 str(loaded.metadata[key])
-                for key in ("problem", "case", "controller")
+                for key in ("problem", "case", "controller", "fault")
                 if key in loaded.metadata
             )
         )
@@ -108,7 +113,12 @@ def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrot
 
 
 def _sweep(
-    problems: Sequence["Problem"], controllers: list[str] | None, live: bool, logs: Path, what: str
+    problems: Sequence["Problem"],
+    controllers: list[str] | None,
+    faults: bool,
+    live: bool,
+    logs: Path,
+    what: str,
 ) -> None:
     """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -126,6 +136,7 @@ def _sweep(
             problems,
             controllers,
             folder=folder,
+            faults=faults,
             live=live,
             progress=lambda what, done, total: bar.update(
                 task, description=what, completed=done, total=total
@@ -138,7 +149,7 @@ def _sweep(
     if logged:
         shown = next((row for row in logged if row.controller == "koopman-mpc"), logged[0])
         out.print(Text(f"look at a run: koopmpc view {shown.log}"), soft_wrap=True)
-    if any(row.fault is not None for row in rows):
+    if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
 
 

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from koopmpc.bench.controllers import CONTROLLERS
+from koopmpc.bench.faults import FAULTS
 from koopmpc.cli import app
 from koopmpc.loop.metrics import metrics
 from koopmpc.recording.reader import load_run
@@ -67,6 +68,18 @@ def test_bench_takes_several_problems(call, tmp_path):
     (folder,) = folders(tmp_path)
     assert folder.name.endswith("-bench")
     assert {path.stem for path in folder.glob("*.rrd")} == {"one-far-lqr", "two-far-lqr"}
+
+
+def test_faults_add_a_table_and_a_log_each_and_exit_with_zero(call, tmp_path):
+    for command in ("run", "bench"):
+        result = call(command, f"{write(tmp_path)}:far", "-c", "lqr", "--faults")
+        assert result.exit_code == 0, result.output
+        assert "tiny:far under faults" in result.stdout
+        assert all(fault in result.stdout for fault in FAULTS)
+    for folder in folders(tmp_path):
+        assert len(list(folder.glob("*.rrd"))) == 1 + len(FAULTS)
+        log = folder / "tiny-far-lqr-nan-sensor.rrd"
+        assert "tiny far lqr nan-sensor" in call("inspect", log).stdout
 
 
 def test_a_run_that_raises_exits_with_one_and_the_others_are_there(call, tmp_path, monkeypatch):

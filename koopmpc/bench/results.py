@@ -28,8 +28,10 @@ class Row:
         What the data and the fit of its model took [s]; 0 for controllers that learn nothing.
     log
         Where its log is; None where there is none.
+    failure
+        Why it did not end as it should; None where it did. Poor control is no failure.
     fault
-        Why it did not end as it should; None where it did. Poor control is no fault.
+        Name of what was broken on purpose; None where nothing was.
     """
 
     problem: str
@@ -39,10 +41,11 @@ class Row:
     reached: bool = False
     training_time: float = 0.0
     log: Path | None = None
+    failure: str | None = None
     fault: str | None = None
 
 
-def faults(run: Run, steps: int) -> list[str]:
+def failures(run: Run, steps: int) -> list[str]:
     """Return why a run did not end as it should: steps missing, u not finite or beyond a limit, no status."""
     found: list[str] = []
     if run.steps != steps:

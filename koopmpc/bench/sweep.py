@@ -4,17 +4,19 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from koopmpc.bench.controllers import CONTROLLERS, chosen
+from koopmpc.bench.faults import FAULTS, possible
 from koopmpc.bench.parquet import write_results
 from koopmpc.bench.prepare import Prepared
 from koopmpc.bench.problem import Case, Problem
-from koopmpc.bench.results import Row, faults, reached
+from koopmpc.bench.results import Row, failures, reached
 from koopmpc.control.move import Controller
 from koopmpc.errors import ProblemError
+from koopmpc.loop.injection import Fault, named
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Observer, simulate
@@ -25,11 +27,20 @@ from koopmpc.recording.recorder import Recorder, record
 Progress = Callable[[str, int, int], None]
 
 
+class _Task(NamedTuple):
+    """One run: a case, a controller, and what is broken."""
+
+    case: str
+    controller: str
+    fault: str | None
+
+
 def sweep(
     problems: Iterable[Problem],
     controllers: Sequence[str] | None = None,
     *,
     folder: str | Path,
+    faults: bool = False,
     live: bool = False,
     progress: Progress | None = None,
 ) -> list[Row]:
@@ -43,6 +54,8 @@ def sweep(
         Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, nonlinear-mpc; by default all.
     folder
         Made if need be; holds one <problem>-<case>-<controller>.rrd a run, and results.parquet.
+    faults
+        Run each case again under each fault of `koopmpc.bench.faults`; <controller>-<fault>.rrd are their logs.
     live
         Stream each run, while it runs, to the viewer that is up, or that is opened. Without one: one UserWarning.
     progress
@@ -51,7 +64,7 @@ def sweep(
     Returns
     -------
     rows
-        One a run. An exception ends that run alone and is its row's `fault`.
+        One a run. An exception ends that run alone and is its row's `failure`.
 
     Raises
     ------
@@ -73,50 +86,59 @@ def sweep(
             UserWarning,
             stacklevel=2,
         )
-    total = len(cases) * len(names)
+    tasks = [
+        (problem, _Task(case, name, fault))
+        for problem in problems
+        for case in problem.cases
+        for fault in (None, *(possible(problem.limits_of(case)) if faults else ()))
+        for name in names
+    ]
     rows: list[Row] = []
-    for problem in problems:
-        parts = Prepared(problem)
-        for case in problem.cases:
-            for name in names:
-                if progress is not None:
-                    progress(f"{problem.name}:{case} {name}", len(rows), total)
-                rows.append(_row(parts, case, name, folder, live))
+    parts: Prepared | None = None
+    for problem, task in tasks:
+        if parts is None or parts.problem is not problem:
+            parts = Prepared(problem)
+        if progress is not None:
+            progress(f"{problem.name}:{' '.join(filter(None, task))}", len(rows), len(tasks))
+        rows.append(_row(parts, task, folder, live))
     if progress is not None:
-        progress("done", total, total)
+        progress("done", len(tasks), len(tasks))
     write_results(rows, folder / "results.parquet")
     return rows
 
 
-def _row(parts: Prepared, case: str, name: str, folder: Path, live: bool) -> Row:
-    """Run, log, read back and judge; whatever is raised on the way becomes the row's fault."""
-    problem = parts.problem.name
-    log = folder / f"{problem}-{case}-{name}.rrd"
+def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> Row:
+    """Run, log, read back and judge; whatever is raised on the way becomes the row's failure."""
+    problem, (case, name, fault) = parts.problem.name, task
+    log = folder / ("-".join((problem, *filter(None, task))) + ".rrd")
     try:
-        run = _run(parts, case, name, log, live)
-        found = faults(run, parts.problem.cases[case].steps)
+        run = _run(parts, task, log, live)
+        found = failures(run, parts.problem.cases[case].steps)
         if load_run(log) != run:
             found.append(f"{log.name} does not read back equal to the run")
         training = parts.training_time if name.startswith("koopman") else 0.0
-        return Row(problem, case, name, metrics(run), reached(run), training, log, "; ".join(found) or None)
+        failure = "; ".join(found) or None
+        return Row(problem, case, name, metrics(run), reached(run), training, log, failure, fault)
     except Exception as error:  # one run must not take the others with it; the exit code says so
         trace = log.with_suffix(".txt")
         trace.write_text(traceback.format_exc())
-        fault = f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
-        return Row(problem, case, name, log=log if log.exists() else None, fault=fault)
+        failure = f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
+        kept = log if log.exists() else None
+        return Row(problem, case, name, log=kept, failure=failure, fault=fault)
 
 
-def _run(parts: Prepared, case_name: str, name: str, log: Path, live: bool) -> Run:
+def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
     """Return the run of one controller on one case, written to `log`."""
-    problem, case = parts.problem, parts.problem.cases[case_name]
-    limits = problem.limits_of(case_name)
-    controller = CONTROLLERS[name](parts, limits)
+    problem, case = parts.problem, parts.problem.cases[task.case]
+    limits = problem.limits_of(task.case)
+    controller = CONTROLLERS[task.controller](parts, limits)
+    injected = () if task.fault is None else (FAULTS[task.fault],)
     _warm_up(controller, parts, case)
     about: dict[str, Any] = {
         "cost": problem.cost,
         "limits": limits,
         "angles": tuple(problem.angles),
-        "metadata": _metadata(problem, case_name, name),
+        "metadata": _metadata(problem, task, injected),
     }
     drawn: dict[str, Any] = {"scene": problem.scene, "model": getattr(controller, "predictor", None)}
 
@@ -127,6 +149,7 @@ def _run(parts: Prepared, case_name: str, name: str, log: Path, live: bool) -> R
             x0=case.x0,
             reference=case.reference,
             steps=case.steps,
+            faults=injected,
             observers=observers,
             plans=True,
             **about,
@@ -159,14 +182,15 @@ def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
     controller.reset(case.x0)
 
 
-def _metadata(problem: Problem, case: str, name: str) -> dict[str, Any]:
+def _metadata(problem: Problem, task: _Task, injected: Sequence[Fault]) -> dict[str, Any]:
     training = problem.training
-    return {
+    known: dict[str, Any] = {
         "problem": problem.name,
         "title": problem.title,
-        "case": case,
-        "controller": name,
+        "case": task.case,
+        "controller": task.controller,
         "horizon": problem.horizon,
         "ridge": problem.ridge,
         "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed},
     }
+    return known | ({"fault": task.fault, "faults": named(injected)} if injected else {})

@@ -10,6 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from koopmpc.bench.fault_table import FAULT_LEGEND, under_faults
 from koopmpc.bench.results import Row
 from koopmpc.loop.metrics import Metrics
 
@@ -37,15 +38,21 @@ LEGEND = (
 
 
 def table(rows: Sequence[Row]) -> RenderableType:
-    """Return one table for each case, the faults in full, and what the columns mean; 100 columns are enough."""
+    """Return one table for each case, the failures in full, and what the columns mean; 100 columns are enough."""
     parts: list[RenderableType] = []
     for (problem, case), group in groupby(rows, key=lambda row: (row.problem, row.case)):
-        parts.append(_case(f"{problem}:{case}", list(group)))
-    raised = [
-        f"{row.problem}:{row.case} {row.controller}: {row.fault}" for row in rows if row.fault is not None
-    ]
-    parts.extend(Text(line, style="red") for line in raised)
-    return Group(*parts, Text(LEGEND, style="dim"))
+        ran = list(group)
+        parts.append(_case(f"{problem}:{case}", [row for row in ran if row.fault is None]))
+        if any(row.fault is not None for row in ran):
+            parts.append(under_faults(f"{problem}:{case} under faults", ran))
+    for row in rows:
+        if row.failure is not None:
+            what = " ".join(filter(None, (f"{row.problem}:{row.case}", row.controller, row.fault)))
+            parts.append(Text(f"{what}: {row.failure}", style="red"))
+    parts.append(Text(LEGEND, style="dim"))
+    if any(row.fault is not None for row in rows):
+        parts.append(Text(FAULT_LEGEND, style="dim"))
+    return Group(*parts)
 
 
 def figures(metrics: Metrics) -> RenderableType:
@@ -82,7 +89,7 @@ def _case(title: str, rows: list[Row]) -> Table:
             lines.add_row(row.controller, "raised", style="red")
         else:
             cells = _cells(row, row.metrics, oracle, violated)
-            lines.add_row(row.controller, *cells, style="red" if row.fault else None)
+            lines.add_row(row.controller, *cells, style="red" if row.failure else None)
     learned = max((row.training_time for row in rows), default=0.0)
     if learned:
         lines.caption = f"Koopman model learned from data in {duration(learned)}"

@@ -122,6 +122,8 @@ class NonlinearMPC:
         begin = self._first(x0) if self._warm is None else [self._warm]
         solved = [self._shooting.solve(x0, aim, each) for each in begin]
         iterations = sum(horizon.iterations for horizon, _ in solved)
+        if self.solver_fails:
+            return self._fail(applied, Status.FAILED, iterations, start)
         good = [each for each in solved if each[0].status is Status.OPTIMAL]
         if not good:
             return self._fail(applied, solved[0][0].status, iterations, start)

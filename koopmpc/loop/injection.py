@@ -93,6 +93,11 @@ class Injections(Injection):
         return any(luck)
 
 
+def named(faults: Sequence[Fault]) -> list[str]:
+    """Return the faults as a run's metadata name them."""
+    return [str(fault) for fault in faults]
+
+
 def call(
     controller: Controller,
     y: ArrayLike,

@@ -13,7 +13,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Move, Plan
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.loop.injection import Fault, Injections, Wiring, call
+from koopmpc.loop.injection import Fault, Injections, Wiring, call, named
 from koopmpc.loop.run import Plans, Run
 from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import StepMap
@@ -127,7 +127,7 @@ def simulate(
     if faults:
         box = (limits or Limits()).inputs(nu)
         injected = Injections(faults, Wiring(ny, box), rng)
-        metadata = {**(metadata or {}), "faults": [str(fault) for fault in faults]}
+        metadata = {**(metadata or {}), "faults": named(faults)}
 
     X, Y, U = np.full((steps + 1, nx), np.nan), np.empty((steps + 1, ny)), np.empty((steps, nu))
     moves: list[Move] = []

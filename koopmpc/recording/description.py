@@ -56,8 +56,8 @@ class About(Value):
 
     @property
     def title(self) -> str:
-        """Problem, case and controller, as far as they are known."""
-        parts = [self.metadata.get(key) for key in ("problem", "case", "controller")]
+        """Problem, case, controller and fault, as far as they are known."""
+        parts = [self.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
         return " · ".join(str(p) for p in parts if p is not None) or "run"
 
     def tracked(self, nr: int) -> tuple[str, ...]:

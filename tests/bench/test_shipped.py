@@ -17,7 +17,7 @@ def rows(tmp_path_factory):
 
 
 def test_every_run_ends_as_it_should(rows):
-    assert {key: row.fault for key, row in rows.items() if row.fault} == {}
+    assert {key: row.failure for key, row in rows.items() if row.failure} == {}
     assert len(rows) == 12
 
 
@@ -41,4 +41,4 @@ def test_limits_keep_lqr_from_the_recovery_that_koopman_mpc_manages(rows):
 @pytest.mark.slow
 def test_all_five_controllers_end_as_they_should_on_all_cases(tmp_path):
     swept = sweep([load_problem(path) for path in shipped()], folder=tmp_path)
-    assert [row.fault for row in swept] == [None] * 20
+    assert [row.failure for row in swept] == [None] * 20

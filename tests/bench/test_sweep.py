@@ -7,10 +7,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from koopmpc.bench.controllers import CONTROLLERS, chosen
+from koopmpc.bench.faults import FAULTS, possible
 from koopmpc.bench.library import load_problem
 from koopmpc.bench.prepare import Prepared
-from koopmpc.bench.results import faults, reached
+from koopmpc.bench.results import failures, reached
 from koopmpc.bench.sweep import sweep
+from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.errors import ProblemError
 from koopmpc.loop.metrics import metrics
@@ -39,13 +41,13 @@ def test_every_controller_meets_every_case_once(swept):
     assert {total for *_, total in told} == {10}
 
 
-def test_all_end_as_they_should_and_the_short_case_is_no_fault(swept):
+def test_all_end_as_they_should_and_the_short_case_is_no_failure(swept):
     _, rows, _, _ = swept
-    assert [row.fault for row in rows] == [None] * 10
+    assert [row.failure for row in rows] == [None] * 10
     assert all(row.reached for row in rows if row.case == "near")
     assert not any(
         row.reached for row in rows if row.case == "far"
-    )  # 6 steps are too few: a result, not a fault
+    )  # 6 steps are too few: a result, not a failure
 
 
 def test_figures_are_those_of_the_log_alone(swept):
@@ -114,9 +116,9 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
 
     monkeypatch.setitem(CONTROLLERS, "koopman-lqr", broken)
     rows = sweep([swept[0].select("far")], folder=tmp_path)
-    assert [row.controller for row in rows if row.fault] == ["koopman-lqr"]
-    (row,) = (row for row in rows if row.fault)
-    assert row.fault.startswith("RuntimeError: no such gain (the whole traceback is in")
+    assert [row.controller for row in rows if row.failure] == ["koopman-lqr"]
+    (row,) = (row for row in rows if row.failure)
+    assert row.failure.startswith("RuntimeError: no such gain (the whole traceback is in")
     assert row.metrics is None
     assert row.log is None
     assert "in broken" in (tmp_path / "tiny-far-koopman-lqr.txt").read_text()
@@ -126,7 +128,7 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
 def test_a_model_that_cannot_be_learned_takes_only_its_own_controllers(tmp_path):
     broken = write(tmp_path, **{"km.Noise(-2.0, 2.0)": "lambda k, y, rng: [float('nan')]"})
     rows = sweep([load_problem(f"{broken}:far")], folder=tmp_path)
-    assert [row.controller for row in rows if row.fault] == ["koopman-lqr", "koopman-mpc"]
+    assert [row.controller for row in rows if row.failure] == ["koopman-lqr", "koopman-mpc"]
 
 
 class Cheat:
@@ -144,23 +146,23 @@ class Cheat:
         return Move(np.array([self.u]), Status.OPTIMAL, Fallback.NONE, 0.0, 0)
 
 
-def test_an_input_beyond_its_limit_is_a_fault(swept, tmp_path, monkeypatch):
+def test_an_input_beyond_its_limit_is_a_failure(swept, tmp_path, monkeypatch):
     monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, 1.5))
     (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
-    assert row.fault == "u = [1.5] at step 0 is 0.5 beyond a hard limit"
+    assert row.failure == "u = [1.5] at step 0 is 0.5 beyond a hard limit"
     assert row.metrics is not None
 
 
-def test_an_input_that_is_not_finite_is_a_fault(swept, tmp_path, monkeypatch):
+def test_an_input_that_is_not_finite_is_a_failure(swept, tmp_path, monkeypatch):
     monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, np.nan))
     (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
-    assert "every input must be finite" in row.fault
+    assert "every input must be finite" in row.failure
 
 
-def test_a_log_that_differs_is_a_fault(swept, tmp_path, monkeypatch):
+def test_a_log_that_differs_is_a_failure(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.load_run", lambda path: None)
     (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
-    assert row.fault == "tiny-far-lqr.rrd does not read back equal to the run"
+    assert row.failure == "tiny-far-lqr.rrd does not read back equal to the run"
 
 
 class Unseen(Recorder):
@@ -176,7 +178,7 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
     (row,) = sweep([problem.select("far")], ["koopman-mpc"], folder=tmp_path, live=True)
-    assert row.fault is None
+    assert row.failure is None
     live = load_run(row.log)
     kept = load_run(next(r.log for r in rows if (r.case, r.controller) == ("far", "koopman-mpc")))
     assert np.array_equal(live.U, kept.U)
@@ -189,15 +191,15 @@ def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):
     with pytest.warns(UserWarning, match="no Rerun viewer is up") as caught:
         rows = sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, live=True)
     assert len(caught) == 1
-    assert [row.fault for row in rows] == [None, None]
+    assert [row.failure for row in rows] == [None, None]
 
 
-def test_missing_steps_and_statuses_are_faults(swept):
+def test_missing_steps_and_statuses_are_failures(swept):
     run = load_run(next(row.log for row in swept[1] if row.case == "far"))
-    assert faults(run, 6) == []
-    assert faults(run, 7) == ["it took 6 of 7 steps"]
-    assert faults(replace(run, status=run.status[:-1]), 6) == ["5 of 6 steps have a status"]
-    assert faults(replace(run, U=np.full_like(run.U, np.inf)), 6) == ["u is [inf] at step 0"]
+    assert failures(run, 6) == []
+    assert failures(run, 7) == ["it took 6 of 7 steps"]
+    assert failures(replace(run, status=run.status[:-1]), 6) == ["5 of 6 steps have a status"]
+    assert failures(replace(run, U=np.full_like(run.U, np.inf)), 6) == ["u is [inf] at step 0"]
 
 
 def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
@@ -226,4 +228,71 @@ def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path
         sweep(both, folder=tmp_path / "none")
     assert not (tmp_path / "none").exists()
     rows = sweep([swept[0].select("near"), swept[0].select("far")], ["lqr"], folder=tmp_path)
-    assert [row.fault for row in rows] == [None, None]
+    assert [row.failure for row in rows] == [None, None]
+
+
+@pytest.fixture(scope="module")
+def faulty(swept, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faulty")
+    return sweep([swept[0]], folder=folder, faults=True), folder
+
+
+def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(faulty):
+    rows, folder = faulty
+    assert [(r.case, r.fault, r.controller) for r in rows] == [
+        (case, fault, name) for case in ("near", "far") for fault in (None, *FAULTS) for name in FIVE
+    ]
+    assert [row.failure for row in rows] == [None] * len(rows)
+    assert len({row.log for row in rows}) == len(rows)
+    stored = pq.read_table(folder / "results.parquet").to_pylist()
+    assert [(line["fault"], line["failure"]) for line in stored] == [(row.fault, None) for row in rows]
+
+
+def test_a_fault_is_named_in_its_log_and_in_no_other(faulty):
+    for row in faulty[0]:
+        metadata = load_run(row.log).metadata
+        if row.fault is None:
+            assert not metadata.keys() & {"fault", "faults"}
+        else:
+            assert metadata["fault"] == row.fault
+            assert metadata["faults"] == (str(FAULTS[row.fault]),)
+            assert row.log.name == f"tiny-{row.case}-{row.controller}-{row.fault}.rrd"
+
+
+def test_rows_without_a_fault_are_those_of_a_sweep_without_faults(swept, faulty):
+    bare = [row for row in faulty[0] if row.fault is None]
+    for row, other in zip(bare, swept[1], strict=True):
+        assert np.array_equal(load_run(row.log).U, load_run(other.log).U)
+
+
+def test_all_controllers_meet_the_same_faults(faulty):
+    hidden, lost = [], []
+    for row in faulty[0]:
+        run = load_run(row.log)
+        if row.fault == "nan-sensor" and row.case == "near":
+            hidden.append(np.isnan(run.Y))
+        if row.fault == "actuator-loss":
+            lost.append(np.abs(run.U).max() / (2.0 if row.case == "near" else 1.0))
+    assert hidden[0].any()
+    assert all(np.array_equal(hidden[0], mask) for mask in hidden)
+    assert max(lost) <= 0.5
+
+
+def test_a_live_faulty_run_leaves_the_same_log(swept, faulty, tmp_path, monkeypatch):
+    monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
+    monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
+    rows = sweep([swept[0].select("far")], ["koopman-mpc"], folder=tmp_path, live=True, faults=True)
+    assert [row.failure for row in rows] == [None] * (1 + len(FAULTS))
+    for row in rows:
+        same = (row.case, row.controller, row.fault)
+        kept = next(r for r in faulty[0] if (r.case, r.controller, r.fault) == same)
+        assert np.array_equal(load_run(row.log).U, load_run(kept.log).U)
+
+
+def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path):
+    free = replace(swept[0].select("near"), limits=Limits(x_max=5.0))
+    rows = sweep([free], ["lqr"], folder=tmp_path, faults=True)
+    assert [row.fault for row in rows] == [None, *(name for name in FAULTS if name != "actuator-loss")]
+    assert not any(row.failure for row in rows)
+    assert possible(Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
+    assert "actuator-loss" not in possible(Limits(u_min=-np.inf))

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from koopmpc.bench.controllers import CONTROLLERS
+from koopmpc.bench.faults import FAULTS
 from koopmpc.bench.results import Row
 from koopmpc.bench.table import duration, figures, table
 from koopmpc.loop.metrics import Metrics
@@ -42,7 +44,7 @@ def rows():
         Row("plant", "case", "linear-mpc", replace(GOOD, settling_time=np.inf), reached=True),
         Row("plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31),
         Row("plant", "case", "nonlinear-mpc", GOOD, reached=True),
-        Row("plant", "other", "lqr", fault="RuntimeError: the [gain] is lost"),
+        Row("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
     ]
 
 
@@ -61,7 +63,7 @@ def test_each_row_says_how_it_went():
     assert "4.2 ms" in line["nonlinear-mpc"]
 
 
-def test_one_table_a_case_with_training_time_and_faults_in_full():
+def test_one_table_a_case_with_training_time_and_failures_in_full():
     text = printed(table(rows()))
     assert text.index("plant:case") < text.index("plant:other")
     assert "learned from data in 310 ms" in text
@@ -100,3 +102,54 @@ def test_a_duration_is_right_to_its_digits(seconds):
     number, unit = duration(seconds).split()
     size = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}[unit]
     assert float(number) * size == pytest.approx(seconds, rel=6e-3)
+
+
+def faulty_rows():
+    lost = replace(GOOD, cost=5e6, fallback={"NONE": 150, "HOLD": 50})
+    return [
+        *rows()[1:4],
+        Row("plant", "case", "linear-mpc", lost, fault="nan-sensor"),
+        Row("plant", "case", "koopman-mpc", replace(GOOD, cost=121.705), reached=True, fault="nan-sensor"),
+        Row("plant", "case", "nonlinear-mpc", fault="nan-sensor", failure="RuntimeError: no [luck]"),
+        Row("plant", "case", "linear-mpc", replace(GOOD, cost=60250.0), reached=True, fault="delay"),
+        Row("plant", "case", "koopman-mpc", GOOD, reached=True, fault="delay"),
+        Row("plant", "case", "nonlinear-mpc", GOOD, reached=True, fault="delay"),
+    ]
+
+
+def test_faults_are_a_line_each_under_the_table_of_their_case():
+    text = printed(table(faulty_rows()))
+    assert text.index("plant:case ") < text.index("plant:case under faults")
+    line = {
+        name: next(t for t in text.split("\n") if t.strip().startswith(name)) for name in ("nan-", "delay")
+    }
+    assert line["nan-"].split() == ["nan-sensor", "lost", "(50)", "1.010", "(2)", "raised"]
+    assert line["delay"].split() == ["delay", "5e+02", "(2)", "1.000", "(2)", "1.000", "(2)"]
+    assert "plant:case nonlinear-mpc nan-sensor: RuntimeError: no [luck]" in text
+    assert "multiple of its own without the fault" in text
+    assert max(len(t) for t in text.split("\n")) <= 100
+    assert "…" not in text
+
+
+def test_who_does_not_reach_without_a_fault_is_not_lost_to_it():
+    own = [row for row in faulty_rows() if row.controller == "linear-mpc"]
+    text = printed(table([replace(own[0], reached=False), *own[1:]]))
+    assert "lost" not in text.split("cost:")[0]
+    assert "– (50)" in text
+
+
+def test_no_faults_no_table_of_faults():
+    assert "faults" not in printed(table(rows()))
+
+
+def test_the_five_controllers_under_every_fault_fit_a_hundred_columns():
+    worst = replace(GOOD, cost=1e9, fallback={"HOLD": 12345})
+    ran = [
+        Row("plant", "case", name, metrics, reached=True, fault=fault)
+        for fault, metrics in [(None, GOOD), *((fault, worst) for fault in FAULTS)]
+        for name in CONTROLLERS
+    ]
+    text = printed(table(ran))
+    assert "…" not in text
+    assert max(len(line) for line in text.split("\n")) <= 100
+    assert text.count("8e+06 (12345)") == len(FAULTS) * len(CONTROLLERS)
