@@ -16,9 +16,10 @@ from koopmpc.values import Value
 
 @dataclass(frozen=True, eq=False)
 class Cost(Value):
-    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} ‖u_k − u_r‖²_R + terminal weight.
+    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + ‖u_k − u_{k−1}‖²_{R_delta}) + terminal weight.
 
-    The terminal term is ‖z_N − z_r‖²_{Q_N}, or ‖x_N − r_N‖²_{Q_N} for an (nx, nx) weight.
+    The terminal term is ‖z_N − z_r‖²_{Q_N}, or ‖x_N − r_N‖²_{Q_N} for an (nx, nx) weight. By default Q_N is the P
+    of the infinite horizon; with R_delta that P weighs [z_N − z_r; u_{N−1} − u_r], for u_N has its price too.
 
     Parameters
     ----------
@@ -29,9 +30,12 @@ class Cost(Value):
     Q_N
         Terminal weight, (nx, nx) or (nz, nz). None takes the limit of the Riccati difference equation.
     of
-        The tracked outputs as observables of the state; the references have as many columns.
+        The tracked outputs as observables of the state; the references have as many columns. A controller on a
+        lifted predictor finds them in its own lifting by name: any lifted coordinates may be tracked.
     u_target
         "equilibrium": u_r holds the reference, found for each reference inside the limits; "zero": u_r = 0.
+    R_delta
+        Weight of the changes of the inputs from step to step, ⪰ 0; a scalar or a vector is a diagonal.
 
     Raises
     ------
@@ -44,9 +48,10 @@ class Cost(Value):
     Q_N: ArrayLike | None = None
     of: Lifting = field(default_factory=State)
     u_target: Literal["equilibrium", "zero"] = "equilibrium"
+    R_delta: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        for name in ("Q", "R", "Q_N"):
+        for name in ("Q", "R", "Q_N", "R_delta"):
             value = getattr(self, name)
             if value is not None:
                 stored = checks.array(value, name)
@@ -58,3 +63,10 @@ class Cost(Value):
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
         """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
         return checks.weight(self.Q, "Q", nr), checks.weight(self.R, "R", nu)
+
+    def rate(self, nu: int) -> Float[np.ndarray, "nu nu"] | None:
+        """Return R_delta (nu, nu), None where the changes of the inputs cost nothing."""
+        if self.R_delta is None:
+            return None
+        R_delta = checks.weight(self.R_delta, "R_delta", nu)
+        return R_delta if R_delta.any() else None

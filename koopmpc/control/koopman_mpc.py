@@ -1,6 +1,6 @@
 """KoopmanMPC: the Riccati solution first, a QP only where a limit is active."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import Any, Literal
 
@@ -9,29 +9,32 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.condense import Stage, condense
+from koopmpc.control.condense import Coordinates
 from koopmpc.control.cost import Cost
-from koopmpc.control.fallback import PlanMemory
-from koopmpc.control.lifted import HUGE, Tracking, buffered, reference_rows, tracking
-from koopmpc.control.limits import Limits, softened
+from koopmpc.control.fallback import PlanMemory, admitted
+from koopmpc.control.horizon import blocked
+from koopmpc.control.lifted import HUGE, buffered, reference_rows
+from koopmpc.control.limits import Box, Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
-from koopmpc.control.program import program
-from koopmpc.control.riccati import recursion, stationary
+from koopmpc.control.plan_map import PlanMap
+from koopmpc.control.solvers.base import QPSolution
 from koopmpc.control.solvers.osqp import OSQP
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.state import State
 from koopmpc.plant.step_map import StepMap
 from koopmpc.predict.linear import LinearPredictor
 
+_VIEWS = ("_z", "_u_prev", "_W", "_d", "_drive", "_met", "_met_low", "_met_high")
+
 
 class KoopmanMPC:
-    """Minimise the Cost over N steps of z⁺ = A z + B u, z_0 = ψ(x), within the Limits.
+    """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
 
-    The backward Riccati recursion gives the unconstrained plan as one matrix–vector product of [z, 1]; where that
-    plan meets every limit it is the optimum (status UNCONSTRAINED). Otherwise OSQP solves the condensed QP for the
-    deviation from it, warm-started with the last solution moved on by one step (OPTIMAL, or SOFTENED where a soft
-    limit had to give way). A failed step falls back on the last plan, then on the clipped unconstrained input,
-    then on the last input. Inputs never leave their limits.
+    The backward Riccati recursion gives the unconstrained plan as one matrix–vector product of [z, 1], or of
+    [z, u_{−1}, w, d, 1] where those matter; where that plan meets every limit it is the optimum (status
+    UNCONSTRAINED). Otherwise the condensed QP is solved for the deviation from it, warm-started with the last
+    solution moved on by one step (OPTIMAL, or SOFTENED where a limit had to give way). A failed step falls back on
+    the last plan, then on the clipped unconstrained input, then on the last input. Inputs never leave their limits,
+    nor their rates where these are hard and within reach of the limits.
 
     Parameters
     ----------
@@ -41,6 +44,14 @@ class KoopmanMPC:
         What to minimise, within what.
     horizon
         N steps of the predictor's dt.
+    moves
+        How many inputs the plan has: M of them, the last held to the end of the horizon, or the lengths of the
+        blocks of steps in which each is held. By default one a step.
+    disturbed
+        True makes room for a constant disturbance d of every lifted coordinate, which `disturb` sets.
+    coordinates
+        Variables of the QP: "plain", the inputs; "riccati", those in which the Hessian is the identity however
+        unstable the plant; "auto" takes the plain ones where their Hessian is well conditioned.
     solver
         "osqp".
     settings
@@ -70,47 +81,64 @@ class KoopmanMPC:
         limits: Limits | None = None,
         horizon: int = 20,
         *,
+        moves: int | Sequence[int] | None = None,
+        disturbed: bool = False,
+        coordinates: Coordinates = "auto",
         solver: Literal["osqp"] = "osqp",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         if solver != "osqp":
             raise DataError(f'solver is {solver!r}; there is "osqp"')
-        N = checks.count(horizon, "horizon")
-        limits = Limits() if limits is None else limits
-        self.predictor, self.cost, self.limits = predictor, cost, limits
-        self._N, self._nu = N, predictor.nu
-        track = tracking(predictor, cost, limits)
-        stage = _stage(predictor, cost, track, N)
-        stages = recursion(stage.A, stage.B, track.C.T @ track.Q @ track.C, track.R, stage.P_N, N)
-        self._maps = condense(stage, stages, track.targets)
-        self._track = track
-
-        self._lift = buffered(predictor.lifting)
-        nv, nz = self._maps.from_state.shape
-        self._from_lifted = np.column_stack(
-            [self._maps.from_state, np.zeros(nv)]
-        )  # the last column: the reference's part
-        self._lifted = np.append(np.zeros(nz), 1.0)
-        self._z = self._lifted[:-1]
-        low = np.concatenate([np.tile(track.inputs.low, N), np.tile(track.outputs.low, N)])
-        high = np.concatenate([np.tile(track.inputs.high, N), np.tile(track.outputs.high, N)])
-        self._low, self._high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
-        self._met = bytearray(2 * nv)
-        met = np.frombuffer(self._met, dtype=np.bool_)
-        self._met_low, self._met_high = met[:nv], met[nv:]
-
-        maps = self._maps
-        self._program = program(maps.deviation, track.inputs, track.outputs, N, limits.slack, maps.unit)
+        if coordinates not in ("auto", "riccati", "plain"):
+            raise DataError(f'coordinates is {coordinates!r}; pass "auto", "riccati" or "plain"')
+        self._N, self._nu = checks.count(horizon, "horizon"), predictor.nu
+        self._blocks = blocked(moves, self._N)
+        self.predictor, self.cost, self.limits = predictor, cost, Limits() if limits is None else limits
+        self._disturbed = disturbed
+        self._map = PlanMap(
+            predictor, cost, self.limits, self._blocks, disturbed=disturbed, coordinates=coordinates
+        )
+        track, self._program = self._map.track, self._map.program
+        self._settings = settings
         self._solver = OSQP(self._program.qp, settings)
         self._primal = np.zeros(len(self._program.qp.q) + 1)  # one more, always zero, for the shift
         self._dual = np.zeros(len(self._program.low) + 1)
-        self._warm = False
-        self._plan = np.zeros(nv)
-        self._spare = np.zeros(nv)
-        self._memory = PlanMemory(track.inputs, N)
+        self._warm = self._planned = False
+        self._rated = self._map.horizon.rated
+        self._signals = self._rated or disturbed or predictor.nw > 0
+        self._hard_rates = _hard(track.rates, track.rate_softness.linear)
+        self._move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
+        self._memory = PlanMemory(track.inputs, self._N, track.rates, self._move_of)
+
+        self._lift = buffered(predictor.lifting)
+        rows, columns = self._map.matrix.shape
+        self._known = np.zeros(columns)
+        self._known[-1] = 1.0
+        self._plan, self._spare = np.zeros(rows), np.zeros(rows)
+        self._reference = np.zeros((self._N + 1, len(track.C)))
         self._reference_key: bytes | None = None
-        self._planned = False
+        self._see()
         self.reset()
+
+    def _see(self) -> None:
+        """Make the views of the arrays that a step fills; a copy of the controller makes its own."""
+        predictor, nw = self.predictor, self._N * self.predictor.nw
+        self._z = self._known[: predictor.nz]
+        first = predictor.nz + self._nu * self._rated
+        self._u_prev = self._known[predictor.nz : first]
+        self._drive = self._known[first:-1]
+        self._W, self._d = self._drive[:nw].reshape(self._N, predictor.nw), self._drive[nw:]
+        rows = len(self._plan)
+        self._met = bytearray(2 * rows)
+        met = np.frombuffer(self._met, dtype=np.bool_)
+        self._met_low, self._met_high = met[:rows], met[rows:]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
 
     @property
     def dt(self) -> float:
@@ -127,13 +155,72 @@ class KoopmanMPC:
         """Steps N of the plan."""
         return self._N
 
+    @property
+    def coordinates(self) -> str:
+        """The coordinates of the QP: "riccati" or "plain"."""
+        return self._map.maps.coordinates
+
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget all earlier steps, so that a run repeats to the bit; `u_prev` is held if the first step fails."""
+        """Forget all earlier steps, so that a run repeats to the bit.
+
+        `u_prev`, zero moved inside the limits by default, is where rates count from, and is held if the first step
+        fails. A disturbance that `disturb` set is forgotten too.
+        """
         self._memory.reset(u_prev)
         self._solver.reset()
         self._warm = self._planned = False
+        self._drive[:] = 0.0
 
-    def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
+    def update(self, predictor: LinearPredictor) -> None:
+        """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
+
+        Raises
+        ------
+        DataError
+            The predictor has another lifting, dt, other states, inputs or disturbances than the last one.
+        """
+        old = self.predictor
+        for name in ("lifting", "dt", "states", "inputs", "disturbances"):
+            if getattr(predictor, name) != getattr(old, name):
+                raise DataError(
+                    f"the predictor has another {name} than the controller's; make a new controller"
+                )
+        self._map = PlanMap(
+            predictor,
+            self.cost,
+            self.limits,
+            self._blocks,
+            disturbed=self._disturbed,
+            coordinates="plain" if self.coordinates == "plain" else "riccati",
+        )
+        self.predictor, self._program = predictor, self._map.program
+        self._solver = OSQP(self._program.qp, self._settings)
+        self._reference_key = None
+
+    def disturb(self, d: ArrayLike) -> None:
+        """Set the disturbance d (nz,) of z⁺ = A z + B u + E w + d from the next step on.
+
+        Raises
+        ------
+        DataError
+            The controller was not made with ``disturbed=True``.
+        ShapeError
+            d has another length than z.
+        """
+        if not self._disturbed:
+            raise DataError("the controller has no room for a disturbance; make it with disturbed=True")
+        values = np.asarray(d, dtype=np.float64)
+        if values.shape != self._d.shape:
+            raise ShapeError(f"d has shape {values.shape}, expected {self._d.shape}, one value an observable")
+        self._d[:] = values
+
+    def __call__(
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+    ) -> Move:
         """Return the first input of the plan for state y.
 
         Parameters
@@ -144,6 +231,9 @@ class KoopmanMPC:
             (nr,) held over the horizon, or rows r_k … r_{k+N}, the last repeated.
         applied
             (nu,) what the plant really got last; by default the last u returned.
+        w
+            (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N−1}, the last repeated; by
+            default zero.
         """
         start = perf_counter()
         (x,), (z,), lift, _ = self._lift.slot()
@@ -158,79 +248,122 @@ class KoopmanMPC:
         if key != self._reference_key:
             self._aim(target)
             self._reference_key = key
+        if self._signals or w is not None:
+            self._take(applied, w)
 
-        v = self._spare
-        np.dot(self._from_lifted, self._lifted, out=v)
-        np.greater_equal(v, self._low, out=self._met_low)
-        np.less_equal(v, self._high, out=self._met_high)
+        t = self._spare
+        np.dot(self._map.matrix, self._known, out=t)
+        np.greater_equal(t, self._map.low, out=self._met_low)
+        np.less_equal(t, self._map.high, out=self._met_high)
         if 0 not in self._met:  # every limit is met, and nothing is NaN
-            self._warm = False
-            self._keep(v)
-            u = v[: self._nu].copy()
-            return Move(u, Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
-        return self._constrained(v, applied, start)
+            return self._unconstrained(t, start)
+        return self._limited(t, applied, start)
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
         if not self._planned:
             return None
-        U = self._plan[: self._N * self._nu].reshape(self._N, self._nu).copy()
+        A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
+        moves = self._plan[: len(self._blocks) * self._nu].reshape(-1, self._nu)
+        U = moves[self._move_of]
+        push = self._W @ E.T
+        if self._disturbed:
+            push = push + self._d
         Z = np.empty((self._N + 1, self.predictor.nz))
         Z[0] = self._z
         for k in range(self._N):
-            Z[k + 1] = self.predictor.A @ Z[k] + self.predictor.B @ U[k]
-        return Plan(Z @ self.predictor.C.T, U)
+            Z[k + 1] = A @ Z[k] + B @ U[k] + push[k]
+        return Plan(Z @ C.T, U)
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the last column."""
-        R = reference_rows(reference, self._N, len(self._track.C))
-        column = self._from_lifted[:, -1]
-        if not np.isfinite(R).all():
-            column[:] = np.nan
-            return
-        alpha = self._track.targets.coordinates(R)
-        maps = self._maps
-        column[:] = maps.from_reference @ R.ravel() + maps.from_target @ alpha.ravel() + maps.offset
+        self._reference = reference_rows(reference, self._N, self._reference.shape[1])
+        self._map.aim(self._reference)
 
-    def _keep(self, v: Float[np.ndarray, " nv"]) -> None:
-        """Make v the plan; the array of the plan before it is free for the next step."""
-        self._plan, self._spare = v, self._plan
-        self._memory.keep(v)
+    def _take(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
+        """Write down the last input and the preview of disturbances."""
+        if self._rated:
+            last = self._memory.last() if applied is None else np.asarray(applied, dtype=np.float64)
+            if last.shape != self._u_prev.shape:
+                raise ShapeError(f"applied has shape {last.shape}, expected {self._u_prev.shape}")
+            self._u_prev[:] = last
+        if w is None:
+            self._W[:] = 0.0
+            return
+        rows, nw = np.asarray(w, dtype=np.float64), self.predictor.nw
+        if nw == 0:
+            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
+        if rows.shape != (nw,) and rows.shape != self._W.shape:
+            if rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0:
+                raise ShapeError(
+                    f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{self._N - 1}"
+                )
+            rows = rows[np.minimum(np.arange(self._N), len(rows) - 1)]
+        self._W[:] = rows
+
+    def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
+        self._warm = False
+        self._keep(t)
+        return Move(t[: self._nu].copy(), Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
+
+    def _keep(self, t: Float[np.ndarray, " nt"]) -> None:
+        """Make t the plan; the array of the plan before it is free for the next step."""
+        self._plan, self._spare = t, self._plan
+        self._memory.keep(t)
         self._planned = True
 
-    def _constrained(self, v: Float[np.ndarray, " nv"], applied: ArrayLike | None, start: float) -> Move:
-        """Solve the QP for the deviation from the plan v, which breaks a limit or is not finite."""
-        if not np.abs(v).max() < HUGE:
+    def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
+        """Go on where the plan breaks a limit, its target does, or something is not finite."""
+        plan = self._map
+        if self._rated and not (np.abs(self._u_prev) < HUGE).all():  # what was applied is not known
+            self._u_prev[:] = self._memory.last()
+            np.dot(plan.matrix, self._known, out=t)
+        if not np.abs(t).max() < HUGE:
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
-        problem = self._program
-        low, high = problem.low.copy(), problem.high.copy()
-        moved = v[problem.source]
-        low[: len(moved)] -= moved
-        high[: len(moved)] -= moved
-        self._solver.update(low, high)
-        if self._warm:
-            solution = self._solver.solve(self._primal[problem.shift_primal], self._dual[problem.shift_dual])
-        else:
-            solution = self._solver.solve(
-                np.zeros(len(problem.shift_primal)), np.zeros(len(problem.shift_dual))
-            )
+        n = plan.planned
+        v = t[:n]
+        if not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
+            v += plan.correction(self._reference, self._drive)
+        if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
+            return self._unconstrained(t, start)
+        solution, conflict = self._solve(v)
         if self.solver_fails:
             solution.status = Status.FAILED
         if solution.status is not Status.OPTIMAL:
             return self._fail(v[: self._nu], applied, solution.status, solution.iterations, start)
         self._primal[:-1], self._dual[:-1] = solution.v, solution.y
         self._warm = True
-        nw = self._N * self._nu
-        v += self._maps.deviation @ solution.v[:nw]
-        u = np.clip(v[:nw].reshape(self._N, self._nu), *self._track.inputs)
+        nw = len(self._blocks) * self._nu
+        v += plan.maps.deviation @ solution.v[:nw]
+        inputs = plan.track.inputs
+        u = np.clip(v[:nw].reshape(-1, self._nu), *inputs)
+        if self._hard_rates is not None:
+            u[0] = admitted(u[0], inputs, self._hard_rates, self._u_prev)
         v[:nw] = u.ravel()
-        self._keep(v)
-        status = (
-            Status.SOFTENED
-            if softened(solution.v[nw:].reshape(self._N, -1), self._track.outputs)
-            else Status.OPTIMAL
-        )
+        self._keep(t)
+        gave_way = conflict or (solution.v[nw:] > self._program.allowance).any()
+        status = Status.SOFTENED if gave_way else Status.OPTIMAL
         return Move(u[0].copy(), status, Fallback.NONE, perf_counter() - start, solution.iterations)
+
+    def _solve(self, v: Float[np.ndarray, " nv"]) -> tuple[QPSolution, bool]:
+        """Solve the QP for the deviation from the plan v; True where the input limits are out of the rates' reach."""
+        problem, conflict = self._program, False
+        low, high = problem.low.copy(), problem.high.copy()
+        if self._hard_rates is not None:
+            inputs, (rows, which) = self._map.track.inputs, problem.rates
+            lowest = np.minimum(low[rows], (inputs.high - self._u_prev)[which])
+            highest = np.maximum(high[rows], (inputs.low - self._u_prev)[which])
+            conflict = bool((lowest < low[rows] - 1e-9).any() or (highest > high[rows] + 1e-9).any())
+            low[rows], high[rows] = lowest, highest
+        moved = v[problem.source]
+        low[: len(moved)] -= moved
+        high[: len(moved)] -= moved
+        self._solver.update(low, high)
+        if self._warm:
+            start = self._primal[problem.shift_primal], self._dual[problem.shift_dual]
+        else:
+            start = np.zeros(len(problem.shift_primal)), np.zeros(len(problem.shift_dual))
+        return self._solver.solve(*start), conflict
 
     def _fail(
         self,
@@ -258,31 +391,29 @@ class LinearMPC(KoopmanMPC):
         limits: Limits | None = None,
         horizon: int = 20,
         *,
+        moves: int | Sequence[int] | None = None,
+        disturbed: bool = False,
+        coordinates: Coordinates = "auto",
+        solver: Literal["osqp"] = "osqp",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        super().__init__(LinearPredictor.local(step_map, x, u), cost, limits, horizon, settings=settings)
+        super().__init__(
+            LinearPredictor.local(step_map, x, u),
+            cost,
+            limits,
+            horizon,
+            moves=moves,
+            disturbed=disturbed,
+            coordinates=coordinates,
+            solver=solver,
+            settings=settings,
+        )
 
 
-def _stage(predictor: LinearPredictor, cost: Cost, track: Tracking, N: int) -> Stage:
-    """Return the horizon's matrices with the terminal weight that the cost asks for."""
-    A, B, C, nz, nx = predictor.A, predictor.B, track.C, predictor.nz, predictor.nx
-    CQ_N = None
-    if cost.Q_N is None:
-        P_N = stationary(A, B, C.T @ track.Q @ C, track.R, 10 * N).P
-    else:
-        given = np.asarray(cost.Q_N)
-        size = len(given) if given.ndim else nx
-        on_state = size == nx and isinstance(cost.of, State)
-        if size == nx != nz and not on_state:
-            raise ShapeError(
-                f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})"
-            )
-        if size not in (nx, nz):
-            raise ShapeError(
-                f"Q_N has shape {given.shape}, expected ({nx}, {nx}) on the state or ({nz}, {nz}) on z"
-            )
-        P_N = checks.weight(given, "Q_N", size)
-        if on_state:
-            CQ_N = C.T @ P_N
-            P_N = CQ_N @ C
-    return Stage(A, B, C, track.G, track.Q, track.R, P_N, CQ_N)
+def _hard(rates: Box | None, linear: Float[np.ndarray, " nu"]) -> Box | None:
+    """Return the hard rate limits, ±inf where they are soft."""
+    if rates is None or not np.isinf(linear).any():
+        return None
+    return Box(
+        *(np.where(np.isinf(linear), end, free) for end, free in zip(rates, (-np.inf, np.inf), strict=True))
+    )

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Box, Limits
+from koopmpc.control.limits import Box, Limits, Softness
 from koopmpc.control.target import Targets, targets
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.base import Lifting, rows
@@ -22,14 +22,21 @@ HUGE = 1e30
 
 @dataclass(frozen=True)
 class Tracking:
-    """A predictor under a cost and limits: tracked outputs C z, limited outputs G z, weights and targets."""
+    """A predictor under a cost and limits: tracked outputs C z, limited outputs G z, weights and targets.
+
+    R_delta and `rates` are None where the change of the inputs is free.
+    """
 
     C: Float[np.ndarray, "nr nz"]
     G: Float[np.ndarray, "ng nz"]
     Q: Float[np.ndarray, "nr nr"]
     R: Float[np.ndarray, "nu nu"]
+    R_delta: Float[np.ndarray, "nu nu"] | None
     inputs: Box
+    rates: Box | None
+    rate_softness: Softness
     outputs: Box
+    softness: Softness
     targets: Targets
 
 
@@ -43,22 +50,30 @@ def tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> Tracking
     ShapeError
         A weight or a limit has another size than what it weighs or limits.
     """
-    C = observed(predictor, cost.of)
-    Q, R = cost.matrices(len(C), predictor.nu)
-    G, outputs = _limited(predictor, limits)
-    inputs = limits.inputs(predictor.nu)
-    found = targets(
-        predictor.A,
-        predictor.B,
+    C, nu = observed(predictor, cost.of), predictor.nu
+    Q, R = cost.matrices(len(C), nu)
+    G = predictor.C
+    if limits.of is not None:
+        G = np.vstack([G, observed(predictor, limits.of)])
+    kept, outputs, softness = limits.rows(predictor.nx, len(G) - predictor.nx)
+    G = np.ascontiguousarray(G[kept])
+    inputs = limits.inputs(nu)
+    hold = cost.u_target == "equilibrium"
+    constant = _constant(predictor)
+    found = targets(predictor.A, predictor.B, C, Q, inputs, G, outputs, constant, hold=hold)
+    return Tracking(
         C,
-        Q,
-        inputs,
         G,
+        Q,
+        R,
+        cost.rate(nu),
+        inputs,
+        limits.rates(nu),
+        limits.rate_softness(nu),
         outputs,
-        _constant(predictor),
-        hold=cost.u_target == "equilibrium",
+        softness,
+        found,
     )
-    return Tracking(C, G, Q, R, inputs, outputs, found)
 
 
 def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr nz"]:
@@ -98,15 +113,3 @@ def _constant(predictor: LinearPredictor) -> int | None:
     name = Constant().bind(predictor.states).names[0]
     names = predictor.lifting.names
     return names.index(name) if name in names else None
-
-
-def _limited(predictor: LinearPredictor, limits: Limits) -> tuple[Float[np.ndarray, "ng nz"], Box]:
-    """Return the rows of z that have a limit, and the limits."""
-    low, high = limits.states(predictor.nx)
-    G = predictor.C
-    if limits.of is not None:
-        H = observed(predictor, limits.of)
-        y = limits.outputs(len(H))
-        G, low, high = np.vstack([G, H]), np.concatenate([low, y.low]), np.concatenate([high, y.high])
-    kept = np.isfinite(low) | np.isfinite(high)
-    return np.ascontiguousarray(G[kept]), Box(low[kept], high[kept])

@@ -1,10 +1,10 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -13,6 +13,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.values import Value
 
 SOFTENED = 1e-4  # a slack above this share of 1 + |limit| is reported
+Slack = tuple[ArrayLike, ArrayLike]
 
 
 class Box(NamedTuple):
@@ -22,9 +23,27 @@ class Box(NamedTuple):
     high: Float[np.ndarray, " n"]
 
 
+class Softness(NamedTuple):
+    """linear ε + quadratic ε² is what a row's violation ε costs; linear = inf is a hard row."""
+
+    linear: Float[np.ndarray, " n"]
+    quadratic: Float[np.ndarray, " n"]
+
+
+class Rows(NamedTuple):
+    """The limited outputs [x; y] that have a limit: which they are, their limits, and how soft each is."""
+
+    kept: Bool[np.ndarray, " n"]
+    box: Box
+    softness: Softness
+
+
 @dataclass(frozen=True, eq=False)
 class Limits(Value):
-    """u_min ≤ u_k ≤ u_max (hard), x_min ≤ x_k ≤ x_max and y_min ≤ of(x_k) ≤ y_max (soft), k = 1 … N.
+    """u_min ≤ u_k ≤ u_max and du_min ≤ u_k − u_{k−1} ≤ du_max, x_min ≤ x_k ≤ x_max and y_min ≤ of(x_k) ≤ y_max.
+
+    Inputs (k = 0 … N−1) are always inside their limits. Where the last input and a change inside its limits do not
+    reach them, they win, and the status says SOFTENED. States and outputs (k = 1 … N) are soft unless told.
 
     Parameters
     ----------
@@ -34,14 +53,19 @@ class Limits(Value):
         Observables of the state that y_min and y_max limit. A controller on a lifted predictor finds them in its
         own lifting by name.
     slack
-        (linear, quadratic) weight of the violation ε of every state and output limit: linear ε + quadratic ε².
-        A linear weight above the largest dual keeps the limits exactly wherever that is possible. None makes them
-        hard.
+        (linear, quadratic) weight of the violation ε of state and output limits: linear ε + quadratic ε². A linear
+        weight above the largest dual keeps a limit exactly wherever that is possible. Each is a scalar, or has an
+        entry for every state where there are x limits, and then for every observable of `of`; a linear weight of
+        inf makes its row hard, None makes all hard.
+    du_min, du_max
+        Limits of the change of the inputs in one step; du_min is −du_max by default.
+    du_slack
+        (linear, quadratic) as in `slack`, a scalar or an entry an input; None, the default, keeps rates hard.
 
     Raises
     ------
     DataError
-        Crossed limits; y limits without `of`; a negative slack weight.
+        Crossed limits; rate limits without zero between them; y limits without `of`; a negative slack weight.
     """
 
     u_min: ArrayLike | None = None
@@ -51,11 +75,15 @@ class Limits(Value):
     of: Lifting | None = None
     y_min: ArrayLike | None = None
     y_max: ArrayLike | None = None
-    slack: tuple[float, float] | None = (1e4, 1e2)
+    slack: Slack | None = (1e4, 1e2)
+    du_min: ArrayLike | None = None
+    du_max: ArrayLike | None = None
+    du_slack: Slack | None = None
 
     def __post_init__(self) -> None:
         for low, high, name in (
             ("u_min", "u_max", "input"),
+            ("du_min", "du_max", "rate"),
             ("x_min", "x_max", "state"),
             ("y_min", "y_max", "output"),
         ):
@@ -68,17 +96,29 @@ class Limits(Value):
             raise DataError(
                 "y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)"
             )
-        if self.slack is not None:
-            linear, quadratic = (float(weight) for weight in checks.array(self.slack, "slack", (2,)))
-            if linear < 0 or quadratic < 0 or linear + quadratic == 0:
+        for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
+            value = getattr(self, end)
+            if value is not None and (sign * value > 0).any():
                 raise DataError(
-                    f"slack is {self.slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None"
+                    f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates"
                 )
-            object.__setattr__(self, "slack", (linear, quadratic))
+        for name in ("slack", "du_slack"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _weights(getattr(self, name), name))
 
     def inputs(self, nu: int) -> Box:
         """Return the box of the inputs."""
         return _box(self.u_min, self.u_max, "u_min", "u_max", nu)
+
+    def rates(self, nu: int) -> Box | None:
+        """Return the box of u_k − u_{k−1}; None where nothing limits it."""
+        low = -np.asarray(self.du_max) if self.du_min is None and self.du_max is not None else self.du_min
+        box = _box(low, self.du_max, "du_min", "du_max", nu)
+        return box if (np.isfinite(box.low) | np.isfinite(box.high)).any() else None
+
+    def rate_softness(self, nu: int) -> Softness:
+        """Return how soft the rate limits of each input are."""
+        return _softness(self.du_slack, "du_slack", nu, "one an input")
 
     def states(self, nx: int) -> Box:
         """Return the box of the states."""
@@ -88,13 +128,64 @@ class Limits(Value):
         """Return the box of the observables `of`."""
         return _box(self.y_min, self.y_max, "y_min", "y_max", ny)
 
+    def rows(self, nx: int, ny: int) -> Rows:
+        """Return the limits of [x; of(x)], those rows alone that have one; ny is 0 without `of`."""
+        (x_low, x_high), (y_low, y_high) = self.states(nx), self.outputs(ny) if ny else _NONE
+        low, high = np.concatenate([x_low, y_low]), np.concatenate([x_high, y_high])
+        mine = np.repeat([_given(self.x_min, self.x_max), _given(self.y_min, self.y_max)], [nx, ny])
+        given = _softness(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
+        linear, quadratic = np.full(nx + ny, np.inf), np.zeros(nx + ny)
+        linear[mine], quadratic[mine] = given
+        kept = np.isfinite(low) | np.isfinite(high)
+        return Rows(kept, Box(low[kept], high[kept]), Softness(linear[kept], quadratic[kept]))
+
+
+_NONE = Box(np.zeros(0), np.zeros(0))
+
+
+def allowance(box: Box) -> Float[np.ndarray, " n"]:
+    """Return the slack of each row up to which its limit counts as kept: 1e-4 (1 + |limit|)."""
+    return SOFTENED * (1 + np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)))
+
 
 def softened(slacks: Float[np.ndarray, "N ng"], outputs: Box) -> bool:
     """Return whether a soft limit gives way by more than 1e-4 (1 + |limit|) at any stage."""
-    if not slacks.size:
-        return False
-    size = np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in outputs))
-    return bool((slacks > SOFTENED * (1 + size)).any())
+    return bool(slacks.size and (slacks > allowance(outputs)).any())
+
+
+def _given(low: ArrayLike | None, high: ArrayLike | None) -> bool:
+    return low is not None or high is not None
+
+
+def _weights(slack: Slack, name: str) -> Slack:
+    """Return checked (linear, quadratic), each a float or a vector."""
+    if not isinstance(cast(object, slack), tuple | list | np.ndarray) or len(slack) != 2:
+        raise ShapeError(f"{name} is {slack!r}; pass (linear, quadratic), or None for hard limits")
+    linear = checks.array(slack[0], f"the linear weight of {name}", infinite=True)
+    quadratic = checks.array(slack[1], f"the quadratic weight of {name}")
+    if linear.ndim > 1 or quadratic.ndim > 1:
+        raise ShapeError(f"{name} has weights of {linear.ndim} and {quadratic.ndim} dimensions; pass vectors")
+    if (linear < 0).any() or (quadratic < 0).any() or not (linear.any() or quadratic.any()):
+        raise DataError(f"{name} is {slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None")
+    return (linear if linear.ndim else float(linear)), (quadratic if quadratic.ndim else float(quadratic))
+
+
+def _softness(slack: Slack | None, name: str, n: int, what: str) -> Softness:
+    if slack is None:
+        return Softness(np.full(n, np.inf), np.zeros(n))
+    parts = [checks.array(weight, name, infinite=True) for weight in slack]
+    for part in parts:
+        if part.ndim and part.shape != (n,):
+            raise ShapeError(
+                f"{name} has a weight of shape {part.shape}, expected ({n},), {what}, or a scalar"
+            )
+    linear, quadratic = (np.broadcast_to(part, (n,)).copy() for part in parts)
+    free = np.flatnonzero(linear + quadratic == 0)
+    if free.size:
+        raise DataError(
+            f"{name} has both weights zero at index {int(free[0])}; a limit that costs nothing is none"
+        )
+    return Softness(linear, quadratic)
 
 
 def _require_room(

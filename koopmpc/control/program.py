@@ -2,23 +2,42 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Box, Softness, allowance
 from koopmpc.control.solvers.base import QP
+
+
+class Group(NamedTuple):
+    """Rows of v that have the same limits in each of len(next) stages, and the stage that follows each stage.
+
+    `next` is len(next) past the end: a plan ends unconstrained.
+    """
+
+    box: Box
+    softness: Softness
+    next: Int[np.ndarray, " n"]
+
+
+class FirstRates(NamedTuple):
+    """Rows of the QP that limit the first change of the inputs, hard, and the inputs that they limit."""
+
+    rows: Int[np.ndarray, " r"]
+    inputs: Int[np.ndarray, " r"]
 
 
 @dataclass(frozen=True)
 class Program:
-    """½‖w‖² + Σ (linear ε + quadratic ε²)/(2 unit) → min over [w (N, nu); ε (N, ng)], low ≤ v + D w ≤ high.
+    """½ wᵀH w + Σ (linear ε + quadratic ε²)/(2 unit) → min over [w; ε], low ≤ v + D w ≤ high.
 
-    It is the cost unit ‖w‖² + Σ (linear ε + quadratic ε²), divided by 2 unit.
+    It is the cost unit · wᵀH w + Σ (linear ε + quadratic ε²), divided by 2 unit.
 
     Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v: their bounds
     are `low` and `high` less that entry; the rest are ε ≥ 0. `shift_primal` and `shift_dual` tell where the next
-    stage's entry stands; one past the end stands for zero, for a plan ends unconstrained.
+    stage's entry stands; one past the end stands for zero. A slack above its `allowance` is reported.
     """
 
     qp: QP
@@ -27,70 +46,106 @@ class Program:
     high: Float[np.ndarray, " m"]
     shift_primal: Int[np.ndarray, " n"]
     shift_dual: Int[np.ndarray, " m"]
+    allowance: Float[np.ndarray, " ns"]
+    rates: FirstRates
+
+
+class _Block(NamedTuple):
+    """Rows of the QP from one kind of limit: entries of v, bounds, the place after each, the sign and index of ε."""
+
+    source: Int[np.ndarray, " p"]
+    low: Float[np.ndarray, " p"]
+    high: Float[np.ndarray, " p"]
+    next: Int[np.ndarray, " p"]
+    sign: float
+    slack: Int[np.ndarray, " p"]
 
 
 def program(
     deviation: Float[np.ndarray, "nv nw"],
-    inputs: Box,
-    outputs: Box,
-    N: int,
-    slack: tuple[float, float] | None,
+    hessian: Float[np.ndarray, "nw nw"],
+    moves: Group,
+    rates: Group | None,
+    outputs: Group,
     unit: float,
 ) -> Program:
-    """Return the QP of a horizon of N steps for v = [u_0 … u_{N−1}, g_1 … g_N] and its deviation map D."""
-    nu, ng = len(inputs.low), len(outputs.low)
-    nw = N * nu
-    ns = 0 if slack is None else N * ng
-
-    def entries(first: int, size: int, picked: Int[np.ndarray, " p"]) -> Int[np.ndarray, " Np"]:
-        return (first + size * np.arange(N)[:, None] + picked).ravel()
-
-    limited = entries(0, nu, np.flatnonzero(np.isfinite(inputs.low) | np.isfinite(inputs.high)))
-    v_low = np.concatenate([np.tile(inputs.low, N), np.tile(outputs.low, N)])
-    v_high = np.concatenate([np.tile(inputs.high, N), np.tile(outputs.high, N)])
-    if ns:
-        upper = entries(nw, ng, np.flatnonzero(np.isfinite(outputs.high)))
-        lower = entries(nw, ng, np.flatnonzero(np.isfinite(outputs.low)))
-        blocks = [limited, upper, lower]
-        low = [v_low[limited], np.full(len(upper), -np.inf), v_low[lower], np.zeros(ns)]
-        high = [v_high[limited], v_high[upper], np.full(len(lower), np.inf), np.full(ns, np.inf)]
-    else:
-        blocks = [limited, entries(nw, ng, np.arange(ng))]
-        low, high = [v_low[block] for block in blocks], [v_high[block] for block in blocks]
-
-    source = np.concatenate(blocks)
-    A = np.zeros((len(source) + ns, nw + ns))
+    """Return the QP for v = [moves; their changes, unless None; outputs], its deviation map D and H."""
+    nw = deviation.shape[1]
+    groups = [moves, outputs] if rates is None else [moves, rates, outputs]
+    blocks: list[_Block] = []
+    shifts = [_next(moves.next, len(moves.box.low))]
+    weights: list[tuple[Float[np.ndarray, " _"], ...]] = []
+    first, slacks = 0, 0
+    first_rates = FirstRates(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
+    for group in groups:
+        box, softness, following = group
+        width, N = len(box.low), len(following)
+        limited = np.isfinite(box.low) | np.isfinite(box.high)
+        soft = np.flatnonzero(limited & np.isfinite(softness.linear))
+        hard = np.flatnonzero(limited & ~np.isfinite(softness.linear))
+        slack_of = np.full(width, -1)
+        slack_of[soft] = np.arange(len(soft))
+        for picked, sign in (
+            (hard, 0.0),
+            (soft[np.isfinite(box.high[soft])], -1.0),
+            (soft[np.isfinite(box.low[soft])], 1.0),
+        ):
+            count = len(picked)
+            stage = np.arange(N)[:, None]
+            if group is rates and sign == 0.0:
+                first_rates = FirstRates(sum(len(b.source) for b in blocks) + np.arange(count), picked)
+            blocks.append(
+                _Block(
+                    (first + width * stage + picked).ravel(),
+                    np.tile(box.low[picked] if sign >= 0 else np.full(count, -np.inf), N),
+                    np.tile(box.high[picked] if sign <= 0 else np.full(count, np.inf), N),
+                    _next(following, count),
+                    sign,
+                    (slacks + len(soft) * stage + slack_of[picked]).ravel(),
+                )
+            )
+        shifts.append(_next(following, len(soft)))
+        of_stage = softness.linear, softness.quadratic, allowance(box)
+        weights.append(tuple(np.tile(weight[soft], N) for weight in of_stage))
+        first, slacks = first + width * N, slacks + len(soft) * N
+    source = np.concatenate([block.source for block in blocks])
+    A = np.zeros((len(source) + slacks, nw + slacks))
     A[: len(source), :nw] = deviation[source]
-    P, q = np.eye(nw + ns), np.zeros(nw + ns)
-    counts = [len(block) // N for block in blocks]
-    if slack is not None and ns:
-        first = len(limited)
-        for block, sign in zip(blocks[1:], (-1.0, 1.0), strict=True):  # ε of entry nw + i is variable nw + i
-            A[first + np.arange(len(block)), block] = sign
-            first += len(block)
-        A[len(source) :, nw:] = np.eye(ns)
-        P[nw:, nw:] *= slack[1] / unit
-        q[nw:] = slack[0] / (2 * unit)
-        counts.append(ng)
-    lows, highs = np.concatenate(low), np.concatenate(high)
+    row = 0
+    for block in blocks:
+        if block.sign:
+            A[row + np.arange(len(block.source)), nw + block.slack] = block.sign
+        row += len(block.source)
+    A[row:, nw:] = np.eye(slacks)
+    linear, quadratic, allowed = (np.concatenate(parts) for parts in zip(*weights, strict=True))
+    P, q = np.zeros((nw + slacks, nw + slacks)), np.zeros(nw + slacks)
+    P[:nw, :nw] = hessian
+    P[nw:, nw:] = np.diag(quadratic / unit)
+    q[nw:] = linear / (2 * unit)
+    low = np.concatenate([*(block.low for block in blocks), np.zeros(slacks)])
+    high = np.concatenate([*(block.high for block in blocks), np.full(slacks, np.inf)])
     return Program(
-        QP(P, q, A, lows, highs),
+        QP(P, q, A, low, high),
         source,
-        lows,
-        highs,
-        _next_stage([nu, ng] if ns else [nu], N),
-        _next_stage(counts, N),
+        low,
+        high,
+        _joined(shifts),
+        _joined([*(block.next for block in blocks), *shifts[1:]]),
+        allowed,
+        first_rates,
     )
 
 
-def _next_stage(counts: Sequence[int], N: int) -> Int[np.ndarray, " m"]:
-    """Return the places of the next stage for blocks of N stages with `counts` entries a stage."""
-    end = N * sum(counts)
-    places: list[Int[np.ndarray, " p"]] = []
-    start = 0
-    for count in counts:
-        block = start + count + np.arange(N * count)
-        block[(N - 1) * count :] = end
-        places.append(block)
-        start += N * count
-    return np.concatenate(places)
+def _next(following: Int[np.ndarray, " N"], count: int) -> Int[np.ndarray, " p"]:
+    """Return the place of the next stage's entry for `count` entries a stage, −1 past the end."""
+    place = count * following[:, None] + np.arange(count)
+    place[following >= len(following)] = -1
+    return place.ravel()
+
+
+def _joined(shifts: Sequence[Int[np.ndarray, " _"]]) -> Int[np.ndarray, " m"]:
+    """Return the places of all parts, one after the other; past the end stands for zero."""
+    sizes = [len(shift) for shift in shifts]
+    starts, total = np.cumsum([0, *sizes[:-1]]), sum(sizes)
+    parts = [np.where(part < 0, total, part + start) for part, start in zip(shifts, starts, strict=True)]
+    return np.concatenate(parts)

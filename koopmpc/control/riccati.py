@@ -1,6 +1,6 @@
 """Riccati: the infinite-horizon gains, the finite-horizon recursion, and the terminal weight between them."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +23,25 @@ class Gain(NamedTuple):
     P: Float[np.ndarray, "nx nx"]
 
 
-@dataclass(frozen=True)
-class Stages:
-    """The backward recursion at k = 0 … N−1: gains K_k and S_k = R + BᵀP_{k+1}B = L_k L_kᵀ."""
+class Stage(NamedTuple):
+    """x⁺ = A x + B u + e f at the cost xᵀQx + 2xᵀMu + uᵀRu + 2xᵀq f + 2uᵀr f, f being known; None stands for zero."""
 
-    K: Float[np.ndarray, "N nu nz"]
+    A: Float[np.ndarray, "nx nx"]
+    B: Float[np.ndarray, "nx nu"]
+    Q: Float[np.ndarray, "nx nx"]
+    M: Float[np.ndarray, "nx nu"] | None
+    R: Float[np.ndarray, "nu nu"]
+    e: Float[np.ndarray, "nx nf"] | None = None
+    q: Float[np.ndarray, "nx nf"] | None = None
+    r: Float[np.ndarray, "nu nf"] | None = None
+
+
+class Law(NamedTuple):
+    """u_k = −K_k x_k + v_k f for k = 0 … N−1, and S_k = R + BᵀP_{k+1}B = L_k L_kᵀ."""
+
+    K: Float[np.ndarray, "N nu nx"]
     L: Float[np.ndarray, "N nu nu"]
+    v: Float[np.ndarray, "N nu nf"]
 
 
 def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
@@ -75,26 +88,29 @@ def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
 
 
 def recursion(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    P_N: Float[np.ndarray, "nz nz"],
-    N: int,
-) -> Stages:
-    """Return the stages of P_k = Q + AᵀP_{k+1}(A − B K_k) from P_N back to k = 0.
+    stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"]
+) -> Law:
+    """Return the law that minimises the cost of all stages and xᵀP_N x + 2xᵀp_N f at their end.
+
+    K = S⁻¹(BᵀPA + Mᵀ), v = −S⁻¹g, g = Bᵀ(p + P e) + r; P ← Q + AᵀPA − KᵀSK, p ← q + Aᵀ(p + P e) − Kᵀg.
 
     Raises
     ------
     DefinitenessError
         R + BᵀPB is not positive definite at some stage.
     """
-    nz, nu = B.shape
-    K, L = np.empty((N, nu, nz)), np.empty((N, nu, nu))
-    P = P_N
+    nx, nu = stages[0].B.shape
+    N = len(stages)
+    K, L, v = np.empty((N, nu, nx)), np.empty((N, nu, nu)), np.empty((N, nu, p_N.shape[1]))
+    P, p = P_N, p_N
     for k in range(N - 1, -1, -1):
-        K[k], L[k], P = _step(A, B, Q, R, P)
-    return Stages(K, L)
+        A, B, Q, M, R, e, q, r = stages[k]
+        p = p if e is None else p + P @ e
+        K[k], L[k], P = _step(A, B, Q, R, P, M)
+        g = B.T @ p if r is None else B.T @ p + r
+        v[k] = -scipy.linalg.cho_solve((L[k], True), g)
+        p = A.T @ p - K[k].T @ g if q is None else q + A.T @ p - K[k].T @ g
+    return Law(K, L, v)
 
 
 def stationary(
@@ -103,18 +119,19 @@ def stationary(
     Q: Float[np.ndarray, "nz nz"],
     R: Float[np.ndarray, "nu nu"],
     most: int,
+    M: Float[np.ndarray, "nz nu"] | None = None,
 ) -> Gain:
-    """Iterate P ← Q + AᵀP(A − BK) from P = Q until K rests, at most `most` steps.
+    """Iterate P ← Q + AᵀPA − KᵀSK from P = Q until K rests, at most `most` steps; the stage cost may hold 2xᵀMu.
 
     K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
     weight may take that long to reach an input. Never refused: a Constant, or any other mode that u cannot move,
     only makes its own entries of P grow, which z − z_r does not see. Where P has grown by 1e12, an unstable mode
     that u cannot move has taken over; the iteration then runs on the controllable part alone.
     """
-    gain, bounded = _iterate(A, B, Q, R, most)
+    gain, bounded = _iterate(A, B, Q, R, most, M)
     if not bounded:
         V = _controllable(A, B)
-        gain, _ = _iterate(A @ V @ V.T, B, Q, R, most)
+        gain, _ = _iterate(A @ V @ V.T, B, Q, R, most, M)
     return gain
 
 
@@ -124,13 +141,14 @@ def _iterate(
     Q: Float[np.ndarray, "nz nz"],
     R: Float[np.ndarray, "nu nu"],
     most: int,
+    M: Float[np.ndarray, "nz nu"] | None,
 ) -> tuple[Gain, bool]:
     """Return the last gain, and whether P stayed below `LARGEST`."""
     P, K = Q, np.zeros((B.shape[1], A.shape[0]))
     scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
     rested = 0
     for _ in range(most):
-        K_next, _, P_next = _step(A, B, Q, R, P)
+        K_next, _, P_next = _step(A, B, Q, R, P, M)
         if not np.isfinite(P_next).all() or float(np.abs(P_next).max()) > LARGEST * scale:
             return Gain(K, P), False
         moved = float(np.abs(K_next - K).max(initial=0.0))
@@ -161,6 +179,7 @@ def _step(
     Q: Float[np.ndarray, "nz nz"],
     R: Float[np.ndarray, "nu nu"],
     P: Float[np.ndarray, "nz nz"],
+    M: Float[np.ndarray, "nz nu"] | None,
 ) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "nz nz"]]:
     BP = B.T @ P
     S = R + BP @ B
@@ -169,11 +188,13 @@ def _step(
     except np.linalg.LinAlgError as error:
         least = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
         raise DefinitenessError(
-            f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state that"
-            " every input moves"
+            f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state"
+            " that every input moves"
         ) from error
-    K = scipy.linalg.cho_solve((L, True), BP @ A)
+    K = scipy.linalg.cho_solve((L, True), BP @ A if M is None else BP @ A + M.T)
     P = Q + A.T @ (P @ (A - B @ K))
+    if M is not None:
+        P = P - M @ K
     return K, L, 0.5 * (P + P.T)
 
 

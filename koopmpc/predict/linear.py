@@ -1,4 +1,4 @@
-"""LinearPredictor: z⁺ = A z + B u, x ≈ C z, z₀ = ψ(x₀)."""
+"""LinearPredictor: z⁺ = A z + B u (+ E w), x ≈ C z, z₀ = ψ(x₀)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are depe
 
 @dataclass(frozen=True, eq=False, init=False)
 class LinearPredictor(Value):
-    """A lifted linear predictor z⁺ = A z + B u, x ≈ C z, z₀ = ψ(x₀).
+    """A lifted linear predictor z⁺ = A z + B u + E w, x ≈ C z, z₀ = ψ(x₀), w disturbances that are measured.
 
     Attributes
     ----------
@@ -47,11 +47,15 @@ class LinearPredictor(Value):
     exact_modes
         (nl, nz) exact DMD modes X′ V Σ⁻¹ W in the observables of the unreduced lifting, one a column, where a
         rank-truncated fit computed them; its `lifting` is then a Projected one.
+    E
+        (nz, nw); (nz, 0) without measured disturbances.
+    disturbances
+        Names of w with units; ``w0, w1, …`` by default.
 
     Raises
     ------
     ShapeError
-        A, B, C, the lifting and the names do not fit together.
+        A, B, C, E, the lifting and the names do not fit together.
 
     References
     ----------
@@ -68,6 +72,8 @@ class LinearPredictor(Value):
     inputs: tuple[str, ...]
     report: FitReport | None
     exact_modes: Complex[np.ndarray, "nl nz"] | None
+    E: Float[np.ndarray, "nz nw"]
+    disturbances: tuple[str, ...]
 
     def __init__(
         self,
@@ -80,6 +86,8 @@ class LinearPredictor(Value):
         inputs: Sequence[str],
         report: FitReport | None = None,
         exact_modes: Complex[np.ndarray, "nl nz"] | None = None,
+        E: ArrayLike | None = None,
+        disturbances: Sequence[str] | None = None,
     ) -> None:
         bound = lifting.bind(tuple(states))
         nz, nx, nu = bound.nz, len(states), len(inputs)
@@ -96,6 +104,11 @@ class LinearPredictor(Value):
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
             modes = np.array(modes, dtype=np.complex128, order="C")
+        drift = np.zeros((nz, 0)) if E is None else checks.array(E, "E", (nz, None))
+        nw = drift.shape[1]
+        names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
+        if len(names) != nw:
+            raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
         for name, value in {
             "A": transition,
             "B": checks.array(B, "B", (nz, nu)),
@@ -106,6 +119,8 @@ class LinearPredictor(Value):
             "inputs": tuple(inputs),
             "report": report,
             "exact_modes": modes,
+            "E": drift,
+            "disturbances": names,
         }.items():
             object.__setattr__(self, name, value)
 
@@ -124,12 +139,19 @@ class LinearPredictor(Value):
         """Number of lifted coordinates."""
         return self.A.shape[0]
 
+    @property
+    def nw(self) -> int:
+        """Number of measured disturbances."""
+        return self.E.shape[1]
+
     def lift(self, x: ArrayLike) -> Float[np.ndarray, "*batch nz"]:
         """Return z = ψ(x) for one state (nx,) or rows of states (M, nx)."""
         return self.lifting(checks.array(x, "x"))
 
-    def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
-        """Return x_k ≈ C z_k of z_{k+1} = A z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
+    def rollout(
+        self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None
+    ) -> Float[np.ndarray, "steps nx"]:
+        """Return x_k ≈ C z_k of z_{k+1} = A z_k + B u_k + E w_k, z_0 = ψ(x0), lifted once at the start.
 
         Parameters
         ----------
@@ -137,12 +159,16 @@ class LinearPredictor(Value):
             (nx,) initial state.
         U
             (T, nu) inputs; (T, 0) for an autonomous predictor.
+        W
+            (T, nw) measured disturbances; zero by default.
         """
         inputs = checks.array(U, "U", (None, self.nu))
         start = checks.array(x0, "x0", (self.nx,))
         Z = np.empty((len(inputs) + 1, self.nz))
         Z[0] = self.lift(start)
         forced = inputs @ self.B.T
+        if W is not None:
+            forced += checks.array(W, "W", (len(inputs), self.nw)) @ self.E.T
         for k in range(len(inputs)):
             np.dot(self.A, Z[k], out=Z[k + 1])
             Z[k + 1] += forced[k]
@@ -151,7 +177,7 @@ class LinearPredictor(Value):
         return X
 
     def step_map(self) -> StepMap:
-        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC."""
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC; w is 0."""
         x, u = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu)
         CA, CB = ca.DM(self.C @ self.A), ca.DM(self.C @ self.B)
         x_next = CA @ self.lifting.symbolic(x) + CB @ u

@@ -73,8 +73,8 @@ def test_limits_that_make_no_sense():
             r"slack is \(-1.0, 0.0\); pass weights \(linear, quadratic\) ≥ 0, one above zero, or None",
         ),
         ({"slack": (0.0, 0.0)}, km.DataError, r"slack is \(0.0, 0.0\); pass weights"),
-        ({"slack": (np.nan, 1.0)}, km.DataError, r"slack holds 1 NaN or inf"),
-        ({"slack": (np.inf, 1.0)}, km.DataError, r"slack holds 1 NaN or inf"),
+        ({"slack": (np.nan, 1.0)}, km.DataError, r"the linear weight of slack holds NaN"),
+        ({"slack": (1.0, np.inf)}, km.DataError, r"quadratic weight of slack holds 1 NaN or inf"),
     ):
         with pytest.raises(error, match=text):
             km.Limits(**kwargs)
@@ -104,5 +104,5 @@ show(lambda: km.Limits(slack=5))
         """DataError u_target is 'rest'; pass "equilibrium" or "zero\"""",
         """DataError solver is 'simplex'; there is "osqp\"""",
         "DataError horizon is 2.5; pass a whole number",
-        "ShapeError slack has shape (), expected (2,)",
+        "ShapeError slack is 5; pass (linear, quadratic), or None for hard limits",
     ]

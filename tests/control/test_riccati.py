@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import recursion, stationary
+from koopmpc.control.riccati import Stage, recursion, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -185,7 +185,7 @@ def test_the_recursion_is_a_bellman_equation(seed, nx, nu, N):
     A, B = random_pair(rng, nx, nu)
     Q, R = weights(rng, nx, nu)
     P_N, _ = weights(rng, nx, nu)
-    stages = recursion(A, B, Q, R, P_N, N)
+    stages = recursion([Stage(A, B, Q, None, R)] * N, P_N, np.zeros((nx, 0)))
     assert stages.K.shape == (N, nu, nx)
     P = P_N
     for k in range(N - 1, -1, -1):
