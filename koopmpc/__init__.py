@@ -38,6 +38,16 @@ from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import State
 from koopmpc.lifting.thin_plate import ThinPlate
+from koopmpc.loop.faults import (
+    ActuatorDelay,
+    ActuatorLoss,
+    DroppedSamples,
+    FrozenSensor,
+    NaNSensor,
+    SensorDelay,
+    SolverFailure,
+)
+from koopmpc.loop.injection import Fault, Injection
 from koopmpc.loop.metrics import Metrics, metrics
 from koopmpc.loop.run import Plans, Run
 from koopmpc.loop.simulate import Step, simulate
@@ -59,6 +69,8 @@ __all__ = [
     "LQR",
     "PRBS",
     "RK4",
+    "ActuatorDelay",
+    "ActuatorLoss",
     "Affine",
     "Box",
     "Case",
@@ -70,19 +82,23 @@ __all__ = [
     "DataError",
     "DefinitenessError",
     "Disk",
+    "DroppedSamples",
     "Dynamics",
     "Episode",
     "Episodes",
     "Euler",
     "Expressions",
     "Fallback",
+    "Fault",
     "Feedback",
     "FitReport",
     "FitWarning",
     "Fourier",
+    "FrozenSensor",
     "Gain",
     "Gaussian",
     "ImplicitMidpoint",
+    "Injection",
     "KoopmanMPC",
     "KoopmpcError",
     "Lifting",
@@ -96,6 +112,7 @@ __all__ = [
     "Monomials",
     "Move",
     "Multisine",
+    "NaNSensor",
     "Noise",
     "NonlinearMPC",
     "ObservableError",
@@ -107,9 +124,11 @@ __all__ = [
     "Recorder",
     "Run",
     "Score",
+    "SensorDelay",
     "ShapeError",
     "SimulatedPlant",
     "Snapshots",
+    "SolverFailure",
     "State",
     "Status",
     "Step",

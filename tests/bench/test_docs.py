@@ -1,8 +1,11 @@
-"""The example in docs/problems.md runs as it stands."""
+"""The examples in docs/problems.md and docs/faults.md run as they stand."""
 
 import re
 from pathlib import Path
 
+import numpy as np
+
+from koopmpc.bench.faults import FAULTS
 from koopmpc.bench.library import load_problem
 from koopmpc.bench.sweep import sweep
 
@@ -15,3 +18,21 @@ def test_the_example_of_the_documentation_runs_and_reaches(tmp_path):
     rows = sweep([load_problem(path)], folder=tmp_path / "logs")
     assert [row.failure for row in rows] == [None] * 10
     assert all(row.reached for row in rows if row.controller in ("koopman-mpc", "nonlinear-mpc"))
+
+
+def test_the_example_of_faults_runs(capsys):
+    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
+    (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    found = {}
+    exec(source, found)
+    run = found["run"]
+    assert np.isnan(run.Y).any()
+    assert np.abs(run.U[20:]).max() <= 12.5
+    assert len(run.metadata["faults"]) == 3
+    assert "BAD_MEASUREMENT" in capsys.readouterr().out
+
+
+def test_every_fault_is_in_the_documentation():
+    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
+    for fault in FAULTS.values():
+        assert f"| `{type(fault).__name__}(" in text
