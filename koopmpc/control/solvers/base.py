@@ -1,7 +1,8 @@
-"""The small interface of a QP solver: set up once, update vectors, solve; every outcome has a Status."""
+"""The small interface of a QP solver: set up once, update limits, solve; every outcome has a Status."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import scipy.sparse
@@ -9,7 +10,9 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.move import Status
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
+
+INFINITY = 1e30  # what OSQP and DAQP take for no limit
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class QPSolution:
 
 @runtime_checkable
 class QPSolver(Protocol):
-    """A QP whose P, q and A stay and whose limits move."""
+    """A QP whose P, q and A stay and whose limits move. Copies and pickles start afresh on the last limits."""
 
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits."""
@@ -62,6 +65,55 @@ class QPSolver(Protocol):
         """Forget what earlier solves left behind."""
         ...
 
-    def solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"]) -> QPSolution:
-        """Solve from the warm start (v, y)."""
+    def solve(
+        self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None = None
+    ) -> QPSolution:
+        """Solve from the warm start (v, y), within `time_limit` seconds: none by default, TIME_LIMIT if it is over."""
         ...
+
+
+Setup: TypeAlias = Callable[[QP, Mapping[str, Any] | None], QPSolver]
+
+
+class Bounds:
+    """The limits of a QP of m rows, checked and cut to ±INFINITY, in arrays of their own."""
+
+    def __init__(self, qp: QP) -> None:
+        m = len(qp.low)
+        self._ends = np.full(m, -INFINITY), np.full(m, INFINITY)
+        self.low, self.high = np.empty(m), np.empty(m)
+        self._spare = np.empty(m), np.empty(m)
+        self._in_order = bytearray(m)  # a search in bytes is five times as fast as all()
+        self._in_order_array = np.frombuffer(self._in_order, bool)
+        self.set(qp.low, qp.high)
+
+    def set(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
+        """Take new limits, ±inf where there is none; the old ones stay where they are refused.
+
+        Raises
+        ------
+        ShapeError
+            They have the wrong length.
+        DataError
+            They hold NaN or cross.
+        """
+        if low.shape != self.low.shape or high.shape != self.low.shape:
+            raise ShapeError(
+                f"the limits have shapes {low.shape} and {high.shape}, the QP has {len(self.low)} rows"
+            )
+        new_low, new_high = self._spare
+        np.maximum(low, self._ends[0], out=new_low)
+        np.minimum(high, self._ends[1], out=new_high)
+        np.less_equal(new_low, new_high, out=self._in_order_array)
+        if 0 in self._in_order:
+            raise DataError("the limits of the QP cross, hold NaN, or are beyond 1e30")
+        self._spare = self.low, self.high
+        self.low, self.high = new_low, new_high
+
+
+def check_start(qp: QP, v: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]) -> None:
+    """Raise where a warm start does not fit the QP."""
+    if v.shape != qp.q.shape or y.shape != qp.low.shape:
+        raise ShapeError(
+            f"the warm start has shapes {v.shape} and {y.shape}, the QP is {qp.q.shape}, {qp.low.shape}"
+        )

@@ -124,6 +124,25 @@ def test_every_end_has_a_status():
     assert box().solve(np.full(3, np.nan), zero).status is not km.Status.OPTIMAL
 
 
+def test_a_status_is_never_that_of_the_solve_before():
+    qp = random_qp(np.random.default_rng(0), 8, 12)
+    start, far = (np.zeros(8), np.zeros(12)), (np.full(8, 1e6), np.full(12, 1e6))
+    solver = OSQP(qp, {"max_iter": OSQP(qp).solve(*start).iterations})
+    assert solver.solve(*start).status is km.Status.OPTIMAL
+    hopeless = solver.solve(*far)
+    solver.update(qp.low, qp.high)
+    assert solver.solve(*far).status is hopeless.status is km.Status.MAX_ITERATIONS
+
+
+def test_the_first_time_limit_leaves_out_the_setup():
+    qp = random_qp(np.random.default_rng(0), 60, 120)
+    endless = {"eps_abs": 1e-300, "eps_rel": 0.0, "max_iter": 10**7}
+    solver, start = OSQP(qp, endless), (np.zeros(60), np.zeros(120))
+    first, second = (solver.solve(*start, time_limit=0.01) for _ in range(2))
+    assert first.status is second.status is km.Status.TIME_LIMIT
+    assert min(first.iterations, second.iterations) > 0
+
+
 def test_reset_forgets_the_step_size():
     rng = np.random.default_rng(0)
     qp = random_qp(rng, 8, 12)

@@ -1,0 +1,198 @@
+# pyright: basic
+"""DAQP behind our interface: the one file that imports it, checks what it accepts, and maps every exit flag.
+
+DAQP is a dual active-set method: exact to rounding, and fast where few rows are active; but what it holds before
+its end is infeasible. DAQP 0.11 takes short and NaN vectors and unknown settings without a word, ignores a row
+whose norm is below 3e-6, measures its tolerances in the units of the cost, and may call rows that are equal up to
+rounding contradictory. Nothing of that passes here: rows, variables and cost are scaled, the dense Hessian's
+answers are measured, and an infeasible problem is solved again, cold, with limits a tolerance wider, before it is
+believed to be infeasible. Scaling is left out where nothing is far from one: each multiplication costs as much as
+an iteration.
+
+Arnström, Bemporad & Axehill, "A dual active-set solver for embedded quadratic programming using recursive LDLᵀ
+updates", IEEE Trans. Automatic Control 67(8), 2022.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.control.move import Status
+from koopmpc.control.solvers.base import INFINITY, QP, Bounds, QPSolution, check_start
+from koopmpc.errors import DataError
+
+# eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
+DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
+_WIDER = (
+    1e-8  # how much wider the limits must be made, relative, before a problem is believed to be infeasible
+)
+_ACCURACY = 1e-6  # of the scaled KKT conditions where the Hessian is not the identity, relative
+
+_OPTIMAL, _INFEASIBLE, _CYCLING, _OVERDETERMINED, _TIME_LIMIT = 1, -1, -2, -6, -7
+_STATUS = {
+    _OPTIMAL: Status.OPTIMAL,
+    _INFEASIBLE: Status.INFEASIBLE,
+    -4: Status.MAX_ITERATIONS,
+    _TIME_LIMIT: Status.TIME_LIMIT,
+}
+
+
+class DAQP:
+    """A QP set up once in DAQP; limits move, solves start from the active rows of the last one.
+
+    Parameters
+    ----------
+    qp
+        The problem.
+    settings
+        DAQP's own settings, for example ``{"iter_limit": 200}``; they override `DEFAULTS`.
+
+    Raises
+    ------
+    DataError
+        daqp is not installed, or it refuses the problem or a setting.
+    """
+
+    def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
+        self._qp, self._settings = qp, dict(settings or {})
+        self._model = _model(self._settings)
+        self._time_limit = self._allowed = self._model.settings["time_limit"]
+        self._scale()
+        free = np.full(len(qp.low), INFINITY)
+        flag, _ = self._model.setup(self._H, self._f, self._M, free, -free)
+        if flag < 0:
+            raise DataError(f"DAQP refuses the problem, exit flag {flag}; pass a convex QP, P ⪰ 0")
+        self._bounds = Bounds(qp)
+        self._cold = True
+
+    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]]]:
+        return type(self), (replace(self._qp, low=self._bounds.low, high=self._bounds.high), self._settings)
+
+    def reset(self) -> None:
+        """Forget the active rows of the last solve."""
+        self._cold = True
+
+    def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
+        """Set new limits; ±inf where there is none.
+
+        Raises
+        ------
+        ShapeError
+            They have the wrong length.
+        DataError
+            They hold NaN or cross.
+        """
+        self._bounds.set(low, high)
+        self._send()
+
+    def solve(
+        self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None = None
+    ) -> QPSolution:
+        """Solve within `time_limit` seconds, looked at every 32 iterations.
+
+        (v, y) is only checked: to start from the active rows of the last solve, whose factors DAQP still holds, is
+        quicker than to start from the shifted ones.
+        """
+        check_start(self._qp, v, y)
+        if time_limit is not None and not time_limit > 0:
+            return QPSolution(v.copy(), y.copy(), Status.TIME_LIMIT, 0)
+        start = perf_counter()
+        if self._cold:
+            self._send()
+        limit = self._time_limit if time_limit is None else time_limit
+        x, multipliers, flag, iterations = self._run(limit)
+        if flag in (_INFEASIBLE, _CYCLING, _OVERDETERMINED):
+            left = limit - (perf_counter() - start) if limit else 0.0
+            if left < 0:
+                flag = _TIME_LIMIT
+            else:
+                self._cold = True
+                self._send(_WIDER)
+                x, multipliers, flag, more = self._run(left)
+                iterations += more
+        status = _STATUS.get(flag, Status.FAILED)
+        if status is Status.OPTIMAL and not self._exact and not self._accurate(x, multipliers):
+            status = Status.FAILED
+        self._cold = self._cold or status is not Status.OPTIMAL
+        if self._scaled:
+            x, multipliers = self._columns * x, self._multipliers * multipliers
+        return QPSolution(x, multipliers, status, iterations)
+
+    def _scale(self) -> None:
+        """Set DAQP's problem H, f, M with v = D x: unit diagonal of H, unit rows of M, a cost of the size of v."""
+        P, q, A = self._qp.P, self._qp.q, self._qp.A
+        diagonal = np.diag(P)
+        curved = diagonal > 0
+        unit = float(np.exp(np.log(diagonal[curved]).mean())) if curved.any() else 1.0
+        columns = np.sqrt(unit / np.where(curved, diagonal, unit))
+        norms = np.linalg.norm(A * columns, axis=1)
+        rows = 1.0 / np.where(norms > 0, norms, 1.0)
+        self._exact = bool(curved.all()) and not np.count_nonzero(P - np.diag(diagonal))
+        sizes = np.concatenate([[unit], columns, rows])
+        self._scaled = bool(sizes.min() < 0.01 or sizes.max() > 100)
+        if not self._scaled:
+            unit, columns, rows = 1.0, np.ones_like(columns), np.ones_like(rows)
+        self._H, self._f = P * np.outer(columns, columns) / unit, q * columns / unit
+        self._M = A * columns * rows[:, None]
+        self._columns, self._rows, self._multipliers = columns, rows, rows * unit
+
+    def _send(self, wider: float = 0.0) -> None:
+        """Give DAQP the limits, relaxed by the share `wider` of 1 + their size."""
+        self._low, self._high = self._bounds.low, self._bounds.high
+        if self._scaled:
+            self._low, self._high = self._rows * self._low, self._rows * self._high
+        if wider:
+            self._low = self._low - wider * (1 + np.abs(self._low))
+            self._high = self._high + wider * (1 + np.abs(self._high))
+        sense = np.zeros(len(self._rows), np.intc) if self._cold else None
+        self._refused = 0  # DAQP fails to update no rows
+        if len(self._rows):
+            self._refused = self._model.update(bupper=self._high, blower=self._low, sense=sense)
+        self._cold = wider > 0
+
+    def _run(self, limit: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], int, int]:
+        """Return what DAQP says of the limits that it has: x, multipliers, exit flag, iterations."""
+        if self._refused < 0:
+            return np.zeros_like(self._f), np.zeros_like(self._rows), self._refused, 0
+        if limit != self._allowed:
+            self._model.settings = {"time_limit": limit}
+            self._allowed = limit
+        x, _, flag, info = self._model.solve()
+        return x, info["lam"], flag, info["iterations"]
+
+    def _accurate(self, x: Float[np.ndarray, " n"], multipliers: Float[np.ndarray, " m"]) -> bool:
+        """Tell whether H x + f + Mᵀλ = 0 and low ≤ M x ≤ high hold."""
+        Hx, Mx, Ml = self._H @ x, self._M @ x, multipliers @ self._M
+        size = max(float(np.abs(part).max(initial=1.0)) for part in (Hx, self._f, Ml))
+        far = float(np.abs(Mx).max(initial=1.0))
+        still = float(np.abs(Hx + self._f + Ml).max())
+        outside = float(np.maximum(Mx - self._high, self._low - Mx).max(initial=0.0))
+        return still <= _ACCURACY * size and outside <= _ACCURACY * far
+
+
+def _model(settings: Mapping[str, Any]) -> Any:
+    """Return an empty DAQP model with checked settings."""
+    try:
+        import daqp
+    except ImportError as error:
+        raise DataError(
+            'daqp is not installed: pip install "koopmpc[daqp]", or pass solver="osqp"'
+        ) from error
+    model = daqp.Model()
+    known = model.settings
+    for name, value in settings.items():
+        if name not in known:
+            raise DataError(f"DAQP has no setting {name!r}; it has {', '.join(known)}")
+        if name.endswith("_tol"):
+            checks.positive(value, f"DAQP's {name}")
+        elif isinstance(known[name], int):
+            checks.count(value, f"DAQP's {name}", least=1 if name == "iter_limit" else -1)
+        else:
+            checks.array(value, f"DAQP's {name}", ())
+    model.settings = {**DEFAULTS, **settings}
+    return model

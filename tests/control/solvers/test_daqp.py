@@ -1,0 +1,145 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.control.solvers.base import QP
+from tests.bare import shown
+from tests.control.solvers.random_qps import exactness, random_qp
+
+pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
+from koopmpc.control.solvers.daqp import DAQP
+
+ONE, EYE = np.ones(2), np.eye(2)
+
+
+def box(**settings):
+    return DAQP(QP(EYE, -3 * ONE, EYE, -ONE, ONE), settings)
+
+
+def solved(solver, n=2, m=2):
+    return solver.solve(np.zeros(n), np.zeros(m))
+
+
+def test_exact_to_rounding():
+    rng = np.random.default_rng(0)
+    for kind in ("box", "hard", "soft", "degenerate", "scaled"):
+        qp = random_qp(rng, kind, 12)
+        solution = DAQP(qp).solve(np.zeros(len(qp.q)), np.zeros(len(qp.low)))
+        assert solution.status is km.Status.OPTIMAL
+        assert exactness(qp, solution.v, solution.y) < 1e-10
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1.0, 1e6, 1e9])
+def test_units_of_rows_and_cost_do_not_matter(unit):
+    """Bare DAQP drops rows of norm 1e-7, and measures feasibility by the root of the cost."""
+    solution = solved(DAQP(QP(EYE, -3 * ONE, unit * EYE, -unit * ONE, unit * ONE)))
+    np.testing.assert_allclose(solution.v, ONE, rtol=1e-12)
+    np.testing.assert_allclose(unit * solution.y, 2 * ONE, rtol=1e-12)
+    solution = solved(DAQP(QP(unit * EYE, -3 * unit * ONE, EYE, -ONE, ONE)))
+    np.testing.assert_allclose(solution.v, ONE, rtol=1e-12)
+    np.testing.assert_allclose(solution.y, 2 * unit * ONE, rtol=1e-12)
+
+
+def test_rows_close_to_equal_are_not_contradictory():
+    """More equalities than variables, all met at one point to rounding: bare DAQP calls some infeasible."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        n = int(rng.integers(1, 9))
+        half, A, inside = rng.normal(size=(n, n)), rng.normal(size=(2 * n, n)), rng.normal(size=n)
+        qp = QP(half @ half.T + np.eye(n), rng.normal(size=n), A, A @ inside, A @ inside)
+        solution = solved(DAQP(qp), n, 2 * n)
+        assert solution.status is km.Status.OPTIMAL
+        np.testing.assert_allclose(solution.v, inside, atol=1e-5)
+
+
+def test_equalities_come_and_go():
+    solver = box()
+    for low, high, v in ((0.5, 0.5, 0.5), (-1, 1, 1), (-np.inf, np.inf, 3), (2, 2, 2), (-4, -3.5, -3.5)):
+        solver.update(low * ONE, high * ONE)
+        np.testing.assert_allclose(solved(solver).v, v * ONE, atol=1e-12)
+
+
+def test_empty_rows():
+    qp = QP(EYE, -3 * ONE, np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([-1.0, -1.0]), ONE)
+    solver = DAQP(qp)
+    np.testing.assert_allclose(solved(solver).v, [1, 3], atol=1e-12)
+    solver.update(np.array([0.5, -1.0]), ONE)
+    assert solved(solver).status is km.Status.INFEASIBLE
+    solver.update(qp.low, qp.high)
+    np.testing.assert_allclose(solved(solver).v, [1, 3], atol=1e-12)
+    np.testing.assert_allclose(solved(DAQP(QP(EYE, ONE, EYE[:0], ONE[:0], ONE[:0])), 2, 0).v, -ONE)
+
+
+def test_limits_are_as_they_were_after_the_wider_second_solve():
+    apart = np.vstack([EYE, EYE[:1]])
+    solver = DAQP(QP(EYE, -3 * ONE, apart, -np.ones(3), np.ones(3)))
+    solver.update(np.array([-1.0, -1.0, 2.0]), np.array([1.0, 1.0, 3.0]))
+    for _ in range(3):
+        assert solved(solver, 2, 3).status is km.Status.INFEASIBLE
+    solver.update(-np.ones(3), np.ones(3))
+    np.testing.assert_array_equal(solved(solver, 2, 3).v, ONE)
+
+
+def test_every_end_has_a_status():
+    qp = random_qp(np.random.default_rng(0), "hard", 60)
+    assert solved(DAQP(qp, {"iter_limit": 3}), 60, 120).status is km.Status.MAX_ITERATIONS
+    assert solved(DAQP(qp, {"time_limit": 1e-9}), 60, 120).status is km.Status.TIME_LIMIT
+    unbounded = QP(np.diag([1.0, 0.0]), -ONE, EYE[:1], -ONE[:1], ONE[:1])
+    assert solved(DAQP(unbounded), 2, 1).status is km.Status.FAILED
+    with pytest.raises(
+        km.DataError, match=r"DAQP refuses the problem, exit flag -5; pass a convex QP, P ⪰ 0"
+    ):
+        DAQP(QP(-EYE, ONE, EYE, -ONE, ONE))
+
+
+def test_an_answer_that_misses_its_conditions_is_a_failure():
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.normal(size=(8, 8)))[0]
+    statuses = set()
+    for _ in range(100):  # condition numbers that no explicit inverse of a factor survives
+        P = basis * np.logspace(0, -15, 8) @ basis.T
+        qp = QP((P + P.T) / 2, rng.normal(size=8), rng.normal(size=(16, 8)), -np.ones(16), np.ones(16))
+        solution = solved(DAQP(qp), 8, 16)
+        statuses.add(solution.status)
+        assert solution.status is not km.Status.OPTIMAL or exactness(qp, solution.v, solution.y) < 1e-5
+    assert km.Status.OPTIMAL in statuses
+
+
+def test_settings_that_daqp_would_swallow():
+    with pytest.raises(km.DataError, match=r"DAQP has no setting 'eps_abs'; it has primal_tol, dual_tol,"):
+        box(eps_abs=1e-9)
+    with pytest.raises(km.DataError, match=r"DAQP's primal_tol is -1; it must be above zero"):
+        box(primal_tol=-1.0)
+    with pytest.raises(km.DataError, match=r"DAQP's iter_limit is 0; it must be at least 1"):
+        box(iter_limit=0)
+    with pytest.raises(km.DataError, match=r"DAQP's time_limit holds 1 NaN or inf"):
+        box(time_limit=np.nan)
+    (line,) = shown(
+        """
+from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.daqp import DAQP
+one = np.ones(1)
+show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5}))
+"""
+    )
+    assert line == "DataError DAQP's iter_limit is 2.5; pass a whole number"
+
+
+def test_a_missing_daqp_says_what_to_install():
+    code = """
+import sys
+sys.modules["daqp"] = None
+import numpy as np, koopmpc as km
+from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.choose import solver
+one = np.ones(1)
+try:
+    solver("daqp")(QP(np.eye(1), one, np.eye(1), -one, one), None)
+except km.DataError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == 'daqp is not installed: pip install "koopmpc[daqp]", or pass solver="osqp"\n'
