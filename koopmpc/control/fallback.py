@@ -5,9 +5,9 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.lifted import HUGE
 from koopmpc.control.limits import Box
 from koopmpc.control.move import Fallback
+from koopmpc.lifting.buffered import HUGE
 
 
 def admitted(

@@ -13,13 +13,16 @@ from koopmpc.control.condense import Coordinates
 from koopmpc.control.cost import Cost
 from koopmpc.control.fallback import PlanMemory, admitted
 from koopmpc.control.horizon import blocked
-from koopmpc.control.lifted import HUGE, buffered, reference_rows
+from koopmpc.control.lifted import reference_rows
 from koopmpc.control.limits import Box, Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
+from koopmpc.control.origin import Origin
 from koopmpc.control.plan_map import PlanMap
 from koopmpc.control.solvers.base import QPSolution
 from koopmpc.control.solvers.osqp import OSQP
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.estimate.observer import Estimator, Observer
+from koopmpc.lifting.buffered import HUGE
 from koopmpc.plant.step_map import StepMap
 from koopmpc.predict.linear import LinearPredictor
 
@@ -47,6 +50,13 @@ class KoopmanMPC:
     moves
         How many inputs the plan has: M of them, the last held to the end of the horizon, or the lengths of the
         blocks of steps in which each is held. By default one a step.
+    estimator
+        Estimates z and a disturbance d of every lifted coordinate, so that no offset is left: `LiftedDisturbance`
+        where y is the state, `LiftedKalman` where y is some of it. Without one y is the state, and d zero.
+    latency
+        Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts
+        from the state predicted for then, under the inputs that are still to act; zero moved inside the limits
+        acts before the first. `horizon` grows by it: more of the reference is read.
     disturbed
         True makes room for a constant disturbance d of every lifted coordinate, which `disturb` sets.
     coordinates
@@ -81,6 +91,8 @@ class KoopmanMPC:
         limits: Limits | None = None,
         horizon: int = 20,
         *,
+        estimator: Estimator | None = None,
+        latency: int = 0,
         moves: int | Sequence[int] | None = None,
         disturbed: bool = False,
         coordinates: Coordinates = "auto",
@@ -94,9 +106,10 @@ class KoopmanMPC:
         self._N, self._nu = checks.count(horizon, "horizon"), predictor.nu
         self._blocks = blocked(moves, self._N)
         self.predictor, self.cost, self.limits = predictor, cost, Limits() if limits is None else limits
-        self._disturbed = disturbed
+        self._latency = checks.count(latency, "latency", 0)
+        self._disturbed = disturbed or estimator is not None
         self._map = PlanMap(
-            predictor, cost, self.limits, self._blocks, disturbed=disturbed, coordinates=coordinates
+            predictor, cost, self.limits, self._blocks, disturbed=self._disturbed, coordinates=coordinates
         )
         track, self._program = self._map.track, self._map.program
         self._settings = settings
@@ -105,12 +118,14 @@ class KoopmanMPC:
         self._dual = np.zeros(len(self._program.low) + 1)
         self._warm = self._planned = False
         self._rated = self._map.horizon.rated
-        self._signals = self._rated or disturbed or predictor.nw > 0
+        self._signals = self._rated or predictor.nw > 0
         self._hard_rates = _hard(track.rates, track.rate_softness.linear)
         self._move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
         self._memory = PlanMemory(track.inputs, self._N, track.rates, self._move_of)
 
-        self._lift = buffered(predictor.lifting)
+        self._origin = Origin(predictor, estimator, self._latency)
+        self._ahead = np.zeros((self._latency + 1, predictor.nw))
+        self._estimated = estimator is not None
         rows, columns = self._map.matrix.shape
         self._known = np.zeros(columns)
         self._known[-1] = 1.0
@@ -152,8 +167,13 @@ class KoopmanMPC:
 
     @property
     def horizon(self) -> int:
-        """Steps N of the plan."""
-        return self._N
+        """Steps of preview: N of the plan, after those of the latency."""
+        return self._N + self._latency
+
+    @property
+    def observer(self) -> Observer:
+        """The estimate now: its z, and its disturbance d."""
+        return self._origin.observer
 
     @property
     def coordinates(self) -> str:
@@ -164,12 +184,13 @@ class KoopmanMPC:
         """Forget all earlier steps, so that a run repeats to the bit.
 
         `u_prev`, zero moved inside the limits by default, is where rates count from, and is held if the first step
-        fails. A disturbance that `disturb` set is forgotten too.
+        fails. A disturbance that `disturb` set is forgotten too. A filter starts at x0, by default at zero.
         """
         self._memory.reset(u_prev)
         self._solver.reset()
         self._warm = self._planned = False
         self._drive[:] = 0.0
+        self._origin.reset(x0, self._memory.last())
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
@@ -196,6 +217,7 @@ class KoopmanMPC:
         self.predictor, self._program = predictor, self._map.program
         self._solver = OSQP(self._program.qp, self._settings)
         self._reference_key = None
+        self._origin.adopt(predictor)
 
     def disturb(self, d: ArrayLike) -> None:
         """Set the disturbance d (nz,) of z⁺ = A z + B u + E w + d from the next step on.
@@ -221,35 +243,29 @@ class KoopmanMPC:
         applied: ArrayLike | None = None,
         w: ArrayLike | None = None,
     ) -> Move:
-        """Return the first input of the plan for state y.
+        """Return the first input of the plan for measurement y.
 
         Parameters
         ----------
         y
-            (nx,) measured state.
+            (nx,) measured state, or the (ny,) measurements of the estimator; there NaN is a missed one.
         reference
-            (nr,) held over the horizon, or rows r_k … r_{k+N}, the last repeated.
+            (nr,) held over the horizon, or rows r_k … r_{k+N}, the last repeated; r_{k+N+latency} with latency.
         applied
             (nu,) what the plant really got last; by default the last u returned.
         w
-            (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N−1}, the last repeated; by
-            default zero.
+            (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N−1}, the last repeated,
+            w_{k+N+latency−1} with latency; by default zero.
         """
         start = perf_counter()
-        (x,), (z,), lift, _ = self._lift.slot()
-        measured = np.asarray(y, dtype=np.float64)
-        if measured.shape != x.shape:
-            raise ShapeError(f"y has shape {measured.shape}, expected {x.shape}, one value a state")
-        x[:] = measured
-        lift()
-        self._z[:] = z
+        if self._signals or w is not None:
+            self._take(applied, w)
+        self._begin(np.asarray(y, dtype=np.float64), applied)
         target = np.asarray(reference, dtype=np.float64)
         key = target.tobytes()
         if key != self._reference_key:
             self._aim(target)
             self._reference_key = key
-        if self._signals or w is not None:
-            self._take(applied, w)
 
         t = self._spare
         np.dot(self._map.matrix, self._known, out=t)
@@ -275,31 +291,44 @@ class KoopmanMPC:
             Z[k + 1] = A @ Z[k] + B @ U[k] + push[k]
         return Plan(Z @ C.T, U)
 
+    def _begin(self, y: Float[np.ndarray, "..."], applied: ArrayLike | None) -> None:
+        """Write down where the plan starts."""
+        origin = self._origin
+        origin.take(y, self._memory.last(), applied, self._ahead)
+        self._z[:] = origin.z
+        if self._estimated:
+            self._d[:] = origin.d
+
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the last column."""
+        if reference.ndim == 2:
+            reference = reference[min(self._latency, len(reference) - 1) :]
         self._reference = reference_rows(reference, self._N, self._reference.shape[1])
         self._map.aim(self._reference)
 
     def _take(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
         """Write down the last input and the preview of disturbances."""
         if self._rated:
-            last = self._memory.last() if applied is None else np.asarray(applied, dtype=np.float64)
+            computed = applied is None or self._latency  # what acted before the plan's first input
+            last = self._memory.last() if computed else np.asarray(applied, dtype=np.float64)
             if last.shape != self._u_prev.shape:
                 raise ShapeError(f"applied has shape {last.shape}, expected {self._u_prev.shape}")
             self._u_prev[:] = last
         if w is None:
-            self._W[:] = 0.0
+            self._W[:] = self._ahead[:] = 0.0
             return
         rows, nw = np.asarray(w, dtype=np.float64), self.predictor.nw
         if nw == 0:
             raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
-        if rows.shape != (nw,) and rows.shape != self._W.shape:
-            if rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0:
-                raise ShapeError(
-                    f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{self._N - 1}"
-                )
-            rows = rows[np.minimum(np.arange(self._N), len(rows) - 1)]
-        self._W[:] = rows
+        steps = self._N + self._latency
+        if rows.shape != (nw,) and (rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0):
+            raise ShapeError(
+                f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{steps - 1}"
+            )
+        if rows.ndim == 2 and len(rows) != steps:
+            rows = rows[np.minimum(np.arange(steps), len(rows) - 1)]
+        self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
+        self._W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._warm = False
@@ -391,6 +420,8 @@ class LinearMPC(KoopmanMPC):
         limits: Limits | None = None,
         horizon: int = 20,
         *,
+        estimator: Estimator | None = None,
+        latency: int = 0,
         moves: int | Sequence[int] | None = None,
         disturbed: bool = False,
         coordinates: Coordinates = "auto",
@@ -402,6 +433,8 @@ class LinearMPC(KoopmanMPC):
             cost,
             limits,
             horizon,
+            estimator=estimator,
+            latency=latency,
             moves=moves,
             disturbed=disturbed,
             coordinates=coordinates,

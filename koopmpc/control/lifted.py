@@ -1,8 +1,7 @@
-"""What LQR and KoopmanMPC share: a predictor's matrices, cost and targets, and ψ(x) at microseconds."""
+"""What LQR and KoopmanMPC share: a predictor's matrices under a cost and limits, and targets."""
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
@@ -11,13 +10,11 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Box, Limits, Softness
 from koopmpc.control.target import Targets, targets
 from koopmpc.errors import ShapeError
+from koopmpc.estimate.observer import constant_index
 from koopmpc.lifting.base import Lifting, rows
-from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
-from koopmpc.plant.buffered import Buffered
 from koopmpc.predict.linear import LinearPredictor
-
-HUGE = 1e30
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ def tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> Tracking
     G = np.ascontiguousarray(G[kept])
     inputs = limits.inputs(nu)
     hold = cost.u_target == "equilibrium"
-    constant = _constant(predictor)
+    constant = constant_index(predictor)
     found = targets(predictor.A, predictor.B, C, Q, inputs, G, outputs, constant, hold=hold)
     return Tracking(
         C,
@@ -84,17 +81,6 @@ def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr n
     return np.eye(predictor.nz)[rows(predictor.lifting, wanted)]
 
 
-def buffered(lifting: Lifting) -> Buffered:
-    """Return ψ as a function of one state, at about a microsecond a call.
-
-    One state that is NaN, or beyond 1e30, makes all of them NaN: a bad measurement shows in every product with z,
-    and NaN, unlike inf, passes through products in silence.
-    """
-    x = ca.SX.sym("x", len(lifting.bound or ()))
-    measured = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
-    return Buffered(ca.Function("psi", [x], [ca.densify(lifting.symbolic(measured))], {"cse": True}))
-
-
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int) -> Float[np.ndarray, "N1 nr"]:
     """Return N + 1 rows of a reference (nr,) that is held or (M, nr) whose last row is repeated.
 
@@ -107,9 +93,3 @@ def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int) -> Floa
         )
     R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
     return np.ascontiguousarray(R[np.minimum(np.arange(N + 1), len(R) - 1)])
-
-
-def _constant(predictor: LinearPredictor) -> int | None:
-    name = Constant().bind(predictor.states).names[0]
-    names = predictor.lifting.names
-    return names.index(name) if name in names else None

@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.lifted import HUGE, buffered, reference_rows, tracking
+from koopmpc.control.lifted import reference_rows, tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import stationary
+from koopmpc.lifting.buffered import HUGE, buffered
 from koopmpc.predict.linear import LinearPredictor
 
 ITERATIONS = 10_000

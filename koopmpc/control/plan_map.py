@@ -7,12 +7,13 @@ from koopmpc import checks
 from koopmpc.control.condense import Condensed, Coordinates, condense
 from koopmpc.control.cost import Cost
 from koopmpc.control.horizon import Horizon, end, one_step, stages
-from koopmpc.control.lifted import HUGE, Tracking, tracking
+from koopmpc.control.lifted import Tracking, tracking
 from koopmpc.control.limits import Limits, Softness
 from koopmpc.control.program import Group, Program, program
 from koopmpc.control.riccati import recursion, stationary
 from koopmpc.control.target import margin
 from koopmpc.errors import ShapeError
+from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
 from koopmpc.predict.linear import LinearPredictor
 

@@ -1,0 +1,1 @@
+"""Estimate: where the lifted state is, and what disturbs it."""

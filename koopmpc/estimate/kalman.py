@@ -1,0 +1,172 @@
+"""LiftedKalman: a Kalman filter on [z; d] for what is measured of the lifted state, late or now and then."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.estimate.detectable import Hidden, hidden
+from koopmpc.estimate.filter import Augmented, Kalman, Model
+from koopmpc.estimate.observer import constant_index, places
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedKalman(Value):
+    """Stationary Kalman filter on s = [z; d]: z⁺ = A z + B u + E w + B_d d, d⁺ = d, y = H z + C_d d.
+
+    z is never lifted afresh. There is one disturbance for each measurement, so that at rest the filter explains y
+    exactly: with the tracked outputs among those measured, and no more of them than inputs, the loop has no offset.
+    The Constant is known, and never estimated.
+
+    Parameters
+    ----------
+    outputs
+        What y holds: names of observables, with or without unit, or a matrix H (ny, nz).
+    disturbance
+        "input": the first nu outputs are explained by disturbances of the inputs (B_d = B), each further one by
+        an offset of its own. "output": every output has an offset of its own (C_d = I); not for a plant that
+        integrates, or is unstable with an observable that drifts: those offsets cannot be told from its motion.
+    process, drift, noise
+        Covariances of a step of z (without the Constant), of a step of d, and of y; a scalar or a vector is a
+        diagonal. Only their ratios matter. More `drift` learns disturbances faster, more `noise` trusts y less, and
+        much `process` gives misfits to slow modes of z, which then return slowly.
+    delay
+        y is `delay` steps old; what followed is predicted from the inputs that acted since.
+    patience
+        So many samples without any measurement in a row are bridged by prediction; then the state is unknown.
+
+    Raises
+    ------
+    DataError
+        A setting is out of range; when a controller is built, the disturbance is not detectable.
+    ObservableError
+        When a controller is built, the lifting lacks an output.
+
+    References
+    ----------
+    Pannocchia & Rawlings, "Disturbance models for offset-free model-predictive control", AIChE Journal 49, 2003;
+    Maeder, Borrelli & Morari, "Linear offset-free model predictive control", Automatica 45, 2009.
+    """
+
+    outputs: str | Sequence[str] | ArrayLike
+    disturbance: Literal["input", "output"] = "input"
+    process: ArrayLike = 1e-4
+    drift: ArrayLike = 1.0
+    noise: ArrayLike = 1e-4
+    delay: int = 0
+    patience: int = 10
+
+    def __post_init__(self) -> None:
+        given = self.outputs
+        if isinstance(given, str):
+            object.__setattr__(self, "outputs", (given,))
+        elif isinstance(given, Sequence) and given and all(isinstance(name, str) for name in given):
+            object.__setattr__(self, "outputs", tuple(given))
+        else:
+            object.__setattr__(
+                self, "outputs", checks.array(cast("ArrayLike", given), "outputs", (None, None))
+            )
+        if self.disturbance not in ("input", "output"):
+            raise DataError(f'disturbance is {self.disturbance!r}; pass "input" or "output"')
+        for name in ("process", "drift", "noise"):
+            stored = checks.array(getattr(self, name), name)
+            checks.weight(stored, name, definite=True)
+            object.__setattr__(self, name, stored)
+        checks.count(self.delay, "delay", 0)
+        checks.count(self.patience, "patience", 0)
+
+    def start(self, predictor: LinearPredictor) -> Kalman:
+        """Return the observer of one controller.
+
+        Raises
+        ------
+        DataError
+            The disturbance, or the state, is not detectable from the outputs.
+        ObservableError, ShapeError
+            The lifting lacks an output; H has another width than z.
+        """
+        return Kalman(self._model, predictor, self.delay, self.patience)
+
+    def _model(self, predictor: LinearPredictor) -> Model:
+        """Return the filter's matrices for a predictor, or say why there are none."""
+        nz, nu = predictor.nz, predictor.nu
+        H = self._matrix(predictor)
+        ny, constant = len(H), constant_index(predictor)
+        kept = np.array([i for i in range(nz) if i != constant], dtype=np.intp)
+        if np.linalg.matrix_rank(H[:, kept]) < ny:
+            raise DataError("outputs depend on each other (or on the Constant alone); name each one once")
+        if self.disturbance == "output":
+            Bd, Cd = np.zeros((nz, ny)), np.eye(ny)
+        elif ny < nu:
+            raise DataError(
+                f"{ny} outputs cannot tell the disturbances of {nu} inputs apart; measure at least {nu}, or use "
+                'disturbance="output"'
+            )
+        else:
+            Bd, Cd = np.hstack([predictor.B, np.zeros((nz, ny - nu))]), np.eye(ny, ny)
+            Cd[:nu] = 0.0
+        model = Augmented(predictor, kept, H, Bd, Cd)
+        lost = hidden(model.F, model.M)
+        if lost is not None:
+            raise DataError(self._words(predictor, model, lost))
+        n = len(kept)
+        Q = scipy.linalg.block_diag(
+            checks.weight(self.process, "process", n), checks.weight(self.drift, "drift", ny)
+        )
+        R = checks.weight(self.noise, "noise", ny)
+        return Model(model, _stationary(model.F, model.M, Q, R), R)
+
+    def _matrix(self, predictor: LinearPredictor) -> Float[np.ndarray, "ny nz"]:
+        if isinstance(self.outputs, tuple):
+            return np.eye(predictor.nz)[places(predictor.lifting, cast("tuple[str, ...]", self.outputs))]
+        H = cast("Float[np.ndarray, 'ny nz']", self.outputs)
+        if H.shape[1] != predictor.nz or not len(H):
+            raise ShapeError(
+                f"outputs has shape {H.shape}, expected (ny, {predictor.nz}), one column an observable"
+            )
+        return H
+
+    def _words(self, predictor: LinearPredictor, model: Augmented, lost: Hidden) -> str:
+        """Say what moves unseen, and what to do."""
+        ny, nu = len(model.M), predictor.nu
+        names = predictor.lifting.names
+        labels = [f"{names[int(i)]!r}" for i in model.kept]
+        outputs = self.outputs if isinstance(self.outputs, tuple) else tuple(f"row {i}" for i in range(ny))
+        first = 0 if self.disturbance == "output" else nu
+        labels += [f"a disturbance of input {name!r}" for name in predictor.inputs[:first]]
+        labels += [f"an offset of output {name!r}" for name in outputs[first:]]
+        size = np.abs(lost.direction)
+        largest = [int(i) for i in np.argsort(-size, kind="stable")[:4] if size[i] > 0.1 * size.max()]
+        moved = ", ".join(labels[i] for i in largest)
+        other = "input" if self.disturbance == "output" else "output"
+        value = lost.eigenvalue
+        written = f"{value.real:.4g}" if value.imag == 0 else f"{value:.4g}"
+        return (
+            f"not detectable from {', '.join(str(name) for name in outputs)}: with λ = {written}, {moved} can move "
+            f"without a trace in y; measure one of them, drop it from the lifting, or use disturbance={other!r}"
+        )
+
+
+def _stationary(
+    F: Float[np.ndarray, "n n"],
+    M: Float[np.ndarray, "ny n"],
+    Q: Float[np.ndarray, "n n"],
+    R: Float[np.ndarray, "ny ny"],
+) -> Float[np.ndarray, "n n"]:
+    """Return P = F (P − P Mᵀ(M P Mᵀ + R)⁻¹ M P) Fᵀ + Q, the covariance before a measurement."""
+    try:
+        P = np.asarray(scipy.linalg.solve_discrete_are(F.T, M.T, Q, R))
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            f"no stationary filter was found ({error}); the disturbance is hardly detectable: measure more, or drop "
+            "observables"
+        ) from error
+    return 0.5 * (P + P.T)

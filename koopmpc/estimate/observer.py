@@ -1,0 +1,80 @@
+"""What a controller asks of an estimator: the lifted state z and the disturbance d of z⁺ = A z + B u + d."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc.errors import ObservableError
+from koopmpc.lifting.base import Lifting, short
+from koopmpc.lifting.constant import Constant
+from koopmpc.predict.linear import LinearPredictor
+
+
+@runtime_checkable
+class Observer(Protocol):
+    """The estimate of one run: z and d are rewritten in place by `update`."""
+
+    @property
+    def ny(self) -> int:
+        """Number of measurements in y."""
+        ...
+
+    @property
+    def z(self) -> Float[np.ndarray, " nz"]:
+        """The lifted state now."""
+        ...
+
+    @property
+    def d(self) -> Float[np.ndarray, " nz"]:
+        """The disturbance of z⁺ = A z + B u + d, held constant over the horizon."""
+        ...
+
+    def reset(self, x0: ArrayLike | None = None) -> None:
+        """Forget everything; the run starts at x0, where it is known."""
+        ...
+
+    def adopt(self, predictor: LinearPredictor) -> None:
+        """Go on with another model of the same lifting."""
+        ...
+
+    def update(
+        self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+    ) -> bool:
+        """Take y; u and w acted since the last call. Return whether z and d can be used."""
+        ...
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """A rule of estimation: `LiftedDisturbance`, `LiftedKalman`, or a user's own."""
+
+    def start(self, predictor: LinearPredictor) -> Observer:
+        """Return the observer of one controller."""
+        ...
+
+
+def constant_index(predictor: LinearPredictor) -> int | None:
+    """Return where the lifting holds the Constant, which is known; None where it does not."""
+    name = Constant().bind(predictor.states).names[0]
+    names = predictor.lifting.names
+    return names.index(name) if name in names else None
+
+
+def places(lifting: Lifting, names: tuple[str, ...]) -> list[int]:
+    """Return the indices of observables by name, with or without the unit.
+
+    Raises
+    ------
+    ObservableError
+        The lifting lacks one of them.
+    """
+    place = {short(name): i for i, name in enumerate(lifting.names)}
+    place |= {name: i for i, name in enumerate(lifting.names)}
+    for name in names:
+        if name not in place:
+            raise ObservableError(
+                f"the lifting lacks {name!r}; add it to the lifting: it holds {', '.join(lifting.names)}"
+            )
+    return [place[name] for name in names]

@@ -1,0 +1,270 @@
+"""LiftedKalman against a textbook filter, and what it finds."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.estimate.kalman import LiftedKalman
+from tests.estimate.plants import Textbook, linear, stable
+
+NO_W = np.zeros(0)
+
+
+def textbook(model, H, disturbance, rule):
+    """The filter on [x; d] of an affine model on State() (+ Constant())."""
+    nx, nu, ny = model.nx, model.nu, len(H)
+    A, B = model.A[:nx, :nx], model.B[:nx]
+    c = model.A[:nx, nx] if model.nz > nx else np.zeros(nx)
+    Bd = np.hstack([B, np.zeros((nx, ny - nu))]) if disturbance == "input" else np.zeros((nx, ny))
+    Cd = np.diag(np.r_[np.zeros(nu), np.ones(ny - nu)]) if disturbance == "input" else np.eye(ny)
+    F = np.block([[A, Bd], [np.zeros((ny, nx)), np.eye(ny)]])
+    Q = np.diag(np.r_[np.full(nx, float(rule.process)), np.full(ny, float(rule.drift))])
+    G = np.vstack([B, np.zeros((ny, nu))])
+    loop = Textbook(
+        F,
+        G,
+        np.r_[c, np.zeros(ny)],
+        np.hstack([H, Cd]),
+        Q,
+        float(rule.noise) * np.eye(ny),
+        np.zeros(nx + ny),
+        Q,
+    )
+    loop.P = loop.settle()
+    return loop, Bd, Cd
+
+
+@pytest.mark.parametrize("disturbance", ["input", "output"])
+@pytest.mark.parametrize("affine", [False, True])
+@given(seed=st.integers(0, 10**6))
+def test_it_equals_the_textbook_filter(disturbance, affine, seed):
+    rng = np.random.default_rng(seed)
+    (A, B), H, c = stable(rng, 3, 1), np.eye(2, 3), rng.normal(size=3)
+    model = linear(A, B, c if affine else None)
+    rule = LiftedKalman(("x0", "x1"), disturbance, process=0.1, drift=0.2, noise=0.3)
+    try:
+        mine = rule.start(model)
+    except km.DataError:
+        return  # a random plant may be undetectable; test_detectable judges that
+    book, Bd, Cd = textbook(model, H, disturbance, rule)
+    shift = H.T @ Cd
+    mine.reset(np.zeros(3))
+    u = np.zeros(1)
+    for k in range(30):
+        y = rng.normal(size=2)
+        if k % 7 == 3:
+            y[rng.integers(2)] = np.nan
+        if k % 11 == 5:
+            y[:] = np.nan
+        held = book.P
+        if k:
+            book.predict(u)
+            book.P = held
+        s = book.correct(y) if np.isfinite(y).any() else book.s
+        book.P = held  # the stationary one throughout
+        assert mine.update(y, u, NO_W)
+        x, d = s[:3], s[3:]
+        np.testing.assert_allclose(mine.z[:3], x + shift @ d, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(mine.d[:3], Bd @ d + (np.eye(3) - A) @ shift @ d, rtol=1e-6, atol=1e-6)
+        if affine:
+            assert mine.z[3] == 1.0
+            assert mine.d[3] == 0.0
+        u = rng.normal(size=1)
+
+
+def test_the_constant_is_known_whatever_a_fit_has_made_of_its_row():
+    A, B = np.diag([0.5, 0.8]), np.ones((2, 1))
+    model = linear(A, B, [1.0, 2.0])
+    spoiled = km.LinearPredictor(
+        model.A + 1e-3 * np.eye(3)[:, [2]] * np.ones(3),
+        model.B,
+        model.C,
+        model.lifting,
+        0.1,
+        model.states,
+        model.inputs,
+    )
+    for disturbance in ("input", "output"):
+        seen = []
+        for one in (model, spoiled):
+            observer = LiftedKalman("x0", disturbance).start(one)
+            for k in range(20):
+                observer.update(np.array([np.sin(k)]), np.array([np.cos(k)]), NO_W)
+            seen.append(np.r_[observer.z, observer.d])
+        np.testing.assert_array_equal(*seen)
+
+
+@given(st.integers(0, 10**6), st.sampled_from(["input", "output"]))
+def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
+    """Whatever the plant: with constant u and y, H z = y and z = A z + B u + d."""
+    rng = np.random.default_rng(seed)
+    A, B = np.diag(rng.uniform(-0.5, 0.7, 3)), rng.uniform(0.5, 1.5, (3, 1))
+    model = linear(A, B, rng.normal(size=3))
+    observer = LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model)
+    y, u = rng.normal(size=2), rng.normal(size=1)
+    for _ in range(400):
+        observer.update(y, u, NO_W)
+    z, d = observer.z, observer.d
+    np.testing.assert_allclose(model.A @ z + model.B @ u + d, z, atol=1e-8)
+    np.testing.assert_allclose(z[:2], y, atol=1e-8)
+
+
+def test_it_finds_a_load_on_the_input():
+    A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
+    model = linear(A, B)
+    observer = LiftedKalman("x0").start(model)
+    rng = np.random.default_rng(0)
+    x, u = np.array([0.3, 0.0]), np.zeros(1)
+    observer.reset(np.zeros(2))
+    for _ in range(300):
+        observer.update(x[:1].copy(), u, NO_W)
+        u = rng.normal(size=1)
+        x = A @ x + B @ (u + 0.7)
+    observer.update(x[:1].copy(), u, NO_W)
+    np.testing.assert_allclose(observer.z, x, atol=1e-8)
+    np.testing.assert_allclose(observer.d, B[:, 0] * 0.7, atol=1e-8)
+
+
+@given(st.integers(1, 5), st.integers(0, 10**6))
+def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inputs_since(delay, seed):
+    rng = np.random.default_rng(seed)
+    A, B = np.diag([0.5, 0.9, 1.02]), rng.uniform(0.5, 1.5, (3, 1))
+    model = linear(A, B, [0.1, 0.2, 0.3])
+    H = np.array([[1.0, 1.0, 1.0, 0.0]])
+    rule, late_rule = LiftedKalman(H), LiftedKalman(H, delay=delay)
+    prompt, late = rule.start(model), late_rule.start(model)
+    x0 = rng.normal(size=3)
+    prompt.reset(x0)
+    late.reset(x0)
+    Y, U = rng.normal(size=(20, 1)), rng.normal(size=(20, 1))
+    estimates = []
+    for k in range(20):
+        u = U[k - 1]
+        prompt.update(Y[k], u, NO_W)
+        estimates.append((prompt.z.copy(), prompt.d.copy()))
+        late.update(Y[max(k - delay, 0)], u, NO_W)
+        z, d = estimates[k - delay] if k >= delay else (model.lift(x0), np.zeros(4))
+        for i in range(max(k - delay, 0), k):
+            z = model.A @ z + model.B @ U[i] + d
+        np.testing.assert_allclose(late.z, z, atol=1e-9)
+        np.testing.assert_allclose(late.d, d, atol=1e-9)
+
+
+def test_a_measured_disturbance_is_no_news():
+    A, B, E = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [1.0]]), np.array([[1.0], [0.5]])
+    observer = LiftedKalman("x0").start(linear(A, B, [0.1, 0.0], E))
+    x, u, w = np.zeros(2), np.zeros(1), np.zeros(1)
+    rng = np.random.default_rng(1)
+    observer.reset(x)
+    for _ in range(20):
+        observer.update(x[:1].copy(), u, w)
+        u, w = rng.normal(size=1), rng.normal(size=1)
+        x = A @ x + B @ u + E @ w + [0.1, 0.0]
+    np.testing.assert_allclose(observer.d, 0, atol=1e-12)
+
+
+def test_samples_are_bridged_for_a_while_and_reset_repeats_to_the_bit():
+    model = linear(np.diag([0.5, 0.9]), np.ones((2, 1)))
+    observer = LiftedKalman(("x0", "x1"), patience=3).start(model)
+    rng = np.random.default_rng(0)
+    Y = rng.normal(size=(12, 2))
+    Y[4:9] = np.nan
+    runs = []
+    for _ in range(2):
+        observer.reset([0.1, 0.2])
+        good, seen = [], []
+        for k, y in enumerate(Y):
+            good.append(observer.update(y, np.array([float(k)]), NO_W))
+            seen.append(np.r_[observer.z, observer.d])
+        runs.append(np.array(seen))
+        assert good == [True] * 7 + [False] * 2 + [True] * 3
+    np.testing.assert_array_equal(*runs)
+
+
+def test_infinities_are_missed_samples():
+    model = linear(np.diag([0.5, 0.9]), np.ones((2, 1)))
+    seen = []
+    for bad in (np.nan, np.inf, -1e200):
+        observer = LiftedKalman(("x0", "x1")).start(model)
+        observer.update(np.array([1.0, bad]), np.zeros(1), NO_W)
+        seen.append(observer.z.copy())
+    np.testing.assert_array_equal(seen[0], seen[1])
+    np.testing.assert_array_equal(seen[0], seen[2])
+
+
+INTEGRATOR = linear(np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]]), [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("rule", "model", "error", "words"),
+    [
+        (
+            LiftedKalman("x0", "output"),
+            INTEGRATOR,
+            km.DataError,
+            "with λ = 1, 'x0 \\[m\\]', an offset of output 'x0'",
+        ),
+        (
+            LiftedKalman("x1"),
+            INTEGRATOR,
+            km.DataError,
+            "'x0 \\[m\\]' can move without a trace in y; measure one",
+        ),
+        (LiftedKalman(("x0", "x0")), INTEGRATOR, km.DataError, "depend on each other"),
+        (LiftedKalman("1"), INTEGRATOR, km.DataError, "or on the Constant"),
+        (LiftedKalman("theta"), INTEGRATOR, km.ObservableError, "lacks 'theta'; add it"),
+        (
+            LiftedKalman(np.eye(2)),
+            INTEGRATOR,
+            km.ShapeError,
+            r"outputs has shape \(2, 2\), expected \(ny, 3\)",
+        ),
+        (
+            LiftedKalman("x0"),
+            linear(np.diag([0.5, 0.6]), np.eye(2)),
+            km.DataError,
+            "1 outputs cannot tell the disturbances of 2 inputs apart; measure at least 2",
+        ),
+        (
+            LiftedKalman("x0", "output"),
+            linear(np.diag([0.5, 1.2]), np.ones((2, 1))),
+            km.DataError,
+            "λ = 1.2, 'x1 \\[m\\]' can move",
+        ),
+    ],
+)
+def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words):
+    with pytest.raises(error, match=words):
+        rule.start(model)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ({"process": 0.0}, km.DefinitenessError, "process is not positive definite"),
+        ({"noise": -1.0}, km.DefinitenessError, "noise is indefinite"),
+        ({"drift": np.nan}, km.DataError, "drift holds 1 NaN"),
+        ({"delay": -1}, km.DataError, "delay is -1"),
+        ({"patience": -1}, km.DataError, "patience is -1"),
+        ({"outputs": [[1.0, 2.0], [1.0]]}, km.DataError, "outputs is not an array"),
+        ({"outputs": ()}, km.ShapeError, "outputs has shape"),
+    ],
+)
+def test_settings_are_refused_in_words(settings, error, words):
+    with pytest.raises(error, match=words):
+        LiftedKalman(**{"outputs": "x0", "disturbance": "input"} | settings)
+
+
+def test_names_with_and_without_units_and_a_matrix_are_the_same():
+    model = linear(np.array([[0.9, 0.1], [0.0, 0.8]]), np.ones((2, 1)), [0.1, 0.2])
+    seen = []
+    for outputs in ("x1", "x1 [m]", ("x1",), ["x1 [m]"], [[0.0, 1.0, 0.0]]):
+        observer = LiftedKalman(outputs).start(model)
+        for k in range(5):
+            observer.update(np.array([float(k)]), np.ones(1), NO_W)
+        seen.append(observer.z.copy())
+    for other in seen[1:]:
+        np.testing.assert_array_equal(seen[0], other)
+    assert LiftedKalman("x1") == LiftedKalman(["x1"])

@@ -1,0 +1,83 @@
+"""latency=1: the input computed now acts one step later; against the optimum of the plant with its delay."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.kalman import LiftedKalman
+from koopmpc.loop.faults import ActuatorDelay
+from tests.control.models import PRECISE, random_pair
+from tests.estimate.plants import linear
+
+LATE = [ActuatorDelay(1)]
+
+
+def pair(rng, nx, nu, limits):
+    """A controller that compensates, and one on the plant with its delay as states: ξ = [x; u_{k−1}]."""
+    A, B = random_pair(rng, nx, nu)
+    N, Q, R, P = 8, np.ones(nx), np.full(nu, 0.3), 2 * np.eye(nx)
+    mine = km.KoopmanMPC(
+        linear(A, B), km.Cost(Q, R, Q_N=P, u_target="zero"), limits, N, latency=1, settings=PRECISE
+    )
+    delayed = linear(
+        np.block([[A, B], [np.zeros((nu, nx + nu))]]), np.vstack([np.zeros((nx, nu)), np.eye(nu)])
+    )
+    whole = np.zeros((nx + nu, nx + nu))
+    whole[:nx, :nx] = P
+    cost = km.Cost(np.append(Q, np.zeros(nu)), R, Q_N=whole, u_target="zero")
+    return A, B, mine, km.KoopmanMPC(delayed, cost, limits, N + 1, settings=PRECISE)
+
+
+@pytest.mark.parametrize("bound", [np.inf, 0.4])
+@given(nx=st.integers(1, 3), nu=st.integers(1, 2), seed=st.integers(0, 10**6))
+def test_it_is_the_optimum_of_the_delayed_plant(bound, nx, nu, seed):
+    rng = np.random.default_rng(seed)
+    limits = km.Limits(-bound, bound)
+    A, B, mine, oracle = pair(rng, nx, nu, limits)
+    x, acting = rng.normal(size=nx), np.zeros(nu)
+    rows = rng.normal(size=(20, nx))
+    for k in range(8):
+        preview = rows[k : k + 10]
+        u = mine(x, preview).u
+        wide = np.hstack([preview, np.zeros((len(preview), nu))])
+        best = oracle(np.append(x, acting), wide).u
+        np.testing.assert_allclose(u, best, atol=1e-5)
+        x, acting = A @ x + B @ acting, u
+
+
+@pytest.mark.parametrize("estimator", [None, LiftedDisturbance(), LiftedKalman(("x0", "x1"))])
+def test_on_a_true_model_the_plan_is_what_happens(estimator):
+    """The loop that applies u a step late meets the plan of the second step to the end."""
+    model = linear(np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]]), [0.0, 0.0])
+    cost, limits = km.Cost([1.0, 0.1], 0.1), km.Limits(-2, 2)
+    mpc = km.KoopmanMPC(model, cost, limits, 20, latency=1, estimator=estimator, settings=PRECISE)
+    run = km.simulate(
+        model.step_map(), mpc, x0=[1, 0], reference=[0, 0], steps=80, limits=limits, faults=LATE, plans=True
+    )
+    for k in (0, 3, 10):
+        np.testing.assert_allclose(run.plans.X[k][:2], run.X[k + 1 : k + 3], atol=1e-6)
+    np.testing.assert_allclose(run.X[-1], 0, atol=1e-3)
+    ignorant = km.KoopmanMPC(model, cost, limits, 20)
+    other = km.simulate(
+        model.step_map(), ignorant, x0=[1, 0], reference=[0, 0], steps=80, limits=limits, faults=LATE
+    )
+    assert _cost(run) < _cost(other)
+
+
+def _cost(run):
+    return (run.X**2 * [1.0, 0.1]).sum() + 0.1 * (run.U**2).sum()
+
+
+def test_offset_free_with_latency():
+    A, B = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]])
+    true = linear(A, 0.8 * B, [0.05, 0.1]).step_map()
+    model = linear(A, B, [0.0, 0.0])
+    for estimator in (LiftedDisturbance(), LiftedKalman(("x0", "x1"))):
+        mpc = km.KoopmanMPC(model, km.Cost([1, 0], 0.1), km.Limits(-5, 5), 15, latency=1, estimator=estimator)
+        run = km.simulate(
+            true, mpc, x0=[0, 0], reference=[0.7, 0], steps=150, limits=km.Limits(-5, 5), faults=LATE
+        )
+        assert abs(run.X[-1, 0] - 0.7) < 1e-6
