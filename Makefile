@@ -18,7 +18,7 @@ full: $(VENV)/installed-dev
 	$(PINNED) $(BIN)/python -m pytest -m "(slow or not slow) and not speed" --cov --cov-report=term
 
 speed: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
+	KOOPMPC_NO_TYPE_HOOK=1 $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
