@@ -74,6 +74,7 @@ class Origin:
             raise ShapeError(f"y has shape {y.shape}, expected ({observer.ny},), one value {what}")
         if self._plain:
             observer.update(y, last, self._w)
+            self.z = observer.z
             return
         self._sent.append(last.copy())
         acted = self._sent[0]

@@ -30,5 +30,5 @@ class Measured:
         (x,), (lifted,), lift, _ = self._lift.slot()
         x[:] = y
         lift()
-        self.z[:] = lifted
+        self.z = lifted
         return True

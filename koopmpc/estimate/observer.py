@@ -14,7 +14,7 @@ from koopmpc.predict.linear import LinearPredictor
 
 @runtime_checkable
 class Observer(Protocol):
-    """The estimate of one run: z and d are rewritten in place by `update`."""
+    """The estimate of one run: z and d hold until the next `update`."""
 
     @property
     def ny(self) -> int:

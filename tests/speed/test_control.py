@@ -163,7 +163,7 @@ def controller(nz, rng):
     B = rng.normal(size=(nz, 1))
     predictor = km.LinearPredictor(A, B, np.eye(2, nz), lifting, 0.05, ("a", "b"), ("u",))
     mpc = km.KoopmanMPC(predictor, km.Cost(1, 1, Q_N=np.eye(nz)), km.Limits(-1e6, 1e6), 40)
-    mpc._lift = Lifted(0.1 * rng.normal(size=nz))
+    mpc.observer._lift = Lifted(0.1 * rng.normal(size=nz))
     return mpc
 
 
