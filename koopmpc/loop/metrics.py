@@ -21,7 +21,8 @@ class Metrics(Value):
     Attributes
     ----------
     cost
-        Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k‖²_R, no dt; NaN where the run has no Cost or no state.
+        Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, no dt; NaN where the run has no Cost
+        or no state.
     tracking_rmse
         Root-mean-square of each tracked output's error over k = 1 … T, in its unit.
     final_error
@@ -63,11 +64,12 @@ def metrics(run: Run) -> Metrics:
     nr, nu = error.shape[1], run.U.shape[1]
     Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
     stage = np.einsum("ki,ij,kj->k", error, Q, error)
+    moved = run.U - run.u_reference
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
     return Metrics(
         cost=float("nan")
         if run.cost is None
-        else float(stage[1:].sum() + np.einsum("ki,ij,kj->", run.U, R, run.U)),
+        else float(stage[1:].sum() + np.einsum("ki,ij,kj->", moved, R, moved)),
         tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
         final_error=error[-1].copy(),
         violation=_violation(run),

@@ -45,6 +45,8 @@ class Run(Value):
         The plan of each step, where asked for.
     cost, limits
         What the run is judged by.
+    u_reference
+        (T, nu) inputs whose distance from U costs: what holds the reference; zeros by default.
     dt
         Sampling time [s].
     states, inputs, outputs
@@ -72,6 +74,11 @@ class Run(Value):
     plans: Plans | None = None
     angles: tuple[int, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    u_reference: Float[np.ndarray, "T nu"] = field(default_factory=lambda: np.empty((0, 0)))
+
+    def __post_init__(self) -> None:
+        if not self.u_reference.size:
+            object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
 
     @property
     def steps(self) -> int:

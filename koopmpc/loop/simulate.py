@@ -15,10 +15,9 @@ from koopmpc.control.move import Controller, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.injection import Fault, Injections, Wiring, call, named
 from koopmpc.loop.run import Plans, Run
+from koopmpc.loop.signals import Signal, held_inputs, noise_of, reference_rows, signal_of
 from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import StepMap
-
-Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +37,7 @@ class Step:
     x_next: Float[np.ndarray, " nx"] | None = None
     y_next: Float[np.ndarray, " ny"] | None = None
     reference_next: Float[np.ndarray, " nr"] | None = None
+    u_reference: Float[np.ndarray, " nu"] | None = None
 
 
 Observer = Callable[[Step], None]
@@ -52,6 +52,7 @@ def simulate(
     steps: int,
     cost: Cost | None = None,
     limits: Limits | None = None,
+    u_reference: ArrayLike | None = None,
     disturbance: Signal | None = None,
     noise: Signal | None = None,
     faults: Sequence[Fault] = (),
@@ -75,6 +76,9 @@ def simulate(
         last one repeated; with ``preview=False`` row k throughout.
     cost, limits
         What the run is judged by; kept in the Run.
+    u_reference
+        (nu,) or (steps, nu): the inputs that hold the reference. The metrics charge ‖u_k − u_reference_k‖²_R, so
+        that rest on the reference costs nothing; zero by default. The controller is not told.
     disturbance
         d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
     noise
@@ -110,7 +114,7 @@ def simulate(
         raise ShapeError(
             f"the controller returns {nu} inputs, the plant takes {len(plant.inputs)} ({plant.inputs})"
         )
-    rows = _reference(reference, steps, controller.horizon)
+    rows = reference_rows(reference, steps, controller.horizon)
     nr = rows.shape[1] if cost is None else cost.of.bind(plant.states).nz
     if rows.shape[1] != nr:
         raise ShapeError(
@@ -119,10 +123,11 @@ def simulate(
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    push = _signal(disturbance, "disturbance", steps, nx)
+    push = signal_of(disturbance, "disturbance", steps, nx)
     if push is not None and not isinstance(plant, SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
-    jitter = _noise(noise, steps, ny)
+    jitter = noise_of(noise, steps, ny)
+    held = held_inputs(u_reference, steps, nu)
     injected = None
     if faults:
         box = (limits or Limits()).inputs(nu)
@@ -165,7 +170,7 @@ def simulate(
             Y[k + 1] = injected.measured(k + 1, Y[k + 1].copy())
         _store(X, k + 1, plant.state)
         if observers:
-            step = Step(k, Y[k], U[k], rows[k], move, X[k], plan, X[k + 1], Y[k + 1], rows[k + 1])
+            step = Step(k, Y[k], U[k], rows[k], move, X[k], plan, X[k + 1], Y[k + 1], rows[k + 1], held[k])
             for observer in observers:
                 observer(step)
     return Run(
@@ -186,6 +191,7 @@ def simulate(
         plans=_stack(kept) if plans else None,
         angles=tuple(angles),
         metadata=dict(metadata or {}),
+        u_reference=held,
     )
 
 
@@ -198,43 +204,6 @@ def _measured(y: Any) -> Float[np.ndarray, " ny"]:
 def _store(X: Float[np.ndarray, "T1 nx"], k: int, state: Float[np.ndarray, " nx"] | None) -> None:
     if state is not None:
         X[k] = state
-
-
-def _reference(reference: ArrayLike, steps: int, horizon: int) -> Float[np.ndarray, "T nr"]:
-    """Return steps + horizon + 1 rows, the last one repeated."""
-    rows = checks.array(reference, "reference")
-    rows = np.atleast_1d(rows)
-    if rows.ndim == 1:
-        rows = np.broadcast_to(rows, (steps + 1, len(rows)))
-    if rows.shape[0] != steps + 1:
-        raise ShapeError(
-            f"reference has shape {rows.shape}, expected (nr,) or (steps+1, nr) = ({steps + 1}, nr)"
-        )
-    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
-
-
-def _signal(
-    signal: Signal | None, name: str, rows: int, n: int
-) -> Callable[[int, np.random.Generator], Float[np.ndarray, " n"]] | None:
-    if signal is None:
-        return None
-    if callable(signal):
-        return lambda k, rng: checks.array(signal(k, rng), name, (n,))
-    values = checks.array(signal, name)
-    if values.ndim < 2:
-        constant = checks.vector(values, name, n)
-        return lambda k, rng: constant
-    values = checks.array(values, name, (rows, n))
-    return lambda k, rng: values[k]
-
-
-def _noise(
-    noise: Signal | None, steps: int, ny: int
-) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
-    if noise is None or callable(noise) or np.ndim(noise) == 2:
-        return _signal(noise, "noise", steps + 1, ny)
-    deviation = checks.vector(noise, "noise", ny)
-    return lambda k, rng: deviation * rng.standard_normal(ny)
 
 
 def _stack(plans: Sequence[Plan | None]) -> Plans | None:

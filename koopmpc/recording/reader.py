@@ -13,8 +13,8 @@ from koopmpc.recording.columns import Columns, read_columns
 from koopmpc.recording.description import About, from_json
 
 _ENTITIES = (
-    "/state", "/reference", "/measurement", "/control/u", "/solver/time_ms", "/solver/status",
-    "/prediction/x", "/prediction/u", "/description", "/metrics",
+    "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/time_ms",
+    "/solver/status", "/prediction/x", "/prediction/u", "/description", "/metrics",
 )  # fmt: skip
 
 
@@ -73,6 +73,7 @@ def _run(log: Columns, path: Path) -> Run:
         solve_time=seconds[:steps],
         iterations=iterations[:steps].astype(np.int64),
         plans=_plans(log, steps),
+        u_reference=_held(log, steps, len(about.inputs)),
         **about.fields(),
     )
 
@@ -97,6 +98,15 @@ def _measured(log: Columns, X: np.ndarray) -> np.ndarray:
     inside = k < len(Y)
     Y[k[inside]] = values[inside]
     return Y
+
+
+def _held(log: Columns, steps: int, nu: int) -> np.ndarray:
+    """Return the inputs that hold the reference: zero, but for the rows that were written."""
+    k, values = log.matrix("/control/u_reference")
+    held, inside = np.zeros((steps, nu)), k < steps
+    if len(k):
+        held[k[inside]] = values[inside]
+    return held
 
 
 def _statuses(log: Columns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:

@@ -171,6 +171,7 @@ def _copied(step: Step) -> Step:
         x_next=_floats(step.x_next),
         y_next=_floats(step.y_next),
         reference_next=_floats(step.reference_next),
+        u_reference=_floats(step.u_reference),
     )
 
 

@@ -31,6 +31,7 @@ class Rows:
     planned: Int[np.ndarray, " p"]
     plan_X: Float[np.ndarray, "p N1 nx_plan"]
     plan_U: Float[np.ndarray, "p N nu_plan"]
+    u_reference: Float[np.ndarray, "m nu"]
 
 
 def rows_of_run(run: Run) -> Rows:
@@ -49,6 +50,7 @@ def rows_of_run(run: Run) -> Rows:
         planned=np.arange(0 if run.plans is None else run.steps),
         plan_X=no_plans if run.plans is None else run.plans.X,
         plan_U=no_plans if run.plans is None else run.plans.U,
+        u_reference=run.u_reference,
     )
 
 
@@ -80,6 +82,7 @@ def rows_of_steps(steps: Sequence[Step], nx: int, *, end: bool = False) -> Rows:
         planned=np.array([k for k, _ in plans], dtype=np.int64),
         plan_X=np.stack([p.X for _, p in plans]) if plans else np.empty((0, 0, 0)),
         plan_U=np.stack([p.U for _, p in plans]) if plans else np.empty((0, 0, 0)),
+        u_reference=np.stack([np.zeros(len(s.u)) if s.u_reference is None else s.u_reference for s in steps]),
     )
 
 
@@ -98,5 +101,6 @@ def run_of_rows(blocks: Sequence[Rows], about: About) -> Run | None:
         fallback=tuple(f for b in blocks for f in b.fallback)[:steps],
         solve_time=np.concatenate([b.solve_time for b in blocks])[:steps],
         iterations=np.concatenate([b.iterations for b in blocks])[:steps],
+        u_reference=np.concatenate([b.u_reference for b in blocks])[:steps],
         **about.fields(),
     )

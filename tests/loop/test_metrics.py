@@ -30,6 +30,7 @@ def random_run(rng, T=12, cost=None, limits=None, nr=2, angles=(), dt=0.1):
         inputs=("u",),
         outputs=STATES,
         angles=angles,
+        u_reference=rng.normal(size=(T, 1)),
     )
 
 
@@ -62,7 +63,7 @@ def test_against_loops(seed, angles):
             )
         if k < T:
             u = run.U[k]
-            cost += u @ R @ u
+            cost += (u - run.u_reference[k]) @ R @ (u - run.u_reference[k])
             over = max(over, u[0] - 0.8, -1 - u[0])
             effort += u @ u * run.dt
     assert found.cost == pytest.approx(cost)
@@ -138,3 +139,14 @@ def test_a_reference_that_does_not_fit_the_cost():
     run = random_run(np.random.default_rng(4), nr=1)
     with pytest.raises(km.ShapeError, match=r"the reference has shape \(13, 1\), what it is for \(13, 2\)"):
         km.metrics(run)
+
+
+def test_rest_where_the_reference_is_held_costs_nothing():
+    """x⁺ = 0.5 x + u stays at 1 under u = 0.5: cost zero with that u_reference, its charge without."""
+    rng = np.random.default_rng(5)
+    run = random_run(rng, cost=km.Cost(1, 2.0))
+    rest = replace(run, X=run.reference, U=np.full_like(run.U, 0.5), u_reference=np.full_like(run.U, 0.5))
+    assert km.metrics(rest).cost == 0.0
+    free = replace(rest, u_reference=np.zeros_like(run.U))
+    assert km.metrics(free).cost == pytest.approx(2.0 * 0.25 * run.steps)
+    assert km.metrics(free).effort == km.metrics(rest).effort

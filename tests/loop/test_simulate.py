@@ -161,6 +161,23 @@ def test_observers_see_each_step_once():
         assert step.move.status is run.status[k]
 
 
+@pytest.mark.parametrize("given", [None, 0.3, [0.3], 0.1 * np.arange(6.0)[:, None]])
+def test_the_inputs_that_hold_the_reference_are_kept_and_shown(given):
+    seen = []
+    run = km.simulate(
+        step_map(A, B),
+        mpc(),
+        x0=[0.5, 0],
+        reference=[0, 0],
+        steps=6,
+        u_reference=given,
+        observers=[seen.append],
+    )
+    expected = np.broadcast_to(0.0 if given is None else given, (6, 1))
+    np.testing.assert_array_equal(run.u_reference, expected)
+    np.testing.assert_array_equal([step.u_reference for step in seen], expected)
+
+
 class Outside:
     """A plant as hardware offers it: it hides its state, and one sensor fails for a while."""
 
@@ -246,6 +263,16 @@ def test_messages():
             km.ShapeError,
             r"disturbance has shape \(3,\), expected \(2,\)",
             lambda: run(disturbance=lambda k, r: ones[:3, 0]),
+        ),
+        (
+            km.ShapeError,
+            r"u_reference has shape \(6, 1\), expected \(5, 1\)",
+            lambda: run(u_reference=np.ones((6, 1))),
+        ),
+        (
+            km.ShapeError,
+            r"u_reference has shape \(2,\), expected \(1,\)",
+            lambda: run(u_reference=[1.0, 2.0]),
         ),
         (km.ShapeError, r"noise has shape \(3,\), expected \(2,\) or a scalar", lambda: run(noise=[1, 1, 1])),
         (km.ShapeError, r"noise has shape \(5, 2\), expected \(6, 2\)", lambda: run(noise=ones)),

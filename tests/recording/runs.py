@@ -31,6 +31,7 @@ options = st.fixed_dictionaries(
         "noisy": st.booleans(),
         "cost": st.booleans(),
         "limits": st.booleans(),
+        "held": st.booleans(),
         "metadata": metadata,
         "seed": st.integers(0, 2**32 - 1),
     }
@@ -38,7 +39,19 @@ options = st.fixed_dictionaries(
 
 
 def make_run(
-    *, nx=2, nu=1, T=20, ny=None, N=4, odd=0.0, noisy=True, cost=True, limits=True, metadata=None, seed=0
+    *,
+    nx=2,
+    nu=1,
+    T=20,
+    ny=None,
+    N=4,
+    odd=0.0,
+    noisy=True,
+    cost=True,
+    limits=True,
+    held=True,
+    metadata=None,
+    seed=0,
 ) -> Run:
     rng = np.random.default_rng(seed)
     ny = nx if ny is None else ny
@@ -73,6 +86,7 @@ def make_run(
         plans=None if N is None else Plans(numbers(T, N + 1, nx), numbers(T, N, nu)),
         angles=(nx - 1,),
         metadata={} if metadata is None else metadata,
+        u_reference=np.where(rng.random((T, nu)) < 0.5 * held, numbers(T, nu), 0.0),
     )
 
 
@@ -92,6 +106,7 @@ def steps_of(run: Run) -> list[Step]:
             x_next=run.X[k + 1],
             y_next=run.Y[k + 1],
             reference_next=run.reference[k + 1],
+            u_reference=run.u_reference[k],
         )
         for k in range(run.steps)
     ]

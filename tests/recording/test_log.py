@@ -60,7 +60,8 @@ def test_metrics_are_recomputed_from_the_log_alone(tmp_path: Path) -> None:
 
 
 def test_an_autonomous_run_has_no_inputs_to_read(tmp_path: Path) -> None:
-    run = replace(make_run(cost=False, limits=False, N=None), U=np.empty((20, 0)), inputs=())
+    none = np.empty((20, 0))
+    run = replace(make_run(cost=False, limits=False, N=None), U=none, u_reference=none, inputs=())
     record(run, tmp_path / "run.rrd")
     assert load_run(tmp_path / "run.rrd") == run
 
