@@ -2,12 +2,12 @@
 """DAQP behind our interface: the one file that imports it, checks what it accepts, and maps every exit flag.
 
 DAQP is a dual active-set method: exact to rounding, and fast where few rows are active; but what it holds before
-its end is infeasible. DAQP 0.11 takes short and NaN vectors and unknown settings without a word, ignores a row
-whose norm is below 3e-6, measures its tolerances in the units of the cost, and may call rows that are equal up to
-rounding contradictory. Nothing of that passes here: rows, variables and cost are scaled, the dense Hessian's
-answers are measured, and an infeasible problem is solved again, cold, with limits a tolerance wider, before it is
-believed to be infeasible. Scaling is left out where nothing is far from one: each multiplication costs as much as
-an iteration.
+its end is infeasible. DAQP 0.11 ignores short vectors and unknown settings without a word, takes NaN, ignores a
+row whose norm is below 3e-6, measures its tolerances in the units of the cost, and may call equalities that differ
+by rounding contradictory, or a problem with a singular P unbounded when it starts warm. Nothing of that passes
+here: rows, variables and cost are scaled; answers are measured where P is not diagonal; and a problem that is called
+infeasible or unbounded is solved again, cold, with limits a tolerance wider, before that is believed. Scaling is
+left out where nothing is far from one: each multiplication costs as much as an iteration.
 
 Arnström, Bemporad & Axehill, "A dual active-set solver for embedded quadratic programming using recursive LDLᵀ
 updates", IEEE Trans. Automatic Control 67(8), 2022.
@@ -28,12 +28,11 @@ from koopmpc.errors import DataError
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
 DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
-_WIDER = (
-    1e-8  # how much wider the limits must be made, relative, before a problem is believed to be infeasible
-)
-_ACCURACY = 1e-6  # of the scaled KKT conditions where the Hessian is not the identity, relative
+_WIDER = 1e-8  # relative widening of the limits before a problem is believed to have no solution
+_ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
 
-_OPTIMAL, _INFEASIBLE, _CYCLING, _OVERDETERMINED, _TIME_LIMIT = 1, -1, -2, -6, -7
+_OPTIMAL, _INFEASIBLE, _TIME_LIMIT = 1, -1, -7
+_DOUBTFUL = (_INFEASIBLE, -2, -3, -6)  # with: cycling; unbounded; equalities that contradict each other
 _STATUS = {
     _OPTIMAL: Status.OPTIMAL,
     _INFEASIBLE: Status.INFEASIBLE,
@@ -106,7 +105,7 @@ class DAQP:
             self._send()
         limit = self._time_limit if time_limit is None else time_limit
         x, multipliers, flag, iterations = self._run(limit)
-        if flag in (_INFEASIBLE, _CYCLING, _OVERDETERMINED):
+        if flag in _DOUBTFUL:
             left = limit - (perf_counter() - start) if limit else 0.0
             if left < 0:
                 flag = _TIME_LIMIT

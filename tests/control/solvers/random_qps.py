@@ -86,7 +86,7 @@ def exactness(qp, v, y):
     """Return the largest violation of the KKT conditions, relative, in the units of the cost.
 
     Stationarity P v + q + Aᵀy = 0 by the size of its terms; low ≤ A v ≤ high, and A v at the end that y pushes
-    to, by ‖aᵢ‖ ‖v‖ and the limit, the variables measured in 1/√Pⱼⱼ.
+    to, by the limit and ‖aᵢ‖ times ‖v‖ and the ‖P⁻¹q‖ of no limits, the variables measured in 1/√Pⱼⱼ.
     """
     if not (np.isfinite(v).all() and np.isfinite(y).all()):
         return np.inf
@@ -98,8 +98,9 @@ def exactness(qp, v, y):
     still = np.abs(qp.P @ v + qp.q + qp.A.T @ y) * units / max((terms * units).max(), 1e-300)
     Av = qp.A @ v
     near = np.clip(Av, qp.low, qp.high)
-    size = np.linalg.norm(qp.A * units, axis=1) * np.linalg.norm(v / units) + np.abs(near) + 1e-300
-    push = np.linalg.norm(qp.A * units, axis=1) * np.abs(y)
+    rows = np.linalg.norm(qp.A * units, axis=1)
+    size = rows * (np.linalg.norm(v / units) + np.linalg.norm(qp.q * units)) + np.abs(near) + 1e-300
+    push = rows * np.abs(y)
     end = np.where(y > 0, qp.high, np.where(y < 0, qp.low, Av))
     away = np.where(push > 1e-9 * (terms * units).max(), np.abs(Av - end), np.abs(Av - near)) / size
     return max(float(part.max(initial=0.0)) for part in (still, away))

@@ -54,16 +54,17 @@ def answers(name, rng, count):
         seen[kind, solution.status.name] += 1
         moved = QP(qp.P, qp.q, qp.A, qp.low - rng.choice([0.0, 0.1]), qp.high + rng.choice([0.0, 0.1]))
         made.update(moved.low, moved.high)
-        again = made.solve(solution.v, solution.y)
+        solved = solution.status is km.Status.OPTIMAL
+        again = made.solve(solution.v, solution.y) if solved else made.solve(*start(qp))
         if again.status is km.Status.OPTIMAL:
             held(name, moved, again)
-        seen["moved", again.status.name] += 1
+        seen["moved" if kind != "infeasible" else "moved apart", again.status.name] += 1
     return seen
 
 
 def test_random_qps(name):
     seen = answers(name, np.random.default_rng(1), 500)
-    assert sum(n for (kind, status), n in seen.items() if kind != "moved" and status == "OPTIMAL") > 350
+    assert sum(n for (kind, status), n in seen.items() if kind in FEASIBLE and status == "OPTIMAL") > 350
     assert seen["infeasible", "INFEASIBLE"] > 45
 
 
@@ -71,13 +72,15 @@ def test_random_qps(name):
 def test_a_hundred_thousand_random_qps(name):
     count = 50_000  # each is solved, moved, and solved again
     seen = answers(name, np.random.default_rng(2), count)
-    lines = [f"{kind:10s} {status:14s} {n}" for (kind, status), n in sorted(seen.items())]
+    lines = [f"{kind:11s} {status:14s} {n}" for (kind, status), n in sorted(seen.items())]
     sys.stdout.write(f"\n{name}, {2 * count} solves\n" + "\n".join(lines) + "\n")
     assert sum(seen.values()) == 2 * count
     share = seen["infeasible", "INFEASIBLE"] / (count / len(KINDS))
     assert share > (0.999 if name == "daqp" else 0.97)
-    if name == "daqp":  # every feasible one is solved
-        assert all(status == "OPTIMAL" for kind, status in seen if kind in FEASIBLE)
+    if name == "daqp":  # every feasible one is solved, but for a few whose P is singular
+        missed = [kind for kind, status in seen if kind in FEASIBLE and status != "OPTIMAL"]
+        assert set(missed) <= {"singular"}
+        assert seen["singular", "OPTIMAL"] > 0.999 * count / len(KINDS)
 
 
 def clarabel(qp):

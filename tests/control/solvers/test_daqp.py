@@ -73,6 +73,21 @@ def test_empty_rows():
     np.testing.assert_allclose(solved(DAQP(QP(EYE, ONE, EYE[:0], ONE[:0], ONE[:0])), 2, 0).v, -ONE)
 
 
+def test_linear_slacks_solve_warm_as_they_do_cold():
+    """P is singular there: bare DAQP, started warm, calls some of them unbounded."""
+    rng = np.random.default_rng(2)
+    for _ in range(500):
+        qp = random_qp(rng, "exact")
+        start = np.zeros(len(qp.q)), np.zeros(len(qp.low))
+        solver = DAQP(qp)
+        for wider in (0.0, 0.1, 0.0):
+            moved = QP(qp.P, qp.q, qp.A, qp.low - wider, qp.high + wider)
+            solver.update(moved.low, moved.high)
+            solution = solver.solve(*start)
+            assert solution.status is km.Status.OPTIMAL
+            assert exactness(moved, solution.v, solution.y) < 1e-6
+
+
 def test_limits_are_as_they_were_after_the_wider_second_solve():
     apart = np.vstack([EYE, EYE[:1]])
     solver = DAQP(QP(EYE, -3 * ONE, apart, -np.ones(3), np.ones(3)))
