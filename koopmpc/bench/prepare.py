@@ -3,12 +3,17 @@
 import time
 from functools import cached_property
 
+import numpy as np
+from jaxtyping import Float
+
 from koopmpc.bench.problem import Problem
+from koopmpc.control.equilibrium import Equilibria
+from koopmpc.control.outputs import outputs
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.identify.edmd import edmd
 from koopmpc.plant.dynamics import Dynamics
-from koopmpc.plant.simulated import Plant
+from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import StepMap, discretize
 from koopmpc.predict.linear import LinearPredictor
 
@@ -22,6 +27,7 @@ class Prepared:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.training_time = 0.0
+        self._held: dict[str, Float[np.ndarray, "T nu"]] = {}
 
     @cached_property
     def step_map(self) -> StepMap:
@@ -37,6 +43,27 @@ class Prepared:
         if isinstance(plant, Dynamics):
             return discretize(plant, self.problem.dt, self.problem.integrator)
         return plant
+
+    def u_reference(self, case: str) -> Float[np.ndarray, "T nu"]:
+        """Return the inputs that hold the references of a case, found on the truth; kept for the next controller.
+
+        On a plant without equations they are the model's, and zero where the cost's u_target is "zero".
+        """
+        if case not in self._held:
+            self._held[case] = self._find(case)
+        return self._held[case]
+
+    def _find(self, case: str) -> Float[np.ndarray, "T nu"]:
+        problem, steps = self.problem, self.problem.cases[case].steps
+        truth = self.truth.step_map if isinstance(self.truth, SimulatedPlant) else self.truth
+        plant = truth if isinstance(truth, StepMap) else self.step_map
+        if problem.cost.u_target == "zero":
+            return np.zeros((steps, plant.nu))
+        seen = outputs(plant, problem.cost, problem.limits_of(case))
+        equilibria = Equilibria(plant, problem.cost, seen, 10 * problem.horizon)
+        rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
+        distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
+        return np.array([equilibria.find(row)[1] for row in distinct])[of.ravel()]
 
     @cached_property
     def data(self) -> Episodes:

@@ -133,6 +133,7 @@ def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
     limits = problem.limits_of(task.case)
     controller = CONTROLLERS[task.controller](parts, limits)
     injected = () if task.fault is None else (FAULTS[task.fault],)
+    held = parts.u_reference(task.case)
     _warm_up(controller, parts, case)
     about: dict[str, Any] = {
         "cost": problem.cost,
@@ -149,6 +150,7 @@ def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
             x0=case.x0,
             reference=case.reference,
             steps=case.steps,
+            u_reference=held,
             faults=injected,
             observers=observers,
             plans=True,

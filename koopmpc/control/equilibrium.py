@@ -72,7 +72,7 @@ class Equilibria:
         return self._known[key]
 
     def _goal(self, row: Float[np.ndarray, " nr"]) -> Goal:
-        x, u = self._find(row)
+        x, u = self.find(row)
         held = u if self._cost.u_target == "equilibrium" else np.zeros_like(u)
         nx, Q = self._step_map.nx, self._outputs.Q
         M, L = np.zeros((nx + self._nr, self._nr)), np.zeros((nx + self._nr, nx))
@@ -90,9 +90,10 @@ class Equilibria:
         M[nx:] = np.sqrt(max(mean, 1.0)) * root(Q) @ (np.eye(self._nr) - J @ back)
         return Goal(x, held, M, L, M @ of.ravel() + L @ x)
 
-    def _find(
+    def find(
         self, row: Float[np.ndarray, " nr"]
     ) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
+        """Return the equilibrium (x, u) that holds a reference row, or comes nearest to it inside the limits."""
         nx, inputs, box = self._step_map.nx, self._outputs.inputs, self._outputs.box
         rest = np.clip(np.zeros(self._step_map.nu), *inputs)
         guesses = [np.concatenate([row if self._of_state else np.zeros(nx), rest])]
