@@ -20,10 +20,13 @@ _FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
 
 
 class Columns:
-    """The columns of a recording: rows in order of their step, by (entity, component)."""
+    """The columns of a recording: rows in order of their step, by (entity, component).
 
-    def __init__(self, chunks: Any, entities: tuple[str, ...]) -> None:
-        self._entities = entities
+    `torn` says that the file ends within a message.
+    """
+
+    def __init__(self, chunks: Any, entities: tuple[str, ...], torn: bool) -> None:
+        self._entities, self.torn = entities, torn
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
         for chunk in chunks:
             if not chunk.is_static and "step" not in chunk.timeline_names:
@@ -118,29 +121,49 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> Columns:
     """
     from rerun.chunk import RrdReader
 
-    if not path.is_file():
-        raise LogError(f"{path} does not exist; pass the .rrd of a run")
+    check_log(path)
     try:
-        with _whole_messages(path) as whole, warnings.catch_warnings():
+        with _whole_messages(path) as (whole, torn), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Rerun's word on a missing footer: load_run has its own
             chunks = RrdReader(whole).stream().filter(content=list(entities)).to_chunks()
-            return Columns(chunks, entities)
+            return Columns(chunks, entities, torn)
     except LogError:
         raise
     except Exception as error:  # the reader of Rerun raises whatever its own parts raise
         raise LogError(f"{path} is no log, or is damaged: {error}") from error
 
 
+def check_log(path: Path) -> None:
+    """Raise where `path` is no file, or none that starts as a recording does; it is not read further.
+
+    Raises
+    ------
+    LogError
+        The file is missing, a folder, cannot be opened, or is no .rrd.
+    """
+    if not path.exists():
+        raise LogError(f"{path} does not exist; pass the .rrd of a run")
+    if path.is_dir():
+        raise LogError(f"{path} is a folder; pass the .rrd of a run, a file")
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_MAGIC))
+    except OSError as error:
+        raise LogError(f"{path} cannot be read: {error.strerror}") from error
+    if start != _MAGIC:
+        raise LogError(f"{path} is no log of koopmpc: it does not start as an .rrd file does")
+
+
 @contextmanager
-def _whole_messages(path: Path) -> Iterator[Path]:
-    """Yield a file that ends with a whole message: `path` itself, or a copy without its last, torn message.
+def _whole_messages(path: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield a file that ends with a whole message, and whether `path` ends within one.
+
+    It is `path` itself, or a copy without its last, torn message.
 
     An .rrd is a header of 12 bytes and then messages, each with a header of 16 bytes (kind and length, little-endian).
     """
     size, end = path.stat().st_size, _FILE_HEADER
     with path.open("rb") as file:
-        if file.read(4) != _MAGIC:
-            raise LogError(f"{path} is no log of koopmpc: it does not start as an .rrd file does")
         file.seek(max(size - 12, 0))
         closed = file.read(8) == _FOOTER
         while not closed and end + _MESSAGE_HEADER <= size:
@@ -150,11 +173,11 @@ def _whole_messages(path: Path) -> Iterator[Path]:
                 break
             end += _MESSAGE_HEADER + length
         if closed or end == size:
-            yield path
+            yield path, False
             return
         file.seek(0)
         head = file.read(end)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "whole.rrd"
         copy.write_bytes(head)
-        yield copy
+        yield copy, True

@@ -49,8 +49,8 @@ def _run(log: Columns, path: Path) -> Run:
     if steps < 1:
         raise LogError(f"{path} holds no whole step; its run ended before the second state was written")
     end = log.static("/metrics", "steps")
-    if end is None or end != steps:
-        total = end if end is not None else planned_steps
+    total = planned_steps if end is None else end
+    if total != steps:
         of = "" if total is None else f" of {total}"
         warnings.warn(
             f"{path} ends after step {steps}{of}: the file was cut short or its writer did not close it; "
@@ -58,7 +58,9 @@ def _run(log: Columns, path: Path) -> Run:
             UserWarning,
             stacklevel=3,
         )
-    elif changed := log.changed():
+    elif end is None or log.torn:
+        warnings.warn(f"{path}: its end is cut, all {steps} steps are there", UserWarning, stacklevel=3)
+    if end == steps and (changed := log.changed()):
         raise LogError(
             f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy"
         )

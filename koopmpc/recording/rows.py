@@ -54,6 +54,38 @@ def rows_of_run(run: Run) -> Rows:
     )
 
 
+def blocks(rows: Rows, least: int = 100, most: int = 10) -> list[Rows]:
+    """Return `rows` as consecutive blocks of at least `least` steps, at most `most` of them.
+
+    The state that the last move led to belongs to the last block.
+    """
+    moves = len(rows.U)
+    size = max(least, -(-moves // most))
+    starts = range(0, moves - size + 1, size) if moves > size else range(1)
+    ends = [*starts[1:], len(rows.X)]
+    return [_part(rows, a, b) for a, b in zip(starts, ends, strict=True)]
+
+
+def _part(rows: Rows, a: int, b: int) -> Rows:
+    """Return the rows from the a-th up to the b-th."""
+    p = slice(*np.searchsorted(rows.planned, [rows.k + a, rows.k + b]))
+    return Rows(
+        k=rows.k + a,
+        X=rows.X[a:b],
+        Y=rows.Y[a:b],
+        reference=rows.reference[a:b],
+        U=rows.U[a:b],
+        status=rows.status[a:b],
+        fallback=rows.fallback[a:b],
+        solve_time=rows.solve_time[a:b],
+        iterations=rows.iterations[a:b],
+        planned=rows.planned[p],
+        plan_X=rows.plan_X[p],
+        plan_U=rows.plan_U[p],
+        u_reference=rows.u_reference[a:b],
+    )
+
+
 def rows_of_steps(steps: Sequence[Step], nx: int, *, end: bool = False) -> Rows:
     """Return consecutive steps as rows; with `end`, the state that the last one led to follows.
 

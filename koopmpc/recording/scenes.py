@@ -1,13 +1,14 @@
 """Scenes: shapes over time as columns for Rerun; recording knows shapes, no plant."""
 # pyright: basic
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.errors import DataError
 from koopmpc.recording.scene import Box, Color, Disk, Line, Shape
 
 Scene = Callable[[np.ndarray, np.ndarray], Sequence[Shape]]
@@ -57,21 +58,48 @@ class Bounds:
         return [float(x0), float(x1)], [-float(y1), -float(y0)]
 
 
-def draw(scenes: Sequence[Sequence[Shape]], bounds: Bounds) -> dict[str, Drawing]:
-    """Return a drawing by name for one scene a row; a shape that a row lacks is cleared there."""
-    order: dict[str, int] = {}
-    for scene in scenes:
-        for i, shape in enumerate(scene):
-            bounds.drawn.include(shape)
-            order.setdefault(shape.name, i)
+class Names:
+    """The names of a scene's shapes, in their order; empty before the first scene."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, None] | None = None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names or {})
+
+    def checked(self, scene: Sequence[Shape], step: int) -> list[Shape]:
+        """Return the shapes of `scene`.
+
+        Raises
+        ------
+        DataError
+            A shape came or went since the first scene.
+        """
+        own = {shape.name: None for shape in scene}
+        self._names = own if self._names is None else self._names
+        for name in own.keys() ^ self._names.keys():
+            what = "has a new shape" if name in own else "lacks the shape"
+            raise DataError(
+                f"the scene of step {step} {what} {name!r}; a scene returns the same names for every x and u"
+            )
+        return list(scene)
+
+
+def draw(names: Iterable[str], scenes: Sequence[Sequence[Shape]], bounds: Bounds) -> dict[str, Drawing]:
+    """Return a drawing by name for one scene a row; an empty scene clears what was there."""
+    for shape in (shape for scene in scenes for shape in scene):
+        bounds.drawn.include(shape)
     return {
         name: _drawing([[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i)
-        for name, i in order.items()
+        for i, name in enumerate(names)
     }
 
 
 def draw_ahead(
-    scenes: Sequence[Sequence[Shape]], ahead: Sequence[Sequence[Sequence[Shape]]], bounds: Bounds
+    names: Iterable[str],
+    scenes: Sequence[Sequence[Shape]],
+    ahead: Sequence[Sequence[Sequence[Shape]]],
+    bounds: Bounds,
 ) -> dict[str, Drawing]:
     """Return a drawing by name for the predicted scenes of each row, the later the fainter.
 
@@ -80,7 +108,7 @@ def draw_ahead(
     for shape in (shape for row in ahead for scene in row for shape in scene):
         bounds.predicted.include(shape)
     drawings: dict[str, Drawing] = {}
-    for name in {shape.name: None for scene in scenes for shape in scene}:
+    for name in names:
         rows: list[list[tuple[Shape, Color]]] = []
         for now, futures in zip(scenes, ahead, strict=True):
             here = [s for s in now if s.name == name]

@@ -18,8 +18,8 @@ from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.blueprint import blueprint
 from koopmpc.recording.description import About, metrics_to_markdown, to_json, to_markdown
 from koopmpc.recording.eigenvalues import draw_eigenvalues
-from koopmpc.recording.rows import Rows
-from koopmpc.recording.scenes import Bounds, Drawing, Scene, draw, draw_ahead, stages
+from koopmpc.recording.rows import Rows, blocks
+from koopmpc.recording.scenes import Bounds, Drawing, Names, Scene, draw, draw_ahead, stages
 from koopmpc.recording.styles import input_limits, styles
 
 _FLUSH = 3.0  # longest wait for a sink [s]
@@ -28,7 +28,8 @@ _FLUSH = 3.0  # longest wait for a sink [s]
 class Writer:
     """One recording: `about` first, then blocks of rows in order, then the end.
 
-    Within a block the states go last: a state that can be read says that all else of its row can be read.
+    In a block the states go last: a state that can be read says that all else of its row can be read. So a file that
+    was cut holds whole blocks, and long rows are written as several.
     """
 
     def __init__(
@@ -52,21 +53,25 @@ class Writer:
         self._bounds, self._shown = Bounds(), Bounds().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
-        self._sums: dict[
-            str, int
-        ] = {}  # of each column's bytes so far: a damaged log must not read as a whole one
+        self._sums: dict[str, int] = {}  # of each column's bytes: a damaged log must not read as a whole one
         self._u: np.ndarray | None = None
+        self._names = Names()
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
 
     def write(self, rows: Rows) -> None:
-        """Write one block."""
-        import rerun as rr
-
-        drawings = self._drawings(rows)
+        """Write the rows that follow, block by block."""
+        parts = blocks(rows)
+        drawings = [self._drawings(part) for part in parts]  # all, for the layout shows as much as they fill
         if not self._opened:
             self._open()
+        for part, drawn in zip(parts, drawings, strict=True):
+            self._write(part, drawn)
+
+    def _write(self, rows: Rows, drawings: dict[str, Drawing]) -> None:
+        import rerun as rr
+
         n, m = len(rows.X), len(rows.U)
         k = rows.k + np.arange(n)
         if "state" not in self._styled:
@@ -97,6 +102,7 @@ class Writer:
             self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
             self._rec.send_columns("solver/time_ms", self._times(k[:m]), [*scalars, *exact])
             self._statuses(rows)
+        self.flush()  # what was logged waits to be sent; columns do not
         self._vectors("state", k, rows.X)
 
     def flush(self) -> None:
@@ -124,7 +130,7 @@ class Writer:
         self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
         if self._bounds.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
-        self._rec.flush(timeout_sec=_FLUSH)
+        self.flush()
         self._rec.disconnect()
 
     def _open(self) -> None:
@@ -134,11 +140,13 @@ class Writer:
         self._opened = True
         sinks: list[Any] = [] if self._path is None else [rr.FileSink(self._path)]
         sinks += [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
-        self._rec.set_sinks(*sinks, default_blueprint=self._blueprint())
+        self._rec.set_sinks(*sinks)
         self._rec.send_recording_name(self._about.title)
         self._sum("/description:json", self._json.encode())
         text = rr.TextDocument(self._page, media_type=rr.MediaType.MARKDOWN)
         self._rec.log("description", text, rr.AnyValues(json=self._json), static=True)
+        self.flush()  # a log that is cut says what it was
+        self._rec.send_blueprint(self._blueprint(), make_active=False)
         if self._model is not None:
             for entity, drawing in draw_eigenvalues(self._model).items():
                 self._style(entity, drawing)
@@ -202,19 +210,22 @@ class Writer:
         ahead: dict[int, list[Any]] = {}
         for k, X, U in zip(rows.planned, rows.plan_X, rows.plan_U, strict=True):
             if np.isfinite(X).all() and np.isfinite(U).all():
-                ahead[int(k)] = [scene(X[i], U[min(i, len(U) - 1)]) for i in stages(len(U))]
+                ahead[int(k)] = [
+                    self._names.checked(scene(X[i], U[min(i, len(U) - 1)]), int(k)) for i in stages(len(U))
+                ]
         now: list[Sequence[Any]] = []
         for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
             self._u = rows.U[i] if i < len(rows.U) else self._u
             x = y if np.isnan(x).any() and len(y) == len(x) else x
-            now.append([] if self._u is None or not np.isfinite(x).all() else list(scene(x, self._u)))
-        found = {f"world/{name}": drawing for name, drawing in draw(now, self._bounds).items()}
+            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
+            now.append([] if shapes is None else self._names.checked(shapes, rows.k + i))
+        drawn = draw(self._names, now, self._bounds)
+        found = {f"world/{name}": drawing for name, drawing in drawn.items()}
         if ahead or self._ahead:
             self._ahead = True
             futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
-            found |= {
-                f"world/prediction/{name}": d for name, d in draw_ahead(now, futures, self._bounds).items()
-            }
+            drawn = draw_ahead(self._names, now, futures, self._bounds)
+            found |= {f"world/prediction/{name}": drawing for name, drawing in drawn.items()}
         return found
 
 

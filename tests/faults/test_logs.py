@@ -2,12 +2,14 @@
 
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from koopmpc.errors import LogError
+from koopmpc.loop.run import Plans, Run
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 from tests.recording.runs import about, make_run, steps_of
@@ -23,9 +25,10 @@ def test_a_log_that_is_no_log(tmp_path: Path) -> None:
             LogError, match=rf"{path.name} is no log of koopmpc: it does not start as an \.rrd file does"
         ):
             load_run(path)
-    for path in (folder, tmp_path / "nowhere.rrd"):
-        with pytest.raises(LogError, match=rf"{path.name} does not exist; pass the \.rrd of a run"):
-            load_run(path)
+    with pytest.raises(LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run, a file"):
+        load_run(folder)
+    with pytest.raises(LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
+        load_run(tmp_path / "nowhere.rrd")
 
 
 def test_a_recording_of_something_else(tmp_path: Path) -> None:
@@ -86,22 +89,77 @@ def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(
     start = whole.find(run.plans.X[25].tobytes())  # the plans come first in a batch: the first batch is whole
     assert start > 0
     path.write_bytes(whole[: int(start + share * (len(whole) - start))])
+    read, said = outcome(path)
+    assert read is not None
+    assert read == head(run, read.steps)
+    if share == 1.0:
+        assert said == []
+    elif said != [
+        word(path, 60, 60, planned="")
+    ]:  # a Recorder does not know beforehand how many there will be
+        assert said == [word(path, read.steps, 1000, planned="")]
+
+
+def head(run: Run, steps: int) -> Run:
+    """Return the first steps of a run."""
+    ends = ("X", "Y", "reference")
+    moves = ("U", "status", "fallback", "solve_time", "iterations", "u_reference")
+    return replace(
+        run,
+        **{name: getattr(run, name)[: steps + 1] for name in ends},
+        **{name: getattr(run, name)[:steps] for name in moves},
+        plans=Plans(run.plans.X[:steps], run.plans.U[:steps]),
+    )
+
+
+def word(path: Path, steps: int, total: int, planned: str) -> str:
+    """Return what is said about a part of a log; `planned` where its length is known beforehand."""
+    if steps == total:
+        return f"{path}: its end is cut, all {steps} steps are there"
+    return (
+        f"{path} ends after step {steps}{planned}: the file was cut short or its writer did not close it; "
+        "the run holds what is there"
+    )
+
+
+def outcome(path: Path) -> tuple[Run | None, list[str]]:
+    """Return what is read and the words that are said; no run where it is refused."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        read = load_run(path)
-    k = read.steps
-    assert np.array_equal(read.X, run.X[: k + 1])
-    assert np.array_equal(read.Y, run.Y[: k + 1])
-    assert np.array_equal(read.U, run.U[:k])
-    assert np.array_equal(read.plans.U, run.plans.U[:k])
-    assert read.status == run.status[:k]
-    if caught:
-        assert [str(w.message) for w in caught] == [
-            f"{path} ends after step {k}: the file was cut short or its writer did not close it; "
-            "the run holds what is there"
-        ]
-    else:
-        assert read == run
+        try:
+            read = load_run(path)
+        except LogError as error:
+            return None, [str(error)]
+    return read, [str(w.message) for w in caught]
+
+
+def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
+    """However `record` was cut: refused before the first block, then block by block, never as a whole run."""
+    run, whole, path = make_run(T=450), tmp_path / "run.rrd", tmp_path / "cut.rrd"
+    record(run, whole)
+    data = whole.read_bytes()
+    found = []
+    for share in (*np.linspace(0.0, 1.0, 25, endpoint=False), 1 - 1 / len(data)):
+        path.write_bytes(data[: int(share * len(data))])
+        read, said = outcome(path)
+        steps = 0 if read is None else read.steps
+        if read is None:
+            assert str(path) in said[0]
+        else:
+            assert read == head(run, steps)
+            assert said == [word(path, steps, 450, planned=" of 450")]
+        found.append(steps)
+    assert found == sorted(found)
+    assert len(set(found)) == 5  # none, three parts, all
+    assert found[-1] == 450
+
+
+def test_a_recorded_log_says_what_it_was_however_little_is_left(tmp_path: Path) -> None:
+    record(make_run(T=200), tmp_path / "run.rrd")
+    data = (tmp_path / "run.rrd").read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(data[: len(data) // 10])
+    with pytest.raises(LogError, match=r"cut\.rrd holds no whole step; its run ended before"):
+        load_run(tmp_path / "cut.rrd")
 
 
 def test_a_log_cut_in_a_batch_ends_with_the_batch_before(written: Path, tmp_path: Path) -> None:

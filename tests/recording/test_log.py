@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 from koopmpc.errors import DataError
 from koopmpc.loop.metrics import metrics
 from koopmpc.recording.description import About, from_json, to_json, to_markdown
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import record
+from koopmpc.recording.rows import blocks, rows_of_run, run_of_rows
 from koopmpc.recording.scene import Box, Disk, Line
 from tests.recording.runs import make_run, options
 
@@ -51,6 +53,34 @@ def test_the_scene_and_hidden_states_leave_the_run_as_it_was(tmp_path: Path) -> 
     for i, some in enumerate((run, hidden, broken)):
         record(some, tmp_path / f"{i}.rrd", scene=scene)
         assert load_run(tmp_path / f"{i}.rrd") == some
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_a_scene_whose_shapes_change_is_refused(ahead: bool, tmp_path: Path) -> None:
+    run = make_run(N=3 if ahead else None)
+    odd = float(run.plans.X[7, -1, 0] if run.plans is not None else run.X[7, 0])
+
+    def scene(x: np.ndarray, u: np.ndarray) -> list[Disk]:
+        bob, lamp = Disk("bob", (0.0, 0.0), 1.0), Disk("lamp", (0.0, 0.0), 1.0)
+        return [bob, lamp] if x[0] == odd else [bob]
+
+    with pytest.raises(DataError, match="the scene of step 7 has a new shape 'lamp'"):
+        record(run, tmp_path / "run.rrd", scene=scene)
+
+
+@settings(max_examples=30)
+@given(T=st.integers(1, 12), least=st.integers(1, 4), most=st.integers(1, 6), k=st.integers(0, 5))
+def test_blocks_are_the_rows(T: int, least: int, most: int, k: int) -> None:
+    run = make_run(T=T, N=2)
+    rows = replace(rows_of_run(run), k=k, planned=np.arange(k, k + T))
+    parts = blocks(rows, least, most)
+    assert len(parts) <= most
+    assert all(len(part.U) >= min(least, T) for part in parts)
+    assert [part.k for part in parts] == [k + sum(len(p.U) for p in parts[:i]) for i in range(len(parts))]
+    assert run_of_rows(parts, About.of(run)) == replace(run, plans=None)
+    assert all(np.array_equal(p.planned, p.k + np.arange(len(p.U))) for p in parts)
+    assert np.array_equal(np.concatenate([p.plan_X for p in parts]), run.plans.X)
+    assert np.array_equal(np.concatenate([p.plan_U for p in parts]), run.plans.U)
 
 
 def test_metrics_are_recomputed_from_the_log_alone(tmp_path: Path) -> None:

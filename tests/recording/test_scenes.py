@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from koopmpc.errors import DataError
 from koopmpc.recording.scene import Box, Disk, Line, Shape
-from koopmpc.recording.scenes import Bounds, draw, draw_ahead, stages
+from koopmpc.recording.scenes import Bounds, Names, draw, draw_ahead, stages
 
 coordinate = st.floats(-10, 10)
 
@@ -20,7 +21,7 @@ def strips(columns: object) -> list[list[list[tuple[float, float]]]]:
 @given(x=coordinate, y=coordinate, angle=st.floats(-4, 4), width=st.floats(0.1, 3), height=st.floats(0.1, 3))
 def test_a_box_is_covered_and_no_more(x: float, y: float, angle: float, width: float, height: float) -> None:
     box = Box("box", (x, y), (width, height), angle)
-    drawing = draw([[box]], Bounds())["box"]
+    drawing = draw(["box"], [[box]], Bounds())["box"]
     path = np.array(strips(drawing.columns)[0][0]) * (1, -1) - (x, y)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     local, r = path @ turn, min(width, height) / 8
@@ -38,7 +39,7 @@ def distance(point: np.ndarray, path: np.ndarray) -> float:
 
 
 def test_up_in_the_scene_is_up_in_the_viewer() -> None:
-    columns = draw([[Line("rod", [(0.0, 0.0), (1.0, 2.0)])]], Bounds())["rod"].columns
+    columns = draw(["rod"], [[Line("rod", [(0.0, 0.0), (1.0, 2.0)])]], Bounds())["rod"].columns
     assert np.array(strips(columns)).tolist() == [[[[0.0, 0.0], [1.0, -2.0]]]]
 
 
@@ -52,7 +53,7 @@ def test_up_in_the_scene_is_up_in_the_viewer() -> None:
 )
 def test_bounds_hold_every_shape_whole(shape: Shape, low: tuple, high: tuple) -> None:
     bounds = Bounds()
-    draw([[shape], []], bounds)
+    draw(["s"], [[shape], []], bounds)
     np.testing.assert_allclose(bounds.drawn.low, low, atol=1e-3)
     np.testing.assert_allclose(bounds.drawn.high, high, atol=1e-3)
     (x0, x1), (y0, y1) = bounds.ranges()
@@ -62,14 +63,14 @@ def test_bounds_hold_every_shape_whole(shape: Shape, low: tuple, high: tuple) ->
 
 def test_nothing_drawn_has_no_bounds() -> None:
     bounds = Bounds()
-    draw([[Line("nowhere", [(np.nan, 0.0), (0.0, 0.0)])]], bounds)
+    draw(["nowhere"], [[Line("nowhere", [(np.nan, 0.0), (0.0, 0.0)])]], bounds)
     assert bounds.ranges() is None
 
 
 def test_only_what_moves_is_drawn_ahead_and_fades() -> None:
     rail, cart = Line("rail", [(0.0, 0.0), (1.0, 0.0)]), Disk("cart", (0.0, 0.0), 0.1, color=(0, 0, 0))
     ahead = [[rail, Disk("cart", (float(i), 0.0), 0.1, color=(0, 0, 0))] for i in (1, 2)]
-    drawings = draw_ahead([[rail, cart], [rail, cart]], [ahead, []], bounds := Bounds())
+    drawings = draw_ahead(["rail", "cart"], [[rail, cart], [rail, cart]], [ahead, []], bounds := Bounds())
     assert [len(row) for row in strips(drawings["rail"].columns)] == [0, 0]
     assert [len(row) for row in strips(drawings["cart"].columns)] == [2, 0]
     colors = next(c for c in drawings["cart"].columns if "colors" in str(c.component_descriptor()))
@@ -94,10 +95,26 @@ def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight() -> No
         Disk("d", (0.2, 0.0), 1.0),
         Disk("d", (1e6, 0.0), 1.0),
     )
-    draw(now, bounds)
+    draw("d", now, bounds)
     alone = bounds.ranges()
-    draw_ahead(now, [[[near]]], bounds)
+    draw_ahead("d", now, [[[near]]], bounds)
     assert bounds.ranges()[0][1] - alone[0][1] == pytest.approx(0.2, abs=1e-3)
-    draw_ahead(now, [[[far]]], bounds)
+    draw_ahead("d", now, [[[far]]], bounds)
     assert 0.2 < bounds.ranges()[0][1] - alone[0][1] < 1.0
     assert bounds.ranges()[0][0] == alone[0][0]
+
+
+def test_a_shape_that_comes_or_goes_is_named() -> None:
+    rail, cart = Line("rail", [(0.0, 0.0)]), Disk("cart", (0.0, 0.0), 0.1)
+    names = Names()
+    assert names.checked((rail, cart, rail), 0) == [rail, cart, rail]
+    assert names.checked([cart, rail], 1) == [cart, rail]
+    assert list(names) == ["rail", "cart"]
+    with pytest.raises(
+        DataError, match="the scene of step 2 lacks the shape 'cart'; a scene returns the same"
+    ):
+        names.checked([rail], 2)
+    with pytest.raises(
+        DataError, match="the scene of step 3 has a new shape 'wall'; a scene returns the same"
+    ):
+        names.checked([rail, cart, Line("wall", [])], 3)
