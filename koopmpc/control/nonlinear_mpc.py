@@ -13,7 +13,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.equilibrium import Equilibria
 from koopmpc.control.fallback import PlanMemory
 from koopmpc.control.lifted import reference_rows
-from koopmpc.control.limits import Limits, softened
+from koopmpc.control.limits import Box, Limits, softened
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.control.outputs import outputs
 from koopmpc.control.shooting import Aim, Shooting, Solver, Start
@@ -79,8 +79,10 @@ class NonlinearMPC:
         self.step_map, self.cost = step_map, cost
         self.limits = Limits() if limits is None else limits
         self._outputs = outputs(step_map, cost, self.limits)
+        soft = np.isfinite(self._outputs.softness.linear)
+        self._soft = Box(*(end[soft] for end in self._outputs.box))
         self._equilibria = Equilibria(step_map, cost, self._outputs, 10 * self._N)
-        self._shooting = Shooting(step_map, self._outputs, self.limits.slack, self._N, solver, settings or {})
+        self._shooting = Shooting(step_map, self._outputs, self._N, solver, settings or {})
         self._starts = checks.count(starts, "starts")
         self._memory = PlanMemory(self._outputs.inputs, self._N)
         self._warm: Start | None = None
@@ -131,7 +133,7 @@ class NonlinearMPC:
         U = np.clip(found.U, *self._outputs.inputs)
         self._memory.keep(U.ravel())
         self._plan = Plan(np.vstack([x0, found.X]), U.copy())
-        status = Status.SOFTENED if softened(found.slacks, self._outputs.box) else Status.OPTIMAL
+        status = Status.SOFTENED if softened(found.slacks, self._soft) else Status.OPTIMAL
         return Move(U[0].copy(), status, Fallback.NONE, perf_counter() - start, iterations)
 
     def _fail(self, applied: ArrayLike | None, status: Status, iterations: int, start: float) -> Move:

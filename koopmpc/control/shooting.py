@@ -82,7 +82,7 @@ class Shooting:
     step_map
         F.
     outputs
-        What is tracked and limited; `slack` (linear, quadratic) relaxes the limits on states, None does not.
+        What is tracked and limited.
     N
         Steps.
     solver, options
@@ -93,13 +93,14 @@ class Shooting:
         self,
         step_map: StepMap,
         outputs: Outputs,
-        slack: tuple[float, float] | None,
         N: int,
         solver: Solver,
         options: Mapping[str, Any],
     ) -> None:
         nx, nu, nr, ng = step_map.nx, step_map.nu, len(outputs.Q), len(outputs.box.low)
-        ns = 0 if slack is None else ng
+        linear, quadratic = outputs.softness
+        soft = np.flatnonzero(np.isfinite(linear))
+        ns = len(soft)
         W = ca.MX.sym("W", nu + nx + ns, N)
         U, X, E = W[:nu, :], W[nu : nu + nx, :], W[nu + nx :, :]
         x0, r, u_r = ca.MX.sym("x0", nx), ca.MX.sym("r", nr, N), ca.MX.sym("u_r", nu, N)
@@ -113,12 +114,12 @@ class Shooting:
         paths, low, high = [ca.MX(0, N)], [np.zeros(0)], [np.zeros(0)]
         if ng:
             values, infinite = outputs.limited.map(N)(X), np.full(ng, np.inf)
-            if slack is None:
-                paths, low, high = [values], [outputs.box.low], [outputs.box.high]
-            else:
-                f += slack[0] * ca.sum1(ca.vec(E)) + slack[1] * ca.sumsqr(E)
-                paths = [values - E, values + E]
-                low, high = [-infinite, outputs.box.low], [outputs.box.high, infinite]
+            relaxed = ca.DM(np.eye(ng)[:, soft]) @ E if ns else ca.MX(ng, N)
+            if ns:
+                weights = ca.DM(linear[soft]), ca.DM(quadratic[soft])
+                f += ca.sum2(weights[0].T @ E + weights[1].T @ E**2)
+            paths = [values - relaxed, values + relaxed]
+            low, high = [-infinite, outputs.box.low], [outputs.box.high, infinite]
         path = ca.vertcat(*paths)
         npath = path.shape[0]
         # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N: the order in which fatrop finds the stages

@@ -79,18 +79,28 @@ def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    text = source(F)
+    return _bound(library(source(F), command, cache))
+
+
+def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
+    """Return the loaded machine code of this C, from `cache` if it is there; else nothing is left on disk.
+
+    Raises
+    ------
+    OSError, subprocess.SubprocessError
+        The compiler fails or its output does not load.
+    """
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # mapped code outlives its file
-            return _bound(_compile(text, command, Path(folder) / "step.so"))
+            return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
     key = "\0".join([text, *command, *_FLAGS, platform.machine(), platform.system()])
     path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     if path.is_file():
         try:
-            return _bound(path)
-        except (OSError, AttributeError):  # of another kind of machine: write it again
+            return ctypes.CDLL(str(path))
+        except OSError:  # of another kind of machine: write it again
             path.unlink()
-    return _bound(_compile(text, command, path))
+    return ctypes.CDLL(str(_compile(text, command, path)))
 
 
 def private_cache() -> Path | None:
@@ -131,8 +141,8 @@ def _compile(text: str, command: list[str], path: Path) -> Path:
     return path
 
 
-def _bound(path: Path) -> Kernel:
-    rollouts = ctypes.CDLL(str(path)).koopmpc_rollouts
+def _bound(code: ctypes.CDLL) -> Kernel:
+    rollouts = code.koopmpc_rollouts
     rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
     rollouts.restype = None
 

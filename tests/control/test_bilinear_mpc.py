@@ -1,0 +1,231 @@
+"""BilinearMPC: KoopmanMPC on a linear plant, NonlinearMPC where it has converged, safe wherever it is sent."""
+
+import copy
+import pickle
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from koopmpc.control.bilinear_mpc import BilinearMPC
+from koopmpc.control.cost import Cost
+from koopmpc.control.koopman_mpc import KoopmanMPC
+from koopmpc.control.limits import Limits
+from koopmpc.control.move import Controller, Fallback, Status
+from koopmpc.control.nonlinear_mpc import NonlinearMPC
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.state import State
+from koopmpc.plant import compiled
+from koopmpc.plant.step_map import StepMap
+from koopmpc.predict.bilinear import BilinearPredictor
+from koopmpc.predict.linear import LinearPredictor
+
+PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
+GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
+
+
+def linear(nu: int = 1) -> LinearPredictor:
+    """Return an unstable plant of three states."""
+    A = np.array([[1.05, 0.1, 0], [0, 1.02, 0.1], [0.05, 0, 0.9]])
+    B = np.array([[0.02, 0.1], [0.1, 0], [0, 0.2]])[:, :nu]
+    return LinearPredictor(A, B, np.eye(3), State(), 0.1, ("a", "b", "c"), ("u", "v")[:nu])
+
+
+def pendulum() -> BilinearPredictor:
+    """Return θ⁺ = θ + 0.1 ω, ω⁺ = ω + 0.05 sin θ + 0.1 u cos θ, bilinear on [θ ω sin θ cos θ]."""
+    A = np.eye(4)
+    A[0, 1], A[1, 2] = 0.1, 0.05
+    N = np.zeros((1, 4, 4))
+    N[0, 1, 3] = 0.1
+    lifting = State() + Fourier(1, states="theta")
+    return BilinearPredictor(A, np.zeros((4, 1)), N, np.eye(2, 4), lifting, 0.1, ("theta", "omega"), ("u",))
+
+
+UPRIGHT = Expressions(
+    lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ["sin(theta)", "cos(theta)", "omega"]
+).bind(("theta", "omega"))
+CIRCLE = Cost(Q=[2, 2, 0.2], R=0.1, of=UPRIGHT)
+
+
+LIMITS = [
+    Limits(),
+    Limits(u_min=-0.5, u_max=0.3),
+    Limits(u_max=0.1),
+    Limits(u_min=-1, u_max=1, x_max=[0.25, np.inf, 0.3], slack=(50.0, 10.0)),
+    Limits(u_min=-1, u_max=1, x_min=-0.6, x_max=0.6, slack=(1.0, 5.0)),
+    Limits(u_min=-3, u_max=3, x_max=[0.9, np.inf, np.inf], slack=None),
+]
+
+
+@pytest.mark.parametrize("nu", [1, 2])
+@pytest.mark.parametrize("limits", LIMITS)
+def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: Limits) -> None:
+    model, cost = linear(nu), Cost(Q=[1, 2, 1], R=0.3)
+    ours = BilinearMPC(model, cost, limits, 15)
+    theirs = KoopmanMPC(model, cost, limits, 15, settings=PRECISE)
+    assert isinstance(ours, Controller)
+    x = np.array([0.5, -0.4, 0.3])
+    for k in range(12):
+        ahead = np.tile([0.1 if k > 5 else 0.0, 0, 0], (16, 1))
+        a, b = ours(x, ahead), theirs(x, ahead)
+        assert a.status is b.status
+        assert np.allclose(a.u, b.u, atol=1e-5)
+        assert np.allclose(ours.plan().U, theirs.plan().U, atol=1e-4)
+        assert np.allclose(ours.plan().X, theirs.plan().X, atol=1e-4)
+        x = model.A @ x + model.B @ a.u
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(-4, 4), Limits(-0.8, 0.5), Limits(-0.8, 0.8, x_max=[np.inf, 0.15])]
+)
+@pytest.mark.parametrize("cost", [CIRCLE, Cost(Q=[1, 0.1], R=0.1)])
+def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: Cost, limits: Limits) -> None:
+    model = pendulum()
+    reference = [0, 1, 0] if cost is CIRCLE else [0, 0]
+    ours = BilinearMPC(model, cost, limits, 15, passes=60)
+    theirs = NonlinearMPC(model.step_map(), cost, limits, 15, settings={"ipopt.tol": 1e-10})
+    x = np.array([0.7, -0.3])
+    for _ in range(5):
+        a, b = ours(x, reference), theirs(x, reference)
+        assert a.status in GOOD
+        assert b.status in GOOD
+        assert np.allclose(ours.plan().U, theirs.plan().U, atol=2e-4)
+        x = model.step_map()(x, a.u)
+
+
+def test_its_plan_follows_the_model_once_it_has_converged() -> None:
+    model = pendulum()
+    mpc = BilinearMPC(model, CIRCLE, Limits(-1, 1), 20, passes=60)
+    move = mpc([2.0, 0.5], [0, 1, 0])
+    plan = mpc.plan()
+    assert np.array_equal(plan.X[0], [2.0, 0.5])
+    assert np.array_equal(plan.U[0], move.u)
+    assert np.allclose(model.step_map().rollout(plan.X[0], plan.U), plan.X, atol=1e-6)
+
+
+def test_every_turn_of_the_angle_counts_the_same() -> None:
+    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-1, 1), 20)
+    u = mpc([0.6, -0.2], [0, 1, 0]).u
+    mpc.reset()
+    assert np.allclose(mpc([0.6 + 2 * np.pi, -0.2], [0, 1, 0]).u, u, atol=1e-8)
+
+
+@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
+def test_machine_code_and_interpreter_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = Limits(-0.8, 0.5, x_max=[np.inf, 0.15])
+    fast = BilinearMPC(pendulum(), CIRCLE, limits, 20)
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
+    slow = BilinearMPC(pendulum(), CIRCLE, limits, 20)
+    assert fast._iteration.compiled
+    assert not slow._iteration.compiled
+    x = np.array([2.5, 0.3])
+    for _ in range(15):
+        a, b = fast(x, [0, 1, 0]), slow(x, [0, 1, 0])
+        assert (a.status, a.iterations) == (b.status, b.iterations)
+        assert np.allclose(a.u, b.u, rtol=1e-12, atol=1e-12)
+        x = pendulum().step_map()(x, a.u)
+
+
+SHARED = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5, x_min=[-9, -1], x_max=[9, 1]), 10)
+measured = st.one_of(st.floats(-20, 20), st.sampled_from([np.nan, np.inf, -np.inf, 1e300, 1e31, 0.0]))
+
+
+@settings(max_examples=50)
+@given(st.lists(st.tuples(measured, measured), min_size=1, max_size=6), st.booleans())
+def test_whatever_it_measures_its_input_is_inside_the_limits(states: list, fresh: bool) -> None:
+    if fresh:
+        SHARED.reset()
+    for x in states:
+        move = SHARED(x, [0, 1, 0])
+        assert (move.u >= -0.8).all()
+        assert (move.u <= 0.5).all()
+        assert (move.status in GOOD) == (move.fallback is Fallback.NONE)
+        bad = not np.abs(x).max() < 1e30
+        assert (move.status is Status.BAD_MEASUREMENT) == bad
+        assert (SHARED.plan() is None) == (move.status not in GOOD)
+
+
+def test_hard_limits_that_nothing_meets_are_found() -> None:
+    limits = Limits(-1, 1, x_max=[0.5, np.inf], slack=None)
+    mpc = BilinearMPC(pendulum(), Cost(1, 0.1), limits, 10)
+    plan = [mpc([0.4, -0.1], [0, 0]), mpc.plan().U][1]
+    move = mpc([0.45, 3.0], [0, 0])
+    assert (move.status, move.fallback) == (Status.INFEASIBLE, Fallback.SHIFTED_PLAN)
+    assert np.array_equal(move.u, plan[1])
+    assert mpc.plan() is None
+    assert mpc([0.4, -0.1], [0, 0]).status in GOOD
+
+
+def test_a_soft_limit_that_gives_way_is_reported() -> None:
+    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-1, 1, x_max=[np.inf, 0.2]), 10)
+    assert mpc([0.1, 0.9], [0, 1, 0]).status is Status.SOFTENED
+    assert mpc([0.1, 0.0], [0, 1, 0]).status in (Status.UNCONSTRAINED, Status.OPTIMAL)
+
+
+def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
+    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5), 15, passes=2)
+
+    def run(controller: BilinearMPC) -> list[np.ndarray]:
+        controller.reset()
+        return [controller([3.0 - 0.1 * k, 0.2], [0, 1, 0]).u for k in range(6)]
+
+    first = run(mpc)
+    for other in (mpc, copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
+        assert np.array_equal(first, run(other))
+
+
+def test_a_solver_that_is_made_to_fail_leaves_the_last_plan() -> None:
+    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5), 15)
+    mpc([1.0, 0.2], [0, 1, 0])
+    plan = mpc.plan().U
+    mpc.solver_fails = True
+    move = mpc([1.0, 0.2], [0, 1, 0])
+    assert (move.status, move.fallback) == (Status.FAILED, Fallback.SHIFTED_PLAN)
+    assert np.array_equal(move.u, plan[1])
+    mpc.solver_fails = False
+    assert mpc([1.0, 0.2], [0, 1, 0]).status in GOOD
+
+
+def test_a_reference_that_is_not_finite_is_a_bad_measurement() -> None:
+    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5), 15)
+    assert mpc([1.0, 0.2], [0, np.nan, 0]).status is Status.BAD_MEASUREMENT
+    assert mpc([1.0, 0.2], [0, 1, 0]).status in GOOD
+
+
+def test_it_takes_a_step_map_of_one_state() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    plant = StepMap(ca.Function("F", [x, u], [x + 0.1 * ca.sin(x) + 0.1 * u]), 0.1)
+    for N in (1, 5):
+        mpc = BilinearMPC(plant, Cost(1, 0.01), Limits(-1, 1), N)
+        state = np.array([0.8])
+        for _ in range(60):
+            state = plant(state, mpc(state, [0]).u)
+        assert abs(state[0]) < 1e-3
+
+
+def test_the_constant_of_an_affine_model_does_no_harm() -> None:
+    model = LinearPredictor.local(pendulum().step_map(), [0.3, 0.1], [0.2])
+    assert Constant().bind(model.states).names[0] in model.lifting.names
+    assert BilinearMPC(model, Cost(1, 0.1), None, 5)([0.3, 0.1], [0, 0]).status is Status.UNCONSTRAINED
+
+
+def test_refusals() -> None:
+    model = pendulum()
+    with pytest.raises(DataError, match="horizon is 0; it must be at least 1"):
+        BilinearMPC(model, CIRCLE, None, 0)
+    with pytest.raises(DataError, match="passes is 0; it must be at least 1"):
+        BilinearMPC(model, CIRCLE, None, 5, passes=0)
+    with pytest.raises(DataError, match="knows no rate limits and no R_delta"):
+        BilinearMPC(model, CIRCLE, Limits(du_max=1), 5)
+    with pytest.raises(ShapeError, match="Q_N weighs x_N − r_N, but the reference is not of the state"):
+        BilinearMPC(model, Cost(Q=[2, 2, 0.2], R=0.1, Q_N=[1, 1], of=UPRIGHT), None, 5)
+    mpc = BilinearMPC(model, CIRCLE, None, 5)
+    with pytest.raises(ShapeError, match=r"y has shape \(3,\), expected \(2,\), one value a state"):
+        mpc([0, 0, 0], [0, 1, 0])
+    with pytest.raises(ShapeError, match=r"reference has shape \(2,\), expected \(3,\)"):
+        mpc([0, 0], [0, 1])
