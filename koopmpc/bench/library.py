@@ -53,10 +53,9 @@ def load_problem(problem: str | Path) -> Problem:
     """
     text = str(problem)
     path, case = _find(text), ""
-    if path is None and ":" in text:
-        name, _, case = text.rpartition(":")
-        path = _find(name)
-        text = name
+    name, colon, last = text.rpartition(":")
+    if path is None and colon and last[:1] not in ("/", "\\"):  # the colon of C:\spring.py is a drive's
+        path, text, case = _find(name), name, last
     if path is None:
         raise ProblemError(_unknown(text))
     loaded = _load(path)
@@ -71,6 +70,9 @@ def _find(text: str) -> Path | None:
 
 
 def _unknown(text: str) -> str:
+    if Path(text).is_dir():
+        inside = ", ".join(str(path) for path in _files(Path(text))) or "there is none in it"
+        return f"{text} is a folder; pass the path of one problem file: {inside}"
     if text.endswith(".py") or "/" in text or "\\" in text:
         return (
             f"there is no file {text}; pass the path of a problem file, or a name that `koopmpc list` shows"
@@ -90,7 +92,7 @@ def _load(path: Path) -> Problem:
     sys.modules[module_name] = module  # dataclasses look their module up
     try:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a file that calls exit() must not end the program
         sys.modules.pop(module_name)
         raise ProblemError(f"{path}{_line(error, path)}: {type(error).__name__}: {error}") from error
     loaded = module.__dict__.get("problem")
@@ -102,7 +104,7 @@ def _load(path: Path) -> Problem:
     return replace(loaded, name=path.stem, title=_first_line(module.__doc__))
 
 
-def _line(error: Exception, path: Path) -> str:
+def _line(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError):
         return f", line {error.lineno}"
     lines = [

@@ -13,7 +13,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.collect import InputFunction, Uniform
 from koopmpc.data.policy import Excitation
-from koopmpc.errors import DataError, ProblemError, ShapeError
+from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.plant.dynamics import Dynamics
 from koopmpc.plant.integrators import RK4, Integrator
@@ -110,7 +110,8 @@ class Problem:
     Raises
     ------
     ShapeError, DataError
-        A start, the equilibrium or an angle does not fit the states; there is no case.
+        A start, a reference, the equilibrium, an angle, the cost or limits do not fit; there is no case, or one
+        whose name cannot be a file's.
     """
 
     dynamics: Dynamics
@@ -143,12 +144,27 @@ class Problem:
             raise DataError(
                 'a problem needs at least one case: cases={"name": km.Case(x0, reference, steps)}'
             )
+        nr = self.cost.of.bind(self.dynamics.states).nz
+        self.cost.matrices(nr, nu)
+        _fits(self.limits, self.dynamics, "limits")
         for name, case in self.cases.items():
+            if not name or any(sign.isspace() or sign in "/\\:" for sign in name):
+                raise DataError(
+                    f"a case is called {name!r}; its logs are named after it: leave out spaces, /, \\ and :"
+                )
             size = np.shape(case.x0)
             if size != (nx,):
                 raise ShapeError(
                     f"case {name!r}: x0 has shape {size}, expected ({nx},): {self.dynamics.states}"
                 )
+            size = np.shape(case.reference) or (1,)
+            if size not in ((nr,), (case.steps + 1, nr)):
+                raise ShapeError(
+                    f"case {name!r}: reference has shape {size}, expected ({nr},) or (steps+1, nr) = "
+                    f"({case.steps + 1}, {nr}): the cost tracks {nr} outputs"
+                )
+            if case.limits is not None:
+                _fits(case.limits, self.dynamics, f"case {name!r}: limits")
         wrong = [i for i in self.angles if not 0 <= i < nx]
         if wrong:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
@@ -172,3 +188,13 @@ class Problem:
         """Return the limits that hold in this case."""
         own = self.cases[case].limits
         return self.limits if own is None else own
+
+
+def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
+    """Raise where limits have other sizes than the inputs, states and observables that they limit."""
+    try:
+        limits.inputs(dynamics.nu)
+        limits.rates(dynamics.nu)
+        limits.rows(dynamics.nx, 0 if limits.of is None else limits.of.bind(dynamics.states).nz)
+    except KoopmpcError as error:
+        raise ShapeError(f"{what}: {error}") from error

@@ -83,6 +83,23 @@ def test_an_unknown_case_suggests_the_nearest():
         load_problem("cart_pole:recovery")
 
 
+@pytest.mark.parametrize("text", [r"C:\Users\me\spring.py", "C:/Users/me/spring.py"])
+def test_the_colon_of_a_drive_is_none_of_a_case(text):
+    with pytest.raises(ProblemError) as caught:
+        load_problem(text)
+    assert str(caught.value).startswith(f"there is no file {text};")
+
+
+def test_a_folder_is_said_to_be_one(tmp_path):
+    path = write(tmp_path)
+    with pytest.raises(ProblemError, match="is a folder; pass the path of one problem file: ") as caught:
+        load_problem(tmp_path)
+    assert str(caught.value).endswith(str(path))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ProblemError, match=r"is a folder; .*there is none in it"):
+        load_problem(tmp_path / "empty")
+
+
 def test_a_missing_file_is_named():
     with pytest.raises(ProblemError, match=r"there is no file nowhere/plant\.py"):
         load_problem("nowhere/plant.py")
@@ -102,6 +119,13 @@ def test_the_line_is_the_files_own_where_the_library_raises(tmp_path):
     path = tmp_path / "deep.py"
     path.write_text("import koopmpc as km\n\nlimits = km.Limits(u_min=1.0, u_max=-1.0)\n")
     with pytest.raises(ProblemError, match=r"deep\.py, line 3: DataError: input limits cross"):
+        load_problem(path)
+
+
+def test_a_file_that_exits_is_an_error_like_any_other(tmp_path):
+    path = tmp_path / "quitter.py"
+    path.write_text("import sys\n\nsys.exit(3)\n")
+    with pytest.raises(ProblemError, match=r"quitter\.py, line 3: SystemExit: 3"):
         load_problem(path)
 
 

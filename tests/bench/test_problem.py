@@ -6,7 +6,10 @@ import pytest
 
 from koopmpc.bench.library import load_problem
 from koopmpc.bench.problem import Case, Training
-from koopmpc.errors import DataError, ProblemError, ShapeError
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
+from koopmpc.lifting.fourier import Fourier
 from tests.bench.tiny import write
 
 
@@ -30,11 +33,52 @@ def problem(tmp_path):
         ({"horizon": 0}, DataError, "horizon is 0; it must be at least 1"),
         ({"ridge": -1.0}, DataError, "ridge is -1; it must be zero or above"),
         ({"angles": (1,)}, DataError, "angles holds 1; pass indices of states, 0 to 0"),
+        (
+            {"cases": {"bad": Case([1.0], [0.0, 0.0], 3)}},
+            ShapeError,
+            r"case 'bad': reference has shape \(2,\), expected \(1,\) or \(steps\+1, nr\) = \(4, 1\)",
+        ),
+        (
+            {"cases": {"bad": Case([1.0], [[0.0]] * 3, 3)}},
+            ShapeError,
+            r"case 'bad': reference has shape \(3, 1\), expected",
+        ),
+        ({"cost": Cost(Q=[1.0, 2.0], R=1.0)}, ShapeError, r"Q has shape \(2,\), expected \(1, 1\)"),
+        ({"cost": Cost(Q=1.0, R=[1.0, 2.0])}, ShapeError, r"R has shape \(2,\)"),
+        (
+            {"cost": Cost(Q=1.0, R=1.0, of=Fourier(1, ["speed"]))},
+            KoopmpcError,
+            "speed",
+        ),
+        ({"limits": Limits(u_max=[1.0, 2.0])}, ShapeError, r"limits: u_max has shape \(2,\)"),
+        ({"limits": Limits(du_max=[1.0, 2.0])}, ShapeError, r"limits: du_m.. has shape \(2,\)"),
+        ({"limits": Limits(x_min=[0.0, 0.0])}, ShapeError, r"limits: x_min has shape \(2,\)"),
+        (
+            {"limits": Limits(of=Fourier(1), y_max=[1.0, 1.0, 1.0])},
+            ShapeError,
+            r"limits: y_max has shape \(3,\), expected \(2,\)",
+        ),
+        (
+            {"cases": {"bad": Case([1.0], [0.0], 3, limits=Limits(u_max=[1.0, 2.0]))}},
+            ShapeError,
+            r"case 'bad': limits: u_max has shape \(2,\)",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(problem, change, error, text):
     with pytest.raises(error, match=text):
         replace(problem, **change)
+
+
+@pytest.mark.parametrize("name", ["up/down", "up\\down", "a:b", "two words", "line\nend", ""])
+def test_a_case_is_named_as_a_file_can_be(problem, name):
+    with pytest.raises(DataError, match="its logs are named after it: leave out spaces"):
+        replace(problem, cases={name: Case([1.0], [0.0], 3)})
+
+
+@pytest.mark.parametrize("reference", [0.0, [0.0], [[0.0]] * 4])
+def test_every_form_of_a_reference_that_simulate_takes_fits(problem, reference):
+    assert replace(problem, cases={"good": Case([1.0], reference, 3)}).cases.keys() == {"good"}
 
 
 def test_a_case_needs_steps_and_numbers():
