@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.condense import Coordinates
+from koopmpc.control.constrained import Constrained
 from koopmpc.control.cost import Cost
 from koopmpc.control.fallback import PlanMemory, admitted
 from koopmpc.control.horizon import blocked
@@ -18,8 +19,6 @@ from koopmpc.control.limits import Box, Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.control.origin import Origin
 from koopmpc.control.plan_map import PlanMap
-from koopmpc.control.solvers.base import QPSolution
-from koopmpc.control.solvers.osqp import OSQP
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Observer
 from koopmpc.lifting.buffered import HUGE
@@ -63,9 +62,12 @@ class KoopmanMPC:
         Variables of the QP: "plain", the inputs; "riccati", those in which the Hessian is the identity however
         unstable the plant; "auto" takes the plain ones where their Hessian is well conditioned.
     solver
-        "osqp".
+        "osqp", or "daqp", an active-set method that the extra ``koopmpc[daqp]`` installs.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}``.
+    time_limit
+        Wall-clock time a step may take [s]. A QP that is not solved by then is given up for the fallback; what is
+        late although it was solved is used. Either way the status is TIME_LIMIT.
 
     Raises
     ------
@@ -96,11 +98,10 @@ class KoopmanMPC:
         moves: int | Sequence[int] | None = None,
         disturbed: bool = False,
         coordinates: Coordinates = "auto",
-        solver: Literal["osqp"] = "osqp",
+        solver: Literal["osqp", "daqp"] = "osqp",
         settings: Mapping[str, Any] | None = None,
+        time_limit: float | None = None,
     ) -> None:
-        if solver != "osqp":
-            raise DataError(f'solver is {solver!r}; there is "osqp"')
         if coordinates not in ("auto", "riccati", "plain"):
             raise DataError(f'coordinates is {coordinates!r}; pass "auto", "riccati" or "plain"')
         self._N, self._nu = checks.count(horizon, "horizon"), predictor.nu
@@ -111,12 +112,10 @@ class KoopmanMPC:
         self._map = PlanMap(
             predictor, cost, self.limits, self._blocks, disturbed=self._disturbed, coordinates=coordinates
         )
-        track, self._program = self._map.track, self._map.program
-        self._settings = settings
-        self._solver = OSQP(self._program.qp, settings)
-        self._primal = np.zeros(len(self._program.qp.q) + 1)  # one more, always zero, for the shift
-        self._dual = np.zeros(len(self._program.low) + 1)
-        self._warm = self._planned = False
+        track = self._map.track
+        self._constrained = Constrained(self._map.hard, self._map.soft, solver, settings)
+        self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
+        self._planned = False
         self._rated = self._map.horizon.rated
         self._signals = self._rated or predictor.nw > 0
         self._hard_rates = _hard(track.rates, track.rate_softness.linear)
@@ -187,8 +186,8 @@ class KoopmanMPC:
         fails. A disturbance that `disturb` set is forgotten too. A filter starts at x0, by default at zero.
         """
         self._memory.reset(u_prev)
-        self._solver.reset()
-        self._warm = self._planned = False
+        self._constrained.reset()
+        self._planned = False
         self._drive[:] = 0.0
         self._origin.reset(x0, self._memory.last())
 
@@ -214,8 +213,8 @@ class KoopmanMPC:
             disturbed=self._disturbed,
             coordinates="plain" if self.coordinates == "plain" else "riccati",
         )
-        self.predictor, self._program = predictor, self._map.program
-        self._solver = OSQP(self._program.qp, self._settings)
+        self.predictor = predictor
+        self._constrained.adopt(self._map.hard, self._map.soft)
         self._reference_key = None
         self._origin.adopt(predictor)
 
@@ -331,9 +330,11 @@ class KoopmanMPC:
         self._W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
-        self._warm = False
+        self._constrained.cool()
         self._keep(t)
-        return Move(t[: self._nu].copy(), Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
+        taken = perf_counter() - start
+        status = Status.UNCONSTRAINED if taken <= self._allowed else Status.TIME_LIMIT
+        return Move(t[: self._nu].copy(), status, Fallback.NONE, taken, 0)
 
     def _keep(self, t: Float[np.ndarray, " nt"]) -> None:
         """Make t the plan; the array of the plan before it is free for the next step."""
@@ -355,44 +356,25 @@ class KoopmanMPC:
             v += plan.correction(self._reference, self._drive)
         if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
             return self._unconstrained(t, start)
-        solution, conflict = self._solve(v)
-        if self.solver_fails:
-            solution.status = Status.FAILED
-        if solution.status is not Status.OPTIMAL:
-            return self._fail(v[: self._nu], applied, solution.status, solution.iterations, start)
-        self._primal[:-1], self._dual[:-1] = solution.v, solution.y
-        self._warm = True
-        nw = len(self._blocks) * self._nu
-        v += plan.maps.deviation @ solution.v[:nw]
-        inputs = plan.track.inputs
+        nw, inputs = len(self._blocks) * self._nu, plan.track.inputs
+        room = None
+        if self._hard_rates is not None:
+            room = Box(inputs.low - self._u_prev, inputs.high - self._u_prev)
+        deadline = None if np.isinf(self._allowed) else start + self._allowed
+        found = self._constrained.solve(v, room, nw, deadline)
+        status = Status.FAILED if self.solver_fails else found.status
+        if status is not Status.OPTIMAL:
+            return self._fail(v[: self._nu], applied, status, found.iterations, start)
+        v += plan.maps.deviation @ found.w
         u = np.clip(v[:nw].reshape(-1, self._nu), *inputs)
         if self._hard_rates is not None:
             u[0] = admitted(u[0], inputs, self._hard_rates, self._u_prev)
         v[:nw] = u.ravel()
         self._keep(t)
-        gave_way = conflict or (solution.v[nw:] > self._program.allowance).any()
-        status = Status.SOFTENED if gave_way else Status.OPTIMAL
-        return Move(u[0].copy(), status, Fallback.NONE, perf_counter() - start, solution.iterations)
-
-    def _solve(self, v: Float[np.ndarray, " nv"]) -> tuple[QPSolution, bool]:
-        """Solve the QP for the deviation from the plan v; True where the input limits are out of the rates' reach."""
-        problem, conflict = self._program, False
-        low, high = problem.low.copy(), problem.high.copy()
-        if self._hard_rates is not None:
-            inputs, (rows, which) = self._map.track.inputs, problem.rates
-            lowest = np.minimum(low[rows], (inputs.high - self._u_prev)[which])
-            highest = np.maximum(high[rows], (inputs.low - self._u_prev)[which])
-            conflict = bool((lowest < low[rows] - 1e-9).any() or (highest > high[rows] + 1e-9).any())
-            low[rows], high[rows] = lowest, highest
-        moved = v[problem.source]
-        low[: len(moved)] -= moved
-        high[: len(moved)] -= moved
-        self._solver.update(low, high)
-        if self._warm:
-            start = self._primal[problem.shift_primal], self._dual[problem.shift_dual]
-        else:
-            start = np.zeros(len(problem.shift_primal)), np.zeros(len(problem.shift_dual))
-        return self._solver.solve(*start), conflict
+        taken = perf_counter() - start
+        status = Status.SOFTENED if found.gave_way else Status.OPTIMAL
+        status = status if taken <= self._allowed else Status.TIME_LIMIT
+        return Move(u[0].copy(), status, Fallback.NONE, taken, found.iterations)
 
     def _fail(
         self,
@@ -403,7 +385,8 @@ class KoopmanMPC:
         start: float,
     ) -> Move:
         """Return what stands in for a failed step, with the status that says why."""
-        self._warm = self._planned = False
+        self._constrained.cool()
+        self._planned = False
         u, fallback = self._memory.instead(free, applied)
         return Move(u, status, fallback, perf_counter() - start, iterations)
 
@@ -425,8 +408,9 @@ class LinearMPC(KoopmanMPC):
         moves: int | Sequence[int] | None = None,
         disturbed: bool = False,
         coordinates: Coordinates = "auto",
-        solver: Literal["osqp"] = "osqp",
+        solver: Literal["osqp", "daqp"] = "osqp",
         settings: Mapping[str, Any] | None = None,
+        time_limit: float | None = None,
     ) -> None:
         super().__init__(
             LinearPredictor.local(step_map, x, u),
@@ -440,6 +424,7 @@ class LinearMPC(KoopmanMPC):
             coordinates=coordinates,
             solver=solver,
             settings=settings,
+            time_limit=time_limit,
         )
 
 

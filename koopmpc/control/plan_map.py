@@ -53,7 +53,10 @@ class PlanMap:
         found = track.targets
         law = recursion(stages(horizon, found), horizon.P_N, end(horizon, found))
         self.maps = condense(horizon, law, found, coordinates)
-        self.program = _program(self.maps, track, horizon)
+        self.hard = _program(self.maps, track, horizon, soft_rows=False)
+        self.soft = (
+            _program(self.maps, track, horizon, soft_rows=True) if np.isfinite(self.hard.most).any() else None
+        )
         self._signals = horizon.signals(found.Z.shape[1])
 
         low, high = _bounds(track, horizon)
@@ -162,7 +165,7 @@ def _bounds(track: Tracking, horizon: Horizon) -> tuple[Float[np.ndarray, " nv"]
     return ends[0], ends[1]
 
 
-def _program(maps: Condensed, track: Tracking, horizon: Horizon) -> Program:
+def _program(maps: Condensed, track: Tracking, horizon: Horizon, *, soft_rows: bool) -> Program:
     """Return the QP, whose next stages are a step on: of outputs the next, of moves the one that then holds."""
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
     starts = np.cumsum([0, *horizon.blocks[:-1]])
@@ -177,4 +180,5 @@ def _program(maps: Condensed, track: Tracking, horizon: Horizon) -> Program:
         rates,
         Group(track.outputs, track.softness, np.arange(1, N + 1)),
         maps.unit,
+        soft_rows=soft_rows,
     )

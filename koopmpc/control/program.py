@@ -37,7 +37,8 @@ class Program:
 
     Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v: their bounds
     are `low` and `high` less that entry; the rest are ε ≥ 0. `shift_primal` and `shift_dual` tell where the next
-    stage's entry stands; one past the end stands for zero. A slack above its `allowance` is reported.
+    stage's entry stands; one past the end stands for zero. A slack above its `allowance` is reported. Where soft
+    rows are held hard, their multipliers must be at most `most` for the solution to be that of the soft QP.
     """
 
     qp: QP
@@ -47,11 +48,15 @@ class Program:
     shift_primal: Int[np.ndarray, " n"]
     shift_dual: Int[np.ndarray, " m"]
     allowance: Float[np.ndarray, " ns"]
+    most: Float[np.ndarray, " m"]
     rates: FirstRates
 
 
 class _Block(NamedTuple):
-    """Rows of the QP from one kind of limit: entries of v, bounds, the place after each, the sign and index of ε."""
+    """Rows of the QP from one kind of limit: entries of v, bounds, the place after each, the sign and index of ε.
+
+    `linear` is the slack weight of each row, inf where it is hard.
+    """
 
     source: Int[np.ndarray, " p"]
     low: Float[np.ndarray, " p"]
@@ -59,6 +64,7 @@ class _Block(NamedTuple):
     next: Int[np.ndarray, " p"]
     sign: float
     slack: Int[np.ndarray, " p"]
+    linear: Float[np.ndarray, " p"]
 
 
 def program(
@@ -68,8 +74,13 @@ def program(
     rates: Group | None,
     outputs: Group,
     unit: float,
+    *,
+    soft_rows: bool,
 ) -> Program:
-    """Return the QP for v = [moves; their changes, unless None; outputs], its deviation map D and H."""
+    """Return the QP for v = [moves; their changes, unless None; outputs], its deviation map D and H.
+
+    Without `soft_rows` every row is hard.
+    """
     nw = deviation.shape[1]
     groups = [moves, outputs] if rates is None else [moves, rates, outputs]
     blocks: list[_Block] = []
@@ -81,8 +92,8 @@ def program(
         box, softness, following = group
         width, N = len(box.low), len(following)
         limited = np.isfinite(box.low) | np.isfinite(box.high)
-        soft = np.flatnonzero(limited & np.isfinite(softness.linear))
-        hard = np.flatnonzero(limited & ~np.isfinite(softness.linear))
+        gives = np.isfinite(softness.linear) & soft_rows
+        soft, hard = np.flatnonzero(limited & gives), np.flatnonzero(limited & ~gives)
         slack_of = np.full(width, -1)
         slack_of[soft] = np.arange(len(soft))
         for picked, sign in (
@@ -93,7 +104,8 @@ def program(
             count = len(picked)
             stage = np.arange(N)[:, None]
             if group is rates and sign == 0.0:
-                first_rates = FirstRates(sum(len(b.source) for b in blocks) + np.arange(count), picked)
+                truly = np.flatnonzero(np.isinf(softness.linear[picked]))
+                first_rates = FirstRates(sum(len(b.source) for b in blocks) + truly, picked[truly])
             blocks.append(
                 _Block(
                     (first + width * stage + picked).ravel(),
@@ -102,6 +114,7 @@ def program(
                     _next(following, count),
                     sign,
                     (slacks + len(soft) * stage + slack_of[picked]).ravel(),
+                    np.tile(softness.linear[picked], N),
                 )
             )
         shifts.append(_next(following, len(soft)))
@@ -132,6 +145,7 @@ def program(
         _joined(shifts),
         _joined([*(block.next for block in blocks), *shifts[1:]]),
         allowed,
+        np.concatenate([*(block.linear / (2 * unit) for block in blocks), np.full(slacks, np.inf)]),
         first_rates,
     )
 

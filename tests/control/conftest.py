@@ -2,14 +2,14 @@
 
 import pytest
 
-import koopmpc.control.koopman_mpc
 import koopmpc.control.target
+from koopmpc.control.solvers import choose
 from tests.control.kkt import CheckedOSQP
 
 
 @pytest.fixture(autouse=True, scope="package")
 def _every_qp_meets_kkt():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(koopmpc.control.koopman_mpc, "OSQP", CheckedOSQP)
+        patch.setitem(choose.SOLVERS, "osqp", CheckedOSQP)
         patch.setattr(koopmpc.control.target, "OSQP", CheckedOSQP)
         yield

@@ -24,8 +24,8 @@ class CheckedOSQP(OSQP):
         super().update(low, high)
         self.qp = QP(self.qp.P, self.qp.q, self.qp.A, low.copy(), high.copy())
 
-    def solve(self, v, y):
-        solution = super().solve(v, y)
+    def solve(self, v, y, time_limit=None):
+        solution = super().solve(v, y, time_limit)
         if solution.status is Status.OPTIMAL:
             meets_kkt(self.qp, solution, *self.eps)
             CheckedOSQP.checked += 1

@@ -102,7 +102,7 @@ show(lambda: km.Limits(slack=5))
     )
     assert lines == [
         """DataError u_target is 'rest'; pass "equilibrium" or "zero\"""",
-        """DataError solver is 'simplex'; there is "osqp\"""",
+        "DataError solver is 'simplex'; there are 'osqp', 'daqp'",
         "DataError horizon is 2.5; pass a whole number",
         "ShapeError slack is 5; pass (linear, quadratic), or None for hard limits",
     ]
