@@ -32,7 +32,7 @@ Faults = Annotated[
 ]
 Controllers = Annotated[
     list[str] | None,
-    typer.Option("--controller", "-c", help="One of the five; may be repeated. Default: all."),
+    typer.Option("--controller", "-c", help="One of the six; may be repeated. Default: all."),
 ]
 
 
@@ -76,7 +76,7 @@ def bench(
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
-    """Compare the five controllers on several problems."""
+    """Compare the six controllers on several problems."""
     from koopmpc.bench.library import load_problem, shipped
 
     with _friendly():

@@ -16,7 +16,7 @@ import koopmpc as km
 
 @dataclass(frozen=True)
 class CartPole(km.Dynamics):
-    """(M + m sin²θ) v̇ = u + m sin θ (L ω² + g cos θ),  L ω̇ = −v̇ cos θ − g sin θ."""
+    """(M + m sin²θ) v̇ = u + wind + m sin θ (L ω² + g cos θ),  L ω̇ = −v̇ cos θ − g sin θ."""
 
     states = ("position [m]", "velocity [m/s]", "theta [rad]", "omega [rad/s]")
     inputs = ("force [N]",)
@@ -25,12 +25,13 @@ class CartPole(km.Dynamics):
     m: float = 1.0  # pole mass, at the tip [kg]
     L: float = 2.0  # pole length [m]
     g: float = 9.81  # gravity [m/s²]
+    wind: float = 0.0  # force on the cart that nobody measures [N]
 
     def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
         """ẋ = [v, v̇, ω, ω̇]."""
         velocity, theta, omega = x[1], x[2], x[3]
         S, C = ca.sin(theta), ca.cos(theta)
-        push = u[0] + self.m * S * (self.L * omega**2 + self.g * C)
+        push = u[0] + self.wind + self.m * S * (self.L * omega**2 + self.g * C)
         acceleration = push / (self.M + self.m * S**2)
         return ca.vertcat(velocity, acceleration, omega, -(acceleration * C + self.g * S) / self.L)
 
@@ -75,6 +76,9 @@ problem = km.Problem(
     cases={
         "shift": km.Case(x0=[-1.0, 0.0, np.pi, 0.0], reference=[1.0, 0.0, np.pi, 0.0], steps=240),
         "recover": km.Case(x0=[0.0, 0.0, np.pi - 0.5, 0.0], reference=[0.0, 0.0, np.pi, 0.0], steps=240),
+        "wind": km.Case(
+            x0=[0.0, 0.0, np.pi, 0.0], reference=[1.0, 0.0, np.pi, 0.0], steps=240, plant=CartPole(wind=5.0)
+        ),
     },
     angles=(2,),
     scene=scene,

@@ -83,6 +83,8 @@ problem = km.Problem(
         "hang": km.Case(
             x0=[np.pi, 0.0], reference=[0.0, 0.0], steps=300, limits=km.Limits(u_min=-10.0, u_max=10.0)
         ),
+        # 17 N m hold the bob there, which weighs a fifth more than anybody was told
+        "hold": km.Case(x0=[np.pi / 4, 0.0], reference=[0.8, 0.0], steps=200, plant=Pendulum(m=1.2)),
     },
     angles=(0,),
     scene=scene,

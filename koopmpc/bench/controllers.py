@@ -1,4 +1,4 @@
-"""The five controllers of the bench: one cost, one set of limits and one horizon for all."""
+"""The six controllers of the bench: one cost, one set of limits and one horizon for all."""
 
 from collections.abc import Callable, Iterable
 
@@ -10,6 +10,7 @@ from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear_mpc import NonlinearMPC
 from koopmpc.errors import ProblemError
+from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.predict.linear import LinearPredictor
 
 Build = Callable[[Prepared, Limits], Controller]
@@ -37,6 +38,12 @@ def _koopman_mpc(parts: Prepared, limits: Limits) -> Controller:
     return KoopmanMPC(parts.model, parts.problem.cost, limits, parts.problem.horizon)
 
 
+def _offset_free(parts: Prepared, limits: Limits) -> Controller:
+    """MPC on the lifted predictor, with a disturbance of every lifted coordinate."""
+    problem = parts.problem
+    return KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
+
+
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
     """MPC on the model itself: the oracle where the model is the truth."""
     return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon)
@@ -47,12 +54,15 @@ CONTROLLERS: dict[str, Build] = {
     "koopman-lqr": _koopman_lqr,
     "linear-mpc": _linear_mpc,
     "koopman-mpc": _koopman_mpc,
+    "offset-free": _offset_free,
     "nonlinear-mpc": _nonlinear_mpc,
 }
 
+LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free")
+
 
 def chosen(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the names of controllers, all five by default.
+    """Return the names of controllers, all six by default.
 
     Raises
     ------

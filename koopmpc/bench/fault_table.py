@@ -20,7 +20,13 @@ def under_faults(title: str, rows: Sequence[Row]) -> Table:
     whole = {row.controller: row for row in rows if row.fault is None}
     found = {(row.fault, row.controller): row for row in rows if row.fault is not None}
     lines = Table(
-        title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        min_width=len(title),
+        padding=0,  # the box has a blank between columns
+        show_edge=False,
     )
     lines.add_column("fault", no_wrap=True)
     for controller in whole:

@@ -37,7 +37,14 @@ class Prepared:
     @cached_property
     def truth(self) -> StepMap | Plant:
         """The plant that is driven: the problem's `plant`, or its model where there is none."""
-        plant = self.problem.plant
+        return self._driven(self.problem.plant)
+
+    def truth_of(self, case: str) -> StepMap | Plant:
+        """Return the plant that is driven in this case: its own, or the problem's."""
+        plant = self.problem.cases[case].plant
+        return self.truth if plant is None else self._driven(plant)
+
+    def _driven(self, plant: Dynamics | StepMap | Plant | None) -> StepMap | Plant:
         if plant is None:
             return self.step_map
         if isinstance(plant, Dynamics):
@@ -55,7 +62,8 @@ class Prepared:
 
     def _find(self, case: str) -> Float[np.ndarray, "T nu"]:
         problem, steps = self.problem, self.problem.cases[case].steps
-        truth = self.truth.step_map if isinstance(self.truth, SimulatedPlant) else self.truth
+        truth = self.truth_of(case)
+        truth = truth.step_map if isinstance(truth, SimulatedPlant) else truth
         plant = truth if isinstance(truth, StepMap) else self.step_map
         if problem.cost.u_target == "zero":
             return np.zeros((steps, plant.nu))

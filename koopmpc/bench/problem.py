@@ -65,12 +65,15 @@ class Case:
         Length of the run.
     limits
         Take the place of the problem's limits in this case.
+    plant
+        The truth of this case, where nobody was told of it: another mass, a load. Data are the problem's.
     """
 
     x0: ArrayLike
     reference: ArrayLike
     steps: int
     limits: Limits | None = None
+    plant: Dynamics | StepMap | Plant | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "x0", checks.array(self.x0, "Case.x0", (None,)))

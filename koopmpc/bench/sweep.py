@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from koopmpc.bench.controllers import CONTROLLERS, chosen
+from koopmpc.bench.controllers import CONTROLLERS, LEARNED, chosen
 from koopmpc.bench.faults import FAULTS, possible
 from koopmpc.bench.parquet import write_results
 from koopmpc.bench.prepare import Prepared
@@ -116,7 +116,7 @@ def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> Row:
         found = failures(run, parts.problem.cases[case].steps)
         if load_run(log) != run:
             found.append(f"{log.name} does not read back equal to the run")
-        training = parts.training_time if name.startswith("koopman") else 0.0
+        training = parts.training_time if name in LEARNED else 0.0
         failure = "; ".join(found) or None
         return Row(problem, case, name, metrics(run), reached(run), training, log, failure, fault)
     except Exception as error:  # one run must not take the others with it; the exit code says so
@@ -129,7 +129,7 @@ def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> Row:
 
 def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
     """Return the run of one controller on one case, written to `log`."""
-    problem, case = parts.problem, parts.problem.cases[task.case]
+    problem, case, plant = parts.problem, parts.problem.cases[task.case], parts.truth_of(task.case)
     limits = problem.limits_of(task.case)
     controller = CONTROLLERS[task.controller](parts, limits)
     injected = () if task.fault is None else (FAULTS[task.fault],)
@@ -145,7 +145,7 @@ def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
 
     def closed_loop(*observers: Observer) -> Run:
         return simulate(
-            parts.truth,
+            plant,
             controller,
             x0=case.x0,
             reference=case.reference,
@@ -161,7 +161,6 @@ def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
         run = closed_loop()
         record(run, log, **drawn)
         return run
-    plant = parts.truth
     names: dict[str, Any] = {
         "dt": plant.dt,
         "states": plant.states,

@@ -25,7 +25,8 @@ class LiftedDisturbance(Value):
     Parameters
     ----------
     gain
-        Share of the newest misfit, in (0, 1]: 1 is deadbeat, and as noisy as two measurements; less filters.
+        Share of the newest misfit, in (0, 1]: 1 is deadbeat, and as noisy as two measurements; less filters. Far
+        from rest the misfit of a learned model is no constant, and a large gain makes the plan believe it is.
 
     Raises
     ------
@@ -33,7 +34,7 @@ class LiftedDisturbance(Value):
         The gain is outside (0, 1].
     """
 
-    gain: float = 0.3
+    gain: float = 0.1
 
     def __post_init__(self) -> None:
         if checks.positive(self.gain, "gain") > 1:

@@ -16,7 +16,7 @@ def test_the_example_of_the_documentation_runs_and_reaches(tmp_path):
     path = tmp_path / "spring.py"
     path.write_text(source)
     rows = sweep([load_problem(path)], folder=tmp_path / "logs")
-    assert [row.failure for row in rows] == [None] * 10
+    assert [row.failure for row in rows] == [None] * 12
     assert all(row.reached for row in rows if row.controller in ("koopman-mpc", "nonlinear-mpc"))
 
 

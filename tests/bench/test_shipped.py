@@ -11,14 +11,14 @@ from koopmpc.bench.sweep import sweep
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
     problems = [replace(load_problem(path), scene=None) for path in shipped()]  # drawing is what takes long
-    names = ["lqr", "koopman-mpc", "nonlinear-mpc"]
+    names = ["lqr", "koopman-mpc", "offset-free", "nonlinear-mpc"]
     swept = sweep(problems, names, folder=tmp_path_factory.mktemp("shipped"))
     return {(row.problem, row.case, row.controller): row for row in swept}
 
 
 def test_every_run_ends_as_it_should(rows):
     assert {key: row.failure for key, row in rows.items() if row.failure} == {}
-    assert len(rows) == 12
+    assert len(rows) == 24
 
 
 @pytest.mark.parametrize("case", [("pendulum", "upright"), ("cart_pole", "shift"), ("cart_pole", "recover")])
@@ -38,7 +38,17 @@ def test_limits_keep_lqr_from_the_recovery_that_koopman_mpc_manages(rows):
     assert lqr.cost > 10 * koopman.cost
 
 
+@pytest.mark.parametrize("case", [("pendulum", "hold"), ("cart_pole", "wind")])
+def test_only_the_estimator_leaves_no_offset_where_nobody_was_told_of_the_load(rows, case):
+    free = rows[*case, "offset-free"].metrics
+    assert max(abs(free.final_error)) < 1e-3
+    for name in ("lqr", "koopman-mpc", "nonlinear-mpc"):
+        other = rows[*case, name].metrics
+        assert max(abs(other.final_error)) > 0.02
+        assert free.cost < other.cost
+
+
 @pytest.mark.slow
-def test_all_five_controllers_end_as_they_should_on_all_cases(tmp_path):
+def test_all_six_controllers_end_as_they_should_on_all_cases(tmp_path):
     swept = sweep([load_problem(path) for path in shipped()], folder=tmp_path)
-    assert [row.failure for row in swept] == [None] * 20
+    assert [row.failure for row in swept] == [None] * 36

@@ -20,7 +20,7 @@ from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder
 from tests.bench.tiny import write
 
-FIVE = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "nonlinear-mpc"]
+SIX = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "nonlinear-mpc"]
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +35,15 @@ def swept(tmp_path_factory):
 def test_every_controller_meets_every_case_once(swept):
     _, rows, _, told = swept
     assert [(r.problem, r.case, r.controller) for r in rows] == [
-        ("tiny", case, name) for case in ("near", "far") for name in FIVE
+        ("tiny", case, name) for case in ("near", "far") for name in SIX
     ]
-    assert [done for _, done, _ in told] == list(range(11))
-    assert {total for *_, total in told} == {10}
+    assert [done for _, done, _ in told] == list(range(13))
+    assert {total for *_, total in told} == {12}
 
 
 def test_all_end_as_they_should_and_the_short_case_is_no_failure(swept):
     _, rows, _, _ = swept
-    assert [row.failure for row in rows] == [None] * 10
+    assert [row.failure for row in rows] == [None] * 12
     assert all(row.reached for row in rows if row.case == "near")
     assert not any(
         row.reached for row in rows if row.case == "far"
@@ -128,7 +128,7 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
 def test_a_model_that_cannot_be_learned_takes_only_its_own_controllers(tmp_path):
     broken = write(tmp_path, **{"km.Noise(-2.0, 2.0)": "lambda k, y, rng: [float('nan')]"})
     rows = sweep([load_problem(f"{broken}:far")], folder=tmp_path)
-    assert [row.controller for row in rows if row.failure] == ["koopman-lqr", "koopman-mpc"]
+    assert [row.controller for row in rows if row.failure] == ["koopman-lqr", "koopman-mpc", "offset-free"]
 
 
 class Cheat:
@@ -219,7 +219,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(chosen(None)) == FIVE
+    assert list(chosen(None)) == SIX
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
@@ -240,7 +240,7 @@ def faulty(swept, tmp_path_factory):
 def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(faulty):
     rows, folder = faulty
     assert [(r.case, r.fault, r.controller) for r in rows] == [
-        (case, fault, name) for case in ("near", "far") for fault in (None, *FAULTS) for name in FIVE
+        (case, fault, name) for case in ("near", "far") for fault in (None, *FAULTS) for name in SIX
     ]
     assert [row.failure for row in rows] == [None] * len(rows)
     assert len({row.log for row in rows}) == len(rows)

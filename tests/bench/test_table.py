@@ -142,7 +142,7 @@ def test_no_faults_no_table_of_faults():
     assert "faults" not in printed(table(rows()))
 
 
-def test_the_five_controllers_under_every_fault_fit_a_hundred_columns():
+def test_the_six_controllers_under_every_fault_fit_a_hundred_columns():
     worst = replace(GOOD, cost=1e9, fallback={"HOLD": 12345})
     ran = [
         Row("plant", "case", name, metrics, reached=True, fault=fault)
