@@ -105,6 +105,9 @@ class Problem:
         Indices of states whose errors wrap at ±π.
     plant
         The truth, where it differs from `dynamics`: data are collected and runs are made on it.
+    controllers
+        Names of the controllers that the bench compares; all by default. A cost on observables that a linearisation
+        lacks, such as sin θ, leaves linear ones out.
     scene
         scene(x, u) → shapes, always the same names; recordings draw them.
     name, title
@@ -130,6 +133,7 @@ class Problem:
     ridge: float = 0.0
     angles: Sequence[int] = ()
     plant: Dynamics | StepMap | Plant | None = None
+    controllers: Sequence[str] = ()
     scene: Scene | None = None
     name: str = "problem"
     title: str = ""

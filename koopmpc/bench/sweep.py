@@ -71,7 +71,7 @@ def sweep(
     ProblemError
         There is no such controller, or a case comes twice.
     """
-    names, problems, folder = chosen(controllers), list(problems), Path(folder)
+    asked, problems, folder = chosen(controllers), list(problems), Path(folder)
     cases = [f"{problem.name}:{case}" for problem in problems for case in problem.cases]
     twice = next((case for case in cases if cases.count(case) > 1), None)
     if twice is not None:
@@ -91,7 +91,7 @@ def sweep(
         for problem in problems
         for case in problem.cases
         for fault in (None, *(possible(problem.limits_of(case)) if faults else ()))
-        for name in names
+        for name in (asked if controllers else chosen(problem.controllers))
     ]
     rows: list[Row] = []
     parts: Prepared | None = None

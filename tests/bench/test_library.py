@@ -10,8 +10,9 @@ from koopmpc.errors import ProblemError
 from tests.bench.tiny import SOURCE, write
 
 
-def test_the_shipped_problems_are_the_two_plants():
-    assert [path.stem for path in shipped()] == ["cart_pole", "pendulum"]
+def test_the_shipped_problems_are_two_plants_and_their_swing_ups():
+    names = ["cart_pole", "cart_pole_swing", "pendulum", "pendulum_swing"]
+    assert [path.stem for path in shipped()] == names
 
 
 @pytest.mark.parametrize("name", ["pendulum", "cart_pole"])

