@@ -27,6 +27,9 @@ from koopmpc.errors import (
     ProblemError,
     ShapeError,
 )
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.kalman import LiftedKalman
+from koopmpc.estimate.observer import Estimator
 from koopmpc.identify.dmd import dmd, dmdc
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.moments import Moments, moments
@@ -86,6 +89,7 @@ __all__ = [
     "Dynamics",
     "Episode",
     "Episodes",
+    "Estimator",
     "Euler",
     "Expressions",
     "Fallback",
@@ -101,6 +105,8 @@ __all__ = [
     "Injection",
     "KoopmanMPC",
     "KoopmpcError",
+    "LiftedDisturbance",
+    "LiftedKalman",
     "Lifting",
     "Limits",
     "Line",

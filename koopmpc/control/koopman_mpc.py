@@ -224,16 +224,18 @@ class KoopmanMPC:
         Raises
         ------
         DataError
-            The controller was not made with ``disturbed=True``.
+            The controller was not made with ``disturbed=True``, or its estimator finds d.
         ShapeError
             d has another length than z.
         """
+        if self._estimated:
+            raise DataError("the estimator finds the disturbance; make the controller without one to set it")
         if not self._disturbed:
             raise DataError("the controller has no room for a disturbance; make it with disturbed=True")
         values = np.asarray(d, dtype=np.float64)
         if values.shape != self._d.shape:
             raise ShapeError(f"d has shape {values.shape}, expected {self._d.shape}, one value an observable")
-        self._d[:] = values
+        self.observer.d[:] = values
 
     def __call__(
         self,
@@ -295,7 +297,7 @@ class KoopmanMPC:
         origin = self._origin
         origin.take(y, self._memory.last(), applied, self._ahead)
         self._z[:] = origin.z
-        if self._estimated:
+        if self._disturbed:
             self._d[:] = origin.d
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:

@@ -1,4 +1,4 @@
-"""Measured: z = ψ(y), and nothing is estimated."""
+"""Measured: z = ψ(y), and d is what it is set to."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from koopmpc.predict.linear import LinearPredictor
 
 
 class Measured:
-    """The observer of a controller without an estimator: y is the state, d is zero."""
+    """The observer of a controller without an estimator: y is the state, d zero or set by hand."""
 
     def __init__(self, predictor: LinearPredictor) -> None:
         self._lift = buffered(predictor.lifting)
@@ -18,7 +18,8 @@ class Measured:
         self.d: Float[np.ndarray, " nz"] = np.zeros(predictor.nz)
 
     def reset(self, x0: ArrayLike | None = None) -> None:
-        """Nothing is remembered."""
+        """Forget d."""
+        self.d[:] = 0.0
 
     def adopt(self, predictor: LinearPredictor) -> None:
         """The lifting stays."""

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.estimate.disturbance import LiftedDisturbance
 from tests.estimate.plants import linear
 
 NO_W = np.zeros(0)
@@ -25,7 +24,7 @@ def predictor(rng):
 def test_it_is_a_first_order_filter_of_the_misfit(gain, seed):
     rng = np.random.default_rng(seed)
     model = predictor(rng)
-    observer = LiftedDisturbance(gain).start(model)
+    observer = km.LiftedDisturbance(gain).start(model)
     X, U = rng.normal(size=(12, 2)), rng.normal(size=(12, 1))
     d = np.zeros(4)
     for k in range(12):
@@ -42,7 +41,7 @@ def test_it_is_a_first_order_filter_of_the_misfit(gain, seed):
 def test_at_rest_the_plant_is_an_equilibrium_of_the_model(seed):
     rng = np.random.default_rng(seed)
     model = predictor(rng)
-    observer = LiftedDisturbance(0.5).start(model)
+    observer = km.LiftedDisturbance(0.5).start(model)
     x, u = rng.normal(size=2), rng.normal(size=1)
     for _ in range(60):
         observer.update(x, u, NO_W)
@@ -53,7 +52,7 @@ def test_at_rest_the_plant_is_an_equilibrium_of_the_model(seed):
 
 def test_a_true_model_has_no_disturbance_and_a_measured_one_is_no_news():
     A, B, E = np.diag([0.5, 0.9]), np.ones((2, 1)), np.array([[1.0], [2.0]])
-    observer = LiftedDisturbance(1.0).start(linear(A, B, [0.1, 0.2], E))
+    observer = km.LiftedDisturbance(1.0).start(linear(A, B, [0.1, 0.2], E))
     rng = np.random.default_rng(0)
     x, u, w = np.zeros(2), np.zeros(1), np.zeros(1)
     for _ in range(10):
@@ -64,7 +63,7 @@ def test_a_true_model_has_no_disturbance_and_a_measured_one_is_no_news():
 
 
 def test_a_missed_sample_leaves_the_disturbance_as_it_is():
-    observer = LiftedDisturbance(0.5).start(linear(np.diag([0.5, 0.9]), np.ones((2, 1))))
+    observer = km.LiftedDisturbance(0.5).start(linear(np.diag([0.5, 0.9]), np.ones((2, 1))))
     u = np.zeros(1)
     for x in ([1.0, 2.0], [2.0, 1.0]):
         observer.update(np.array(x), u, NO_W)
@@ -83,4 +82,4 @@ def test_a_missed_sample_leaves_the_disturbance_as_it_is():
 @pytest.mark.parametrize("gain", [0.0, -0.1, 1.1, np.nan])
 def test_the_gain_is_checked(gain):
     with pytest.raises(km.DataError, match="gain"):
-        LiftedDisturbance(gain)
+        km.LiftedDisturbance(gain)

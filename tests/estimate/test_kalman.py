@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.estimate.kalman import LiftedKalman
 from tests.estimate.plants import Textbook, linear, stable
 
 NO_W = np.zeros(0)
@@ -43,7 +42,7 @@ def test_it_equals_the_textbook_filter(disturbance, affine, seed):
     rng = np.random.default_rng(seed)
     (A, B), H, c = stable(rng, 3, 1), np.eye(2, 3), rng.normal(size=3)
     model = linear(A, B, c if affine else None)
-    rule = LiftedKalman(("x0", "x1"), disturbance, process=0.1, drift=0.2, noise=0.3)
+    rule = km.LiftedKalman(("x0", "x1"), disturbance, process=0.1, drift=0.2, noise=0.3)
     try:
         mine = rule.start(model)
     except km.DataError:
@@ -89,7 +88,7 @@ def test_the_constant_is_known_whatever_a_fit_has_made_of_its_row():
     for disturbance in ("input", "output"):
         seen = []
         for one in (model, spoiled):
-            observer = LiftedKalman("x0", disturbance).start(one)
+            observer = km.LiftedKalman("x0", disturbance).start(one)
             for k in range(20):
                 observer.update(np.array([np.sin(k)]), np.array([np.cos(k)]), NO_W)
             seen.append(np.r_[observer.z, observer.d])
@@ -102,7 +101,7 @@ def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
     rng = np.random.default_rng(seed)
     A, B = np.diag(rng.uniform(-0.5, 0.7, 3)), rng.uniform(0.5, 1.5, (3, 1))
     model = linear(A, B, rng.normal(size=3))
-    observer = LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model)
+    observer = km.LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model)
     y, u = rng.normal(size=2), rng.normal(size=1)
     for _ in range(400):
         observer.update(y, u, NO_W)
@@ -114,7 +113,7 @@ def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
 def test_it_finds_a_load_on_the_input():
     A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
     model = linear(A, B)
-    observer = LiftedKalman("x0").start(model)
+    observer = km.LiftedKalman("x0").start(model)
     rng = np.random.default_rng(0)
     x, u = np.array([0.3, 0.0]), np.zeros(1)
     observer.reset(np.zeros(2))
@@ -133,7 +132,7 @@ def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inp
     A, B = np.diag([0.5, 0.9, 1.02]), rng.uniform(0.5, 1.5, (3, 1))
     model = linear(A, B, [0.1, 0.2, 0.3])
     H = np.array([[1.0, 1.0, 1.0, 0.0]])
-    rule, late_rule = LiftedKalman(H), LiftedKalman(H, delay=delay)
+    rule, late_rule = km.LiftedKalman(H), km.LiftedKalman(H, delay=delay)
     prompt, late = rule.start(model), late_rule.start(model)
     x0 = rng.normal(size=3)
     prompt.reset(x0)
@@ -154,7 +153,7 @@ def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inp
 
 def test_a_measured_disturbance_is_no_news():
     A, B, E = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [1.0]]), np.array([[1.0], [0.5]])
-    observer = LiftedKalman("x0").start(linear(A, B, [0.1, 0.0], E))
+    observer = km.LiftedKalman("x0").start(linear(A, B, [0.1, 0.0], E))
     x, u, w = np.zeros(2), np.zeros(1), np.zeros(1)
     rng = np.random.default_rng(1)
     observer.reset(x)
@@ -167,7 +166,7 @@ def test_a_measured_disturbance_is_no_news():
 
 def test_samples_are_bridged_for_a_while_and_reset_repeats_to_the_bit():
     model = linear(np.diag([0.5, 0.9]), np.ones((2, 1)))
-    observer = LiftedKalman(("x0", "x1"), patience=3).start(model)
+    observer = km.LiftedKalman(("x0", "x1"), patience=3).start(model)
     rng = np.random.default_rng(0)
     Y = rng.normal(size=(12, 2))
     Y[4:9] = np.nan
@@ -187,7 +186,7 @@ def test_infinities_are_missed_samples():
     model = linear(np.diag([0.5, 0.9]), np.ones((2, 1)))
     seen = []
     for bad in (np.nan, np.inf, -1e200):
-        observer = LiftedKalman(("x0", "x1")).start(model)
+        observer = km.LiftedKalman(("x0", "x1")).start(model)
         observer.update(np.array([1.0, bad]), np.zeros(1), NO_W)
         seen.append(observer.z.copy())
     np.testing.assert_array_equal(seen[0], seen[1])
@@ -201,34 +200,34 @@ INTEGRATOR = linear(np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
     ("rule", "model", "error", "words"),
     [
         (
-            LiftedKalman("x0", "output"),
+            km.LiftedKalman("x0", "output"),
             INTEGRATOR,
             km.DataError,
             "with λ = 1, 'x0 \\[m\\]', an offset of output 'x0'",
         ),
         (
-            LiftedKalman("x1"),
+            km.LiftedKalman("x1"),
             INTEGRATOR,
             km.DataError,
             "'x0 \\[m\\]' can move without a trace in y; measure one",
         ),
-        (LiftedKalman(("x0", "x0")), INTEGRATOR, km.DataError, "depend on each other"),
-        (LiftedKalman("1"), INTEGRATOR, km.DataError, "or on the Constant"),
-        (LiftedKalman("theta"), INTEGRATOR, km.ObservableError, "lacks 'theta'; add it"),
+        (km.LiftedKalman(("x0", "x0")), INTEGRATOR, km.DataError, "depend on each other"),
+        (km.LiftedKalman("1"), INTEGRATOR, km.DataError, "or on the Constant"),
+        (km.LiftedKalman("theta"), INTEGRATOR, km.ObservableError, "lacks 'theta'; add it"),
         (
-            LiftedKalman(np.eye(2)),
+            km.LiftedKalman(np.eye(2)),
             INTEGRATOR,
             km.ShapeError,
             r"outputs has shape \(2, 2\), expected \(ny, 3\)",
         ),
         (
-            LiftedKalman("x0"),
+            km.LiftedKalman("x0"),
             linear(np.diag([0.5, 0.6]), np.eye(2)),
             km.DataError,
             "1 outputs cannot tell the disturbances of 2 inputs apart; measure at least 2",
         ),
         (
-            LiftedKalman("x0", "output"),
+            km.LiftedKalman("x0", "output"),
             linear(np.diag([0.5, 1.2]), np.ones((2, 1))),
             km.DataError,
             "λ = 1.2, 'x1 \\[m\\]' can move",
@@ -254,17 +253,17 @@ def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words)
 )
 def test_settings_are_refused_in_words(settings, error, words):
     with pytest.raises(error, match=words):
-        LiftedKalman(**{"outputs": "x0", "disturbance": "input"} | settings)
+        km.LiftedKalman(**{"outputs": "x0", "disturbance": "input"} | settings)
 
 
 def test_names_with_and_without_units_and_a_matrix_are_the_same():
     model = linear(np.array([[0.9, 0.1], [0.0, 0.8]]), np.ones((2, 1)), [0.1, 0.2])
     seen = []
     for outputs in ("x1", "x1 [m]", ("x1",), ["x1 [m]"], [[0.0, 1.0, 0.0]]):
-        observer = LiftedKalman(outputs).start(model)
+        observer = km.LiftedKalman(outputs).start(model)
         for k in range(5):
             observer.update(np.array([float(k)]), np.ones(1), NO_W)
         seen.append(observer.z.copy())
     for other in seen[1:]:
         np.testing.assert_array_equal(seen[0], other)
-    assert LiftedKalman("x1") == LiftedKalman(["x1"])
+    assert km.LiftedKalman("x1") == km.LiftedKalman(["x1"])

@@ -6,13 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.estimate.kalman import LiftedKalman
-from koopmpc.loop.faults import ActuatorDelay
 from tests.control.models import PRECISE, random_pair
 from tests.estimate.plants import linear
 
-LATE = [ActuatorDelay(1)]
+LATE = [km.ActuatorDelay(1)]
 
 
 def pair(rng, nx, nu, limits):
@@ -48,7 +45,7 @@ def test_it_is_the_optimum_of_the_delayed_plant(bound, nx, nu, seed):
         x, acting = A @ x + B @ acting, u
 
 
-@pytest.mark.parametrize("estimator", [None, LiftedDisturbance(), LiftedKalman(("x0", "x1"))])
+@pytest.mark.parametrize("estimator", [None, km.LiftedDisturbance(), km.LiftedKalman(("x0", "x1"))])
 def test_on_a_true_model_the_plan_is_what_happens(estimator):
     """The loop that applies u a step late meets the plan of the second step to the end."""
     model = linear(np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]]), [0.0, 0.0])
@@ -71,11 +68,22 @@ def _cost(run):
     return (run.X**2 * [1.0, 0.1]).sum() + 0.1 * (run.U**2).sum()
 
 
+def test_a_disturbance_that_is_set_by_hand_is_predicted_through_too():
+    A, B, d = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]]), np.array([0.05, 0.1])
+    settings = {"latency": 1, "settings": PRECISE}
+    cost = km.Cost([1, 0], 0.1)
+    told = km.KoopmanMPC(linear(A, B, [0.0, 0.0]), cost, horizon=15, disturbed=True, **settings)
+    told.disturb(np.append(d, 0.0))
+    knowing = km.KoopmanMPC(linear(A, B, d), cost, horizon=15, **settings)
+    for x in ([0.0, 0.0], [1.0, -1.0]):
+        np.testing.assert_allclose(told(x, [0.7, 0]).u, knowing(x, [0.7, 0]).u, atol=1e-9)
+
+
 def test_offset_free_with_latency():
     A, B = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]])
     true = linear(A, 0.8 * B, [0.05, 0.1]).step_map()
     model = linear(A, B, [0.0, 0.0])
-    for estimator in (LiftedDisturbance(), LiftedKalman(("x0", "x1"))):
+    for estimator in (km.LiftedDisturbance(), km.LiftedKalman(("x0", "x1"))):
         mpc = km.KoopmanMPC(model, km.Cost([1, 0], 0.1), km.Limits(-5, 5), 15, latency=1, estimator=estimator)
         run = km.simulate(
             true, mpc, x0=[0, 0], reference=[0.7, 0], steps=150, limits=km.Limits(-5, 5), faults=LATE

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.estimate.kalman import LiftedKalman
-from koopmpc.loop.faults import ActuatorLoss, SensorDelay
 from tests.control.models import PRECISE
 from tests.estimate.pendulums import PROBLEM, SETPOINT, angle, learned, truth
 from tests.estimate.plants import linear
@@ -18,12 +15,12 @@ from tests.estimate.plants import linear
 WHOLE = km.Cost(Q=[10.0, 1.0], R=0.1)
 ANGLE = km.Cost(Q=10.0, R=0.1, of=angle())
 DESIGNS = {
-    "relifted": (LiftedDisturbance(), 2, WHOLE),
-    "deadbeat": (LiftedDisturbance(gain=1.0), 2, WHOLE),
-    "angle, load": (LiftedKalman("theta"), 1, ANGLE),
-    "angle, offset": (LiftedKalman("theta", "output"), 1, ANGLE),
-    "both, load": (LiftedKalman(("theta", "omega")), 2, WHOLE),
-    "both, offset": (LiftedKalman(("theta", "omega"), "output"), 2, WHOLE),
+    "relifted": (km.LiftedDisturbance(), 2, WHOLE),
+    "deadbeat": (km.LiftedDisturbance(gain=1.0), 2, WHOLE),
+    "angle, load": (km.LiftedKalman("theta"), 1, ANGLE),
+    "angle, offset": (km.LiftedKalman("theta", "output"), 1, ANGLE),
+    "both, load": (km.LiftedKalman(("theta", "omega")), 2, WHOLE),
+    "both, offset": (km.LiftedKalman(("theta", "omega"), "output"), 2, WHOLE),
 }
 PLANTS = {"nominal": {}, "load": {"load": 2.0}, "heavy": {"m": 1.2}, "light": {"m": 0.8}}
 
@@ -57,7 +54,7 @@ class InputAlone:
 
 class Bad:
     def __init__(self, predictor):
-        self.whole = LiftedDisturbance().start(predictor)
+        self.whole = km.LiftedDisturbance().start(predictor)
         self.B = predictor.B[:, 0]
 
     ny = property(lambda self: 2)
@@ -93,12 +90,12 @@ def first(x):
 
 POSITION = km.Cost(Q=1.0, R=0.1, of=km.Expressions(first, ["x0 [m]"]))
 KNOWN = linear(A, B, [0.0, 0.0])
-BOTH = pytest.mark.parametrize("estimator", [LiftedDisturbance(), LiftedKalman("x0")])
+BOTH = pytest.mark.parametrize("estimator", [km.LiftedDisturbance(), km.LiftedKalman("x0")])
 
 
 def loop(estimator, limits, reference, steps=200, faults=(), **settings):
     mpc = km.KoopmanMPC(KNOWN, POSITION, limits, 15, estimator=estimator, **settings)
-    seen = 2 if isinstance(estimator, LiftedDisturbance) else 1
+    seen = 2 if isinstance(estimator, km.LiftedDisturbance) else 1
     return km.simulate(
         plant(seen=seen), mpc, x0=[0, 0], reference=reference, steps=steps, limits=limits, faults=faults
     )
@@ -115,7 +112,7 @@ def test_a_setpoint_beyond_the_input_limit_is_held_as_nearly_as_the_plant_can(es
     assert abs(within.X[-1, 0] - (nearest[0] - 0.1)) < 1e-6
 
 
-@pytest.mark.parametrize("estimator", [LiftedDisturbance(), LiftedKalman("x0", process=0.01)])
+@pytest.mark.parametrize("estimator", [km.LiftedDisturbance(), km.LiftedKalman("x0", process=0.01)])
 def test_a_setpoint_beyond_a_state_limit_is_held_at_the_limit(estimator):
     run = loop(estimator, km.Limits(-5, 5, x_max=[1.0, np.inf]), [1.5])
     assert abs(run.X[-1, 0] - 1.0) < 1e-4
@@ -126,7 +123,7 @@ def test_a_setpoint_beyond_a_state_limit_is_held_at_the_limit(estimator):
 def test_what_the_plant_really_got_is_what_the_estimator_uses(estimator):
     """An actuator that lost half its range is no disturbance of a true model."""
     mpc = km.KoopmanMPC(KNOWN, POSITION, km.Limits(-1, 1), 15, estimator=estimator)
-    seen = 2 if isinstance(estimator, LiftedDisturbance) else 1
+    seen = 2 if isinstance(estimator, km.LiftedDisturbance) else 1
     true = plant(1.0, 0.0, seen)
     largest = []
 
@@ -140,7 +137,7 @@ def test_what_the_plant_really_got_is_what_the_estimator_uses(estimator):
         reference=[1.0],
         steps=40,
         limits=km.Limits(-1, 1),
-        faults=[ActuatorLoss(0.5)],
+        faults=[km.ActuatorLoss(0.5)],
         observers=[look],
     )
     assert max(largest) < 1e-12
@@ -148,7 +145,7 @@ def test_what_the_plant_really_got_is_what_the_estimator_uses(estimator):
 
 @BOTH
 def test_copies_and_pickles_go_on_as_the_original_and_reset_repeats_to_the_bit(estimator):
-    seen = 2 if isinstance(estimator, LiftedDisturbance) else 1
+    seen = 2 if isinstance(estimator, km.LiftedDisturbance) else 1
     mpc = km.KoopmanMPC(KNOWN, POSITION, km.Limits(-0.5, 0.5), 15, estimator=estimator, settings=PRECISE)
     rng = np.random.default_rng(0)
     Y = rng.normal(size=(20, seen))
@@ -167,7 +164,7 @@ def test_copies_and_pickles_go_on_as_the_original_and_reset_repeats_to_the_bit(e
 
 
 def test_a_missing_state_is_a_bad_measurement_and_leaves_the_disturbance():
-    mpc = km.KoopmanMPC(KNOWN, POSITION, km.Limits(-1, 1), 15, estimator=LiftedDisturbance())
+    mpc = km.KoopmanMPC(KNOWN, POSITION, km.Limits(-1, 1), 15, estimator=km.LiftedDisturbance())
     for y in ([0.0, 0.0], [0.3, 0.1]):
         mpc(y, [1.0])
     before = mpc.observer.d.copy()
@@ -178,7 +175,7 @@ def test_a_missing_state_is_a_bad_measurement_and_leaves_the_disturbance():
 
 
 def test_a_filter_bridges_missed_samples_for_a_while_then_says_so():
-    rule = LiftedKalman("x0", patience=3)
+    rule = km.LiftedKalman("x0", patience=3)
     mpc = km.KoopmanMPC(KNOWN, POSITION, km.Limits(-1, 1), 15, estimator=rule)
     statuses = [mpc([y], [1.0]).status for y in [0.0, 0.1] + [np.nan] * 6 + [0.5]]
     good = {km.Status.UNCONSTRAINED, km.Status.OPTIMAL}
@@ -188,12 +185,37 @@ def test_a_filter_bridges_missed_samples_for_a_while_then_says_so():
 
 
 def test_late_measurements_leave_no_offset():
-    late = LiftedKalman("x0", delay=3)
-    run = loop(late, km.Limits(-5, 5), [0.7], steps=400, faults=[SensorDelay(3)])
+    late = km.LiftedKalman("x0", delay=3)
+    run = loop(late, km.Limits(-5, 5), [0.7], steps=400, faults=[km.SensorDelay(3)])
     assert abs(run.X[-1, 0] - 0.7) < 1e-6
 
 
+def test_a_disturbance_is_estimated_or_set_by_hand():
+    mpc = km.KoopmanMPC(KNOWN, POSITION, horizon=15, estimator=km.LiftedDisturbance())
+    with pytest.raises(km.DataError, match="the estimator finds the disturbance"):
+        mpc.disturb(np.zeros(3))
+
+
+def test_a_new_model_between_two_steps_keeps_the_state_of_a_filter():
+    """A model that becomes true: what was a disturbance is forgotten at the filter's own pace, without a jump."""
+    true = linear(A, 0.7 * B, [0.1, 0.1])
+    for rule in (km.LiftedDisturbance(gain=0.5), km.LiftedKalman("x0")):
+        mpc = km.KoopmanMPC(KNOWN, POSITION, horizon=15, estimator=rule)
+        mpc.reset([0.0, 0.0])
+        x, seen = np.zeros(2), mpc.observer.ny
+        for k in range(160):
+            if k == 80:
+                assert np.abs(mpc.observer.d).max() > 0.01
+                mpc.update(true)
+            u = mpc(x[:seen], [0.7]).u
+            if k >= 80:
+                assert abs(x[0] - 0.7) < 0.3
+            x = A @ x + 0.7 * B @ u + 0.1
+        assert abs(x[0] - 0.7) < 1e-6
+        assert np.abs(mpc.observer.d).max() < 1e-6
+
+
 def test_y_has_one_value_an_output():
-    mpc = km.KoopmanMPC(KNOWN, POSITION, horizon=15, estimator=LiftedKalman("x0"))
+    mpc = km.KoopmanMPC(KNOWN, POSITION, horizon=15, estimator=km.LiftedKalman("x0"))
     with pytest.raises(km.ShapeError, match=r"y has shape \(2,\), expected \(1,\)"):
         mpc([0.0, 0.0], [1.0])
