@@ -71,9 +71,14 @@ def test_the_forces_work_is_the_cart_poles_energy(theta, omega, velocity, u):
 def test_references_are_equilibria_and_cases_fit(problem):
     x, u = problem.equilibrium
     np.testing.assert_allclose(np.array(right_side(problem.dynamics)(x, u)).ravel(), 0.0, atol=1e-12)
-    for case in problem.cases.values():
-        held = np.array(right_side(problem.dynamics)(case.reference, u)).ravel()
-        np.testing.assert_allclose(held, 0.0, atol=1e-12)
+    f = right_side(problem.dynamics)
+    for name, case in problem.cases.items():  # both are affine in u: one input holds the reference, inside the limits
+        free = np.array(f(case.reference, [0.0])).ravel()
+        gain = np.array(f(case.reference, [1.0])).ravel() - free
+        held = -float(gain @ free) / float(gain @ gain)
+        np.testing.assert_allclose(free + gain * held, 0.0, atol=1e-12)
+        low, high = problem.limits_of(name).inputs(1)
+        assert low[0] < held < high[0]
 
 
 @pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
