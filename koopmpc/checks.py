@@ -128,6 +128,13 @@ def count(value: int, name: str, least: int = 1) -> int:
     return int(value)
 
 
+def members(value: object, name: str, needed: Sequence[str], advice: str) -> None:
+    """Raise where `value` lacks an attribute or a method that it needs."""
+    missing = [member for member in needed if not hasattr(value, member)]
+    if missing:
+        raise DataError(f"{name} is a {type(value).__name__} and has no {', '.join(missing)}; {advice}")
+
+
 def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:
     """Raise where a lower limit stands above its upper one."""
     bad = np.flatnonzero(low > high)

@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.policy import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plant.simulated import Plant
+from koopmpc.plant.simulated import Plant, require_plant
 from koopmpc.plant.step_map import StepMap
 from koopmpc.values import Value
 
@@ -67,8 +67,10 @@ def collect(
     ShapeError
         x0 or the excitation does not fit the plant.
     DataError
-        An episode left the finite numbers.
+        An episode left the finite numbers; the plant cannot be driven.
     """
+    if not isinstance(plant, StepMap):
+        require_plant(plant)
     count, length = checks.count(episodes, "episodes"), checks.count(steps, "steps")
     source = checks.generator(rng)
     nu = len(plant.inputs)

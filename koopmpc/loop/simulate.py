@@ -16,8 +16,14 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.injection import Fault, Injections, Wiring, call, named
 from koopmpc.loop.run import Plans, Run
 from koopmpc.loop.signals import Signal, held_inputs, noise_of, reference_rows, signal_of
-from koopmpc.plant.simulated import Plant, SimulatedPlant
+from koopmpc.plant.simulated import Plant, SimulatedPlant, require_plant
 from koopmpc.plant.step_map import StepMap
+
+_CONTROLLER = (
+    "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
+    "controller(y, reference, applied) -> Move; make it a class, see km.Controller"
+)
+_MOVE = ("status", "fallback", "solve_time", "iterations")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +103,14 @@ def simulate(
     Raises
     ------
     ShapeError, DataError
-        Sizes do not fit, or a controller returned a u that is not finite, or a fault does not fit.
+        Sizes do not fit; plant or controller lack a member; a controller returned a u that is not finite.
     """
     steps = checks.count(steps, "steps")
     rng = checks.generator(rng)
     if isinstance(plant, StepMap):
         plant = SimulatedPlant(plant)
+    require_plant(plant)
+    checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
         raise DataError(
             f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both"
@@ -151,6 +159,8 @@ def simulate(
             move = controller(Y[k].copy(), ahead, applied)
         else:
             move = call(controller, Y[k].copy(), ahead, applied, solver_fails=injected.solver_fails(k))
+        if k == 0:
+            checks.members(move, "what the controller returned", ("u", *_MOVE), "return a km.Move")
         if np.shape(move.u) != (nu,):
             raise ShapeError(
                 f"the controller returned u of shape {np.shape(move.u)} at step {k}, expected ({nu},)"

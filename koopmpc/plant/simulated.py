@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.plant.dynamics import Dynamics
 from koopmpc.plant.step_map import StepMap
 
 
@@ -47,6 +48,21 @@ class Plant(Protocol):
     def step(self, u: ArrayLike) -> np.ndarray:
         """Hold u (nu,) for dt and return the new y (ny,)."""
         ...
+
+
+def require_plant(plant: object) -> None:
+    """Raise where `plant` cannot be driven, naming what it lacks."""
+    if isinstance(plant, Dynamics):
+        raise DataError(
+            f"the plant is {type(plant).__name__}, ẋ = f(x, u) without a sample time; discretize it first: "
+            "km.discretize(dynamics, dt)"
+        )
+    advice = (
+        "a Plant has dt [s], states, inputs and outputs (names), state (x, or None where it is hidden), "
+        "reset(x0, rng) -> y and step(u) -> y; or pass a StepMap"
+    )
+    needed = ("dt", "states", "inputs", "outputs", "state", "reset", "step")
+    checks.members(plant, "the plant", needed, advice)
 
 
 class SimulatedPlant:
