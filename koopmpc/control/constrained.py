@@ -105,14 +105,14 @@ class Solve:
 
     def __init__(self, program: Program, solver: str, settings: Mapping[str, Any]) -> None:
         self.program, self.warm = program, False
-        self._name, self._settings = solver, settings
         self._solver = named(solver)(program.qp, settings)
         self._primal = np.zeros(len(program.qp.q) + 1)  # one more, always zero, for the shift
         self._dual = np.zeros(len(program.low) + 1)
 
     def adopt(self, program: Program) -> None:
         """Go on with new matrices of the same size."""
-        self.program, self._solver = program, named(self._name)(program.qp, self._settings)
+        self.program = program
+        self._solver.adopt(program.qp)
 
     def reset(self) -> None:
         """Forget what earlier solves left behind in the solver."""

@@ -24,6 +24,10 @@ class CheckedOSQP(OSQP):
         super().update(low, high)
         self.qp = QP(self.qp.P, self.qp.q, self.qp.A, low.copy(), high.copy())
 
+    def adopt(self, qp):
+        super().adopt(qp)
+        self.qp = qp
+
     def solve(self, v, y, time_limit=None):
         solution = super().solve(v, y, time_limit)
         if solution.status is Status.OPTIMAL:

@@ -55,10 +55,14 @@ class QPSolution:
 
 @runtime_checkable
 class QPSolver(Protocol):
-    """A QP whose P, q and A stay and whose limits move. Copies and pickles start afresh on the last limits."""
+    """A QP whose limits move from solve to solve, and P, q and A now and then. Copies go on from the last limits."""
 
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits."""
+        ...
+
+    def adopt(self, qp: QP) -> None:
+        """Go on with another QP of the same size."""
         ...
 
     def reset(self) -> None:

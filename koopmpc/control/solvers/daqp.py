@@ -72,6 +72,10 @@ class DAQP:
     def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]]]:
         return type(self), (replace(self._qp, low=self._bounds.low, high=self._bounds.high), self._settings)
 
+    def adopt(self, qp: QP) -> None:
+        """Go on with another QP of the same size: DAQP's setup is one factorisation."""
+        self.__init__(qp, self._settings)
+
     def reset(self) -> None:
         """Forget the active rows of the last solve."""
         self._cold = True

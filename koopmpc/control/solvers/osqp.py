@@ -64,7 +64,7 @@ class OSQP:
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._qp, self._settings = qp, dict(settings or {})
         self._bounds = Bounds(qp)
-        P, A = qp.sparse()
+        P, A = self._matrices = qp.sparse()
         self._problem = osqp.OSQP()
         options = {"verbose": False, **DEFAULTS, **self._settings}
         try:
@@ -77,8 +77,37 @@ class OSQP:
         self._first = True
         self._moved = True
 
-    def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]]]:
-        return type(self), (replace(self._qp, low=self._bounds.low, high=self._bounds.high), self._settings)
+    def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], float]:
+        now = replace(self._qp, low=self._bounds.low, high=self._bounds.high)
+        return type(self), (now, self._settings), self._solver.get_settings().rho
+
+    def __setstate__(self, rho: float) -> None:
+        """Take over the step size ρ that the original had adapted: a copy then has the same iterates."""
+        self._solver.update_rho(rho)
+
+    def adopt(self, qp: QP) -> None:
+        """Go on with another QP of the same size; where its zeros stand elsewhere it is set up anew.
+
+        Raises
+        ------
+        DataError
+            OSQP refuses the problem.
+        """
+        matrices = qp.sparse()
+        same = all(
+            np.array_equal(new.indptr, old.indptr) and np.array_equal(new.indices, old.indices)
+            for new, old in zip(matrices, self._matrices, strict=True)
+        )
+        if not same or qp.A.shape != self._qp.A.shape:
+            self.__init__(qp, self._settings)
+            return
+        self._qp, self._matrices = qp, matrices
+        self._bounds.set(qp.low, qp.high)
+        P, A = (np.ascontiguousarray(matrix.data) for matrix in matrices)
+        self._solver.update_data_vec(q=qp.q, l=self._bounds.low, u=self._bounds.high)
+        if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
+            raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
+        self._moved = True
 
     def reset(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""
