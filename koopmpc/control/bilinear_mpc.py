@@ -34,9 +34,10 @@ class BilinearMPC:
     F is the predictor's re-lifted map x⁺ = C(A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), so whatever the dictionary the problem
     has the dimension of x. The controller keeps the planned states X_k as well as the inputs u_k and moves both on by
     one step. Each pass linearises at (X_k, u_k), with defects c_k = F(X_k, u_k) − X_{k+1} and δx_0 = x − X_0, and
-    adds the solution of that quadratic program (Gauss–Newton in the tracked outputs). It never simulates the inputs
-    over the horizon: on an unstable plant that multiplies the model's error a thousandfold. A Riccati recursion solves
-    the program; where its plan breaks a limit, an interior-point method whose steps are Riccati recursions.
+    adds the solution of that quadratic program (Gauss–Newton in the tracked outputs), halved until F is
+    near its linearisation along it. The inputs are never simulated over the horizon, save for a first plan, the free
+    motion: on an unstable plant that multiplies the model's error a thousandfold. A Riccati recursion solves the
+    program; where its plan breaks a limit, an interior-point method whose steps are Riccati recursions.
 
     Parameters
     ----------

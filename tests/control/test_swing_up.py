@@ -77,6 +77,6 @@ def test_a_linear_model_of_the_same_data_does_not() -> None:
 
 
 @pytest.mark.slow
-def test_at_least_95_of_100_starts_swing_up_within_a_millisecond_a_step(learned: Learned) -> None:
+def test_at_least_95_of_100_starts_swing_up(learned: Learned) -> None:
     runs = learned.runs(learned.bilinear(), 100)
     assert sum(upright(run) for run in runs) >= 95
