@@ -84,23 +84,18 @@ def bench(
 
 
 @app.command()
-def inspect(log: Annotated[Path, typer.Argument(help="A .rrd that koopmpc wrote.")]) -> None:
-    """Recompute the metrics of a run from its log alone."""
-    from koopmpc.bench.table import figures
+def inspect(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
+    """Recompute the metrics of runs from their logs alone."""
     from koopmpc.loop.metrics import metrics
     from koopmpc.recording.reader import load_run
 
+    out = _console()
     with _friendly():
-        loaded = load_run(log)
-        out = _console()
-        out.print(
-            " ".join(
-                str(loaded.metadata[key])
-                for key in ("problem", "case", "controller", "fault")
-                if key in loaded.metadata
-            )
-        )
-        out.print(figures(metrics(loaded)))
+        for log in logs:
+            loaded = load_run(log)
+            keys = ("problem", "case", "controller", "fault")
+            title = " ".join(str(loaded.metadata[key]) for key in keys if key in loaded.metadata)
+            out.print(Text.assemble((title or str(log), "bold"), f"\n{metrics(loaded)}"), soft_wrap=True)
 
 
 @app.command()

@@ -131,6 +131,9 @@ def test_inspect_recomputes_the_metrics_from_the_log_alone(call, tmp_path):
     assert "tiny near lqr" in result.stdout
     assert f"{expected.cost:.6g}" in result.stdout
     assert f"{expected.settling_time:.3g} s" in result.stdout
+    both = call("inspect", log, log)
+    assert both.exit_code == 0
+    assert both.stdout == 2 * result.stdout
 
 
 def test_inspect_refuses_what_is_no_log(call, tmp_path):

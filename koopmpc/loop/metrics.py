@@ -57,7 +57,37 @@ class Metrics(Value):
     status: Mapping[str, int]
     fallback: Mapping[str, int]
 
+    def __str__(self) -> str:
+        """Return a line a figure."""
+        settles = f"{self.settling_time:.3g} s" if np.isfinite(self.settling_time) else "does not settle"
+        times = (self.solve_time_p50, self.solve_time_p99, self.solve_time_max)
+        lines = {
+            "cost": f"{self.cost:.6g}",
+            "tracking rmse": _vector(self.tracking_rmse),
+            "final error": _vector(self.final_error),
+            "violation": f"{self.violation:.3g}",
+            "input violation": f"{self.input_violation:.3g}",
+            "effort": f"{self.effort:.6g}",
+            "settling time": settles,
+            "solve time p50, p99, max": ", ".join(duration(t) for t in times),
+            "steps later than dt": str(self.late),
+            "status": _counts(self.status),
+            "fallback": _counts(self.fallback),
+        }
+        return "\n".join(f"{name:<25} {value}" for name, value in lines.items())
 
+
+def duration(seconds: float) -> str:
+    """Return a time in µs, ms or s with three digits: ``"13.0 µs"``."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-6:.3g} µs"
+
+
+@np.errstate(
+    invalid="ignore", over="ignore"
+)  # a state that diverged, a sensor that showed inf: the cost says so
 def metrics(run: Run) -> Metrics:
     """Return the closed-loop figures of `run`: cost, tracking, violation, effort, settling and solve times."""
     error = tracking_error(run)
@@ -125,7 +155,17 @@ def _violation(run: Run) -> float:
 def _excess(
     values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
 ) -> float:
-    return float(np.maximum(np.maximum(low - values, values - high), 0.0).max(initial=0.0))
+    under, over = np.isfinite(low), np.isfinite(high)  # where there is no limit, not even inf is beyond it
+    beyond = np.hstack([low[under] - values[:, under], values[:, over] - high[over]])
+    return float(np.maximum(beyond, 0.0).max(initial=0.0))
+
+
+def _vector(values: Float[np.ndarray, " n"]) -> str:
+    return "[" + ", ".join(f"{v:.4g}" for v in values) + "]"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
 def _settling_time(stage: Float[np.ndarray, " T1"], dt: float) -> float:

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.loop.metrics import duration
 
 STATES = ("theta [rad]", "omega [rad/s]")
 
@@ -150,3 +151,36 @@ def test_rest_where_the_reference_is_held_costs_nothing():
     free = replace(rest, u_reference=np.zeros_like(run.U))
     assert km.metrics(free).cost == pytest.approx(2.0 * 0.25 * run.steps)
     assert km.metrics(free).effort == km.metrics(rest).effort
+
+
+def test_they_print_as_lines_to_read():
+    """A line a figure: every number that the fields hold can be found in it."""
+    run = random_run(np.random.default_rng(6), cost=km.Cost(1, 1))
+    found = replace(km.metrics(run), settling_time=2.35, solve_time_p50=13e-6, solve_time_p99=4.2e-3)
+    lines = dict(line.split("  ", 1) for line in str(found).splitlines() if "  " in line)
+    lines = {name: value.strip() for name, value in lines.items()}
+    assert f"{found.cost:.6g}" == lines["cost"]
+    assert lines["settling time"] == "2.35 s"
+    assert "13 µs, 4.2 ms, " in str(found)
+    for name, counts in (("status", found.status), ("fallback", found.fallback)):
+        assert lines[name] == ", ".join(f"{n} {kind}" for kind, n in counts.items())
+    assert len(str(found).splitlines()) == 11
+    assert "does not settle" in str(replace(found, settling_time=np.inf))
+
+
+@given(st.floats(1e-8, 1e4))
+def test_a_duration_is_right_to_its_digits(seconds):
+    number, unit = duration(seconds).split()
+    size = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}[unit]
+    assert float(number) * size == pytest.approx(seconds, rel=6e-3)
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e200])
+def test_a_measurement_that_is_no_number_beside_a_hidden_state(value):
+    """Warnings are errors here. What is beyond no limit is not beyond: only the upper one stands."""
+    run = random_run(np.random.default_rng(7), cost=km.Cost(1, 1), limits=km.Limits(x_max=[np.inf, 100.0]))
+    Y = run.Y.copy()
+    Y[3], Y[5, 0] = [0.0, value], -np.inf
+    found = km.metrics(replace(run, X=np.full_like(run.X, np.nan), Y=Y))
+    assert found.violation == max(value - 100.0, 0.0)
+    assert not np.isfinite(found.cost)
