@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
@@ -37,6 +37,7 @@ def textbook(model, H, disturbance, rule):
 
 @pytest.mark.parametrize("disturbance", ["input", "output"])
 @pytest.mark.parametrize("affine", [False, True])
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6))
 def test_it_equals_the_textbook_filter(disturbance, affine, seed):
     rng = np.random.default_rng(seed)
@@ -95,6 +96,7 @@ def test_the_constant_is_known_whatever_a_fit_has_made_of_its_row():
         np.testing.assert_array_equal(*seen)
 
 
+@settings(max_examples=15)
 @given(st.integers(0, 10**6), st.sampled_from(["input", "output"]))
 def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
     """Whatever the plant: with constant u and y, H z = y and z = A z + B u + d."""
@@ -103,7 +105,7 @@ def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
     model = linear(A, B, rng.normal(size=3))
     observer = km.LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model)
     y, u = rng.normal(size=2), rng.normal(size=1)
-    for _ in range(400):
+    for _ in range(150):
         observer.update(y, u, NO_W)
     z, d = observer.z, observer.d
     np.testing.assert_allclose(model.A @ z + model.B @ u + d, z, atol=1e-8)
@@ -240,7 +242,7 @@ def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words)
 
 
 @pytest.mark.parametrize(
-    ("settings", "error", "words"),
+    ("options", "error", "words"),
     [
         ({"process": 0.0}, km.DefinitenessError, "process is not positive definite"),
         ({"noise": -1.0}, km.DefinitenessError, "noise is indefinite"),
@@ -251,9 +253,9 @@ def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words)
         ({"outputs": ()}, km.ShapeError, "outputs has shape"),
     ],
 )
-def test_settings_are_refused_in_words(settings, error, words):
+def test_settings_are_refused_in_words(options, error, words):
     with pytest.raises(error, match=words):
-        km.LiftedKalman(**{"outputs": "x0", "disturbance": "input"} | settings)
+        km.LiftedKalman(**{"outputs": "x0", "disturbance": "input"} | options)
 
 
 def test_names_with_and_without_units_and_a_matrix_are_the_same():

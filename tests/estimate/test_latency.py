@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
@@ -29,6 +29,7 @@ def pair(rng, nx, nu, limits):
 
 
 @pytest.mark.parametrize("bound", [np.inf, 0.4])
+@settings(max_examples=15)
 @given(nx=st.integers(1, 3), nu=st.integers(1, 2), seed=st.integers(0, 10**6))
 def test_it_is_the_optimum_of_the_delayed_plant(bound, nx, nu, seed):
     rng = np.random.default_rng(seed)
@@ -70,11 +71,11 @@ def _cost(run):
 
 def test_a_disturbance_that_is_set_by_hand_is_predicted_through_too():
     A, B, d = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]]), np.array([0.05, 0.1])
-    settings = {"latency": 1, "settings": PRECISE}
+    exact = {"latency": 1, "settings": PRECISE}
     cost = km.Cost([1, 0], 0.1)
-    told = km.KoopmanMPC(linear(A, B, [0.0, 0.0]), cost, horizon=15, disturbed=True, **settings)
+    told = km.KoopmanMPC(linear(A, B, [0.0, 0.0]), cost, horizon=15, disturbed=True, **exact)
     told.disturb(np.append(d, 0.0))
-    knowing = km.KoopmanMPC(linear(A, B, d), cost, horizon=15, **settings)
+    knowing = km.KoopmanMPC(linear(A, B, d), cost, horizon=15, **exact)
     for x in ([0.0, 0.0], [1.0, -1.0]):
         np.testing.assert_allclose(told(x, [0.7, 0]).u, knowing(x, [0.7, 0]).u, atol=1e-9)
 

@@ -25,7 +25,7 @@ DESIGNS = {
 PLANTS = {"nominal": {}, "load": {"load": 2.0}, "heavy": {"m": 1.2}, "light": {"m": 0.8}}
 
 
-def held(estimator, seen, cost, steps=600, **changes):
+def held(estimator, seen, cost, steps=300, **changes):
     """The last offset of a run from π/4 to the setpoint."""
     mpc = km.KoopmanMPC(learned(), cost, PROBLEM.limits, PROBLEM.horizon, estimator=estimator)
     reference = [SETPOINT, 0.0] if cost is WHOLE else [SETPOINT]
@@ -37,7 +37,8 @@ def held(estimator, seen, cost, steps=600, **changes):
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("design", DESIGNS)
 def test_a_learned_pendulum_is_held_without_offset(design, plant):
-    assert held(*DESIGNS[design], **PLANTS[plant]) < 1e-6
+    steps = {"angle, offset": 600, "relifted": 300, "deadbeat": 300}.get(design, 450)
+    assert held(*DESIGNS[design], steps, **PLANTS[plant]) < 1e-6
 
 
 @pytest.mark.parametrize("plant", ["load", "heavy", "light"])
