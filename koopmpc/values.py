@@ -18,6 +18,7 @@ from koopmpc.errors import DataError, LogError
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
+_SHOWN, _LONG = 4, 80  # items and characters that a repr shows of a field
 
 
 class Value:
@@ -26,8 +27,10 @@ class Value:
     _kinds: ClassVar[dict[str, type["Value"]]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Register the classes of the library itself, and no others, for `from_data`."""
+        """Register the classes of the library itself, and no others, for `from_data`; keep the short repr."""
         super().__init_subclass__(**options)
+        if "__repr__" not in cls.__dict__:
+            cls.__repr__ = Value.__repr__  # a dataclass writes one of its own where the class itself has none
         if cls.__module__.split(".")[0] == "koopmpc":
             Value._kinds[cls.__name__] = cls
 
@@ -39,6 +42,11 @@ class Value:
         return all(same(getattr(self, f), getattr(other, f)) for f in _fields(self))
 
     __hash__ = None  # pyright: ignore[reportAssignmentType]  # arrays have no hash
+
+    def __repr__(self) -> str:
+        """Return the class and its fields in a line: of arrays the shape, of other Values the name."""
+        parts = [f"{f}={_brief(getattr(self, f))}" for f in _fields(self)]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     def as_saved(self) -> "Value":
         """Return the Value that stands for this one in a file; itself unless a class says otherwise."""
@@ -123,6 +131,30 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
         raise
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise LogError(f"the file holds a {kind!r} that cannot be built: {error}") from error
+
+
+def _brief(value: Any) -> str:
+    """Return `value` in a few characters."""
+    match value:
+        case np.ndarray():
+            return f"array{cast('Array', value).shape}"
+        case Value():
+            return type(value).__name__
+        case Enum():
+            return f"{type(value).__name__}.{value.name}"
+        case tuple() | list():
+            items = cast("Sequence[Any]", value)
+            shown = [_brief(item) for item in items[:_SHOWN]]
+            shown += [f"… {len(items)} in all"] if len(items) > _SHOWN else []
+            return f"({', '.join(shown)}{',' if len(items) == 1 else ''})"
+        case Mapping():
+            pairs = list(cast("Mapping[Any, Any]", value).items())
+            shown = [f"{key!r}: {_brief(item)}" for key, item in pairs[:_SHOWN]]
+            shown += [f"… {len(pairs)} in all"] if len(pairs) > _SHOWN else []
+            return f"{{{', '.join(shown)}}}"
+        case _:
+            text = repr(value)
+            return text if len(text) <= _LONG else f"{text[: _LONG - 1]}…"
 
 
 def _array_to_data(array: Array, arrays: Arrays | None) -> dict[str, Any]:

@@ -219,3 +219,44 @@ def test_each_name_is_one_class():
     classes = [c for c in below(Value) - {Value} if c.__module__.startswith("koopmpc.")]
     assert len({c.__name__ for c in classes}) == len(classes)
     assert not [c for c in classes if "kind" in getattr(c, "__dataclass_fields__", {})]
+
+
+def test_a_repr_is_a_line_without_numbers():
+    data = km.Episodes([km.Episode(X=np.zeros((9, 2)), U=np.zeros((8, 1)))] * 7, 0.1)
+    assert repr(data[0]) == "Episode(U=array(8, 1), X=array(9, 2))"
+    assert repr(data[:1]) == "Episodes(episodes=(Episode,), dt=0.1, states=('x0', 'x1'), inputs=('u0',))"
+    assert repr(data).startswith(
+        "Episodes(episodes=(Episode, Episode, Episode, Episode, … 7 in all), dt=0.1,"
+    )
+    assert repr(km.Fourier(2, [0])) == "Fourier(bound=None, harmonics=2, states=(0,))"
+    about = {str(i): i for i in range(9)} | {"0": "long" * 99}
+    plan = replace(_run(), metadata=about, cost=km.Cost(Q=[1.0, 2.0], R=[1.0]))
+    text = repr(plan)
+    assert len(text) < 1200
+    assert "\n" not in text
+    for part in (
+        "X=array(201, 2)",
+        "cost=Cost,",
+        "Status.OPTIMAL, … 200 in all)",
+        "'1': 1, '2': 2, '3': 3, … 9 in all}",
+    ):
+        assert part in text
+
+
+def _run() -> km.Run:
+    return km.Run(
+        X=np.zeros((201, 2)),
+        Y=np.zeros((201, 2)),
+        U=np.zeros((200, 1)),
+        reference=np.zeros((201, 2)),
+        status=(km.Status.OPTIMAL,) * 200,
+        fallback=(km.Fallback.NONE,) * 200,
+        solve_time=np.zeros(200),
+        iterations=np.zeros(200, dtype=np.int64),
+        cost=None,
+        limits=None,
+        dt=0.1,
+        states=("a", "b"),
+        inputs=("u",),
+        outputs=("a", "b"),
+    )
