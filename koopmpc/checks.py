@@ -1,13 +1,16 @@
-"""The one place that words messages about shapes, dtypes, NaN and definiteness."""
+"""The one place that words messages about shapes, dtypes, NaN, definiteness and paths."""
 
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.errors import DataError, DefinitenessError, ShapeError
+from koopmpc.errors import DataError, DefinitenessError, LogError, ShapeError
 
 
 def array(
@@ -147,7 +150,35 @@ def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: s
 
 def generator(rng: np.random.Generator | int) -> np.random.Generator:
     """Return a Generator; an int is a seed."""
-    return rng if isinstance(rng, np.random.Generator) else np.random.default_rng(rng)
+    if isinstance(rng, np.random.Generator):
+        return rng
+    if isinstance(rng, bool) or not isinstance(cast(object, rng), int | np.integer) or rng < 0:
+        raise DataError(f"rng is {rng!r}; pass a seed (a whole number from 0 on) or a numpy Generator")
+    return np.random.default_rng(rng)
+
+
+def existing(path: str | PathLike[str], advice: str) -> Path:
+    """Return the path of a file that is there; `advice` ends the message where it is not."""
+    file = Path(path)
+    if file.is_dir():
+        raise LogError(f"{file} is a folder; {advice}")
+    if not file.exists():
+        raise LogError(f"{file} does not exist; {advice}")
+    return file
+
+
+@contextmanager
+def writing(path: str | PathLike[str], mode: str = "wb") -> Generator[BinaryIO]:
+    """Open the file for writing, its folders made; what the system refuses becomes a LogError with the path."""
+    file = Path(path)
+    if file.is_dir():
+        raise LogError(f"{file} is a folder; pass the path of a file in it")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open(mode) as stream:
+            yield cast(BinaryIO, stream)
+    except OSError as error:
+        raise LogError(f"{file} cannot be written: {error.strerror or error}; pass another path") from error
 
 
 def _written(shape: Sequence[int | None]) -> str:

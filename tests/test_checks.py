@@ -143,6 +143,8 @@ show(lambda: checks.array(None, "x0"))
 show(lambda: checks.array({}, "x0"))
 show(lambda: checks.count(2.0, "steps"))
 show(lambda: checks.count("2", "steps"))
+for rng in ("a", None, 1.5, True, -1):
+    show(lambda: checks.generator(rng))
 print(checks.count(np.int64(3), "steps"))
 """
     )
@@ -153,5 +155,9 @@ print(checks.count(np.int64(3), "steps"))
         " not 'dict'; pass numbers of one shape",
         "DataError steps is 2.0; pass a whole number",
         "DataError steps is '2'; pass a whole number",
+        *(
+            f"DataError rng is {rng}; pass a seed (a whole number from 0 on) or a numpy Generator"
+            for rng in ("'a'", "None", "1.5", "True", "-1")
+        ),
         "3",
     ]

@@ -3,32 +3,38 @@
 
 import json
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, LogError
 
 _KEY = b"koopmpc.episodes"
+ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
 
-def write(
-    path: Path, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str
-) -> None:
-    """Write the stacked rows; the inputs of an episode's last row are null, for none was applied there.
+def check_names(names: tuple[str, ...]) -> None:
+    """Raise where a state or an input is named like one of the table's own columns.
 
     Raises
     ------
     DataError
-        A state or an input is named like one of the table's own columns.
+        One is.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     for name in ("episode", "step"):
         if name in names:
             raise DataError(
                 f"a .parquet file has a column {name!r} of its own; rename the state, or save as .npz"
             )
+
+
+def write(
+    file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str
+) -> None:
+    """Write the stacked rows; the inputs of an episode's last row are null, for none was applied there."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     episode, step = _index(steps)
     last = step == steps[episode]
     full = np.zeros((len(X), U.shape[1]))
@@ -36,23 +42,47 @@ def write(
     columns = [pa.array(column) for column in (episode, step, *X.T)]
     columns += [pa.array(column, mask=last) for column in full.T]
     table = pa.table(columns, names=["episode", "step", *names])
-    pq.write_table(table.replace_schema_metadata({_KEY: about.encode()}), path)
+    pq.write_table(table.replace_schema_metadata({_KEY: about.encode()}), file)
 
 
-def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
-    """Return X, U, the steps of each episode, and the text beside them.
+def described(path: Path) -> bool:
+    """Return whether the table says what it holds: whether `write` wrote it.
 
     Raises
     ------
-    ValueError, OSError
-        It is no such table, or pyarrow cannot read it.
+    LogError
+        It is no .parquet file.
     """
-    import pyarrow.parquet as pq
+    return _KEY in (_schema(path).metadata or {})
 
-    table = pq.read_table(path)
-    metadata = table.schema.metadata or {}
-    if _KEY not in metadata:
-        raise ValueError("the table does not say dt, states and inputs")
+
+def names(path: Path) -> list[str]:
+    """Return the names of the columns."""
+    return _schema(path).names
+
+
+def columns(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
+    """Return the columns of these names; null is NaN among numbers and None among others.
+
+    Raises
+    ------
+    LogError
+        The file is damaged.
+    """
+    table = _table(path, wanted)
+    return {name: table[name].to_numpy() for name in wanted}
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Return X, U, the steps of each episode, and the text beside them, of a table that `write` wrote.
+
+    Raises
+    ------
+    LogError, ValueError
+        It is damaged; its rows were changed.
+    """
+    table = _table(path)
+    metadata = table.schema.metadata
     about = metadata[_KEY].decode()
     named = json.loads(about)
     episode, step = (table[name].to_numpy() for name in ("episode", "step"))
@@ -76,3 +106,27 @@ def _index(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows = steps + 1
     first = np.cumsum(rows) - rows
     return np.repeat(np.arange(len(steps)), rows), np.arange(rows.sum()) - np.repeat(first, rows)
+
+
+def _schema(path: Path) -> Any:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_schema(path)
+    except (pa.ArrowException, OSError) as error:
+        raise LogError(
+            f"{path} holds no episodes that can be read: it is no .parquet file, or was cut; {ADVICE}"
+        ) from error
+
+
+def _table(path: Path, wanted: list[str] | None = None) -> Any:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path, columns=wanted)
+    except (pa.ArrowException, OSError) as error:
+        raise LogError(
+            f"{path} holds no episodes that can be read: its columns are damaged; {ADVICE}"
+        ) from error

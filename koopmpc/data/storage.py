@@ -1,15 +1,18 @@
 """Episodes in files, to the bit: .npz and .parquet."""
 
 import json
-import zipfile
+from collections.abc import Sequence
 from functools import reduce
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
+from koopmpc import checks
 from koopmpc.data import parquet
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.npz import read_arrays
+from koopmpc.data.tables import read_table
 from koopmpc.errors import DataError, LogError
 
 
@@ -23,29 +26,56 @@ def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     # Python writes a float so that it reads back to the bit.
     about = json.dumps({"dt": episodes.dt, "states": episodes.states, "inputs": episodes.inputs})
     if suffix == ".parquet":
-        parquet.write(file, X, U, steps, episodes.states + episodes.inputs, about)
-    else:
-        with file.open("wb") as stream:
+        parquet.check_names(episodes.states + episodes.inputs)
+    with checks.writing(file) as stream:
+        if suffix == ".parquet":
+            parquet.write(stream, X, U, steps, episodes.states + episodes.inputs, about)
+        else:
             np.savez(stream, X=X, U=U, steps=steps, about=np.array(about))
 
 
-def load_episodes(path: str | PathLike[str], *more: str | PathLike[str]) -> Episodes:
+def load_episodes(
+    path: str | PathLike[str],
+    *more: str | PathLike[str],
+    dt: float | None = None,
+    states: Sequence[str] | None = None,
+    inputs: Sequence[str] | None = None,
+) -> Episodes:
     """Read the episodes of one file, or of several as one set.
+
+    Files that `Episodes.save` wrote say themselves what they hold. A plain .parquet table is read where it is told:
+    a row a time step; a column each state and input; a column ``episode`` where there are several, of numbers or
+    names; a column ``step`` where the rows are not in order. The inputs of an episode's last row are not read.
+
+    Parameters
+    ----------
+    path, more
+        .npz or .parquet.
+    dt
+        Sample time of a plain table [s].
+    states, inputs
+        The names of its columns; ``inputs=[]`` where there are none.
 
     Raises
     ------
     LogError
         A file is missing, is cut, or holds no episodes.
     DataError
-        The suffix is neither .npz nor .parquet, or the files have unequal dt or names.
+        The suffix is neither .npz nor .parquet, the files have unequal dt or names, or a plain table lacks a
+        column, or a step.
     """
-    return reduce(Episodes.__add__, [_read(Path(file)) for file in (path, *more)])
+    return reduce(Episodes.__add__, [_read(Path(file), dt, states, inputs) for file in (path, *more)])
 
 
-def _read(file: Path) -> Episodes:
+def _read(
+    file: Path, dt: float | None, states: Sequence[str] | None, inputs: Sequence[str] | None
+) -> Episodes:
     suffix = _suffix(file)
-    if not file.is_file():
-        raise LogError(f"{file} is not there; check the path")
+    checks.existing(file, parquet.ADVICE)
+    if suffix == ".parquet" and not parquet.described(file):
+        return read_table(file, dt, states, inputs)
+    if not (dt is None and states is None and inputs is None):
+        raise DataError(f"{file} says itself what it holds; leave out dt, states and inputs")
     try:
         X, U, steps, text = parquet.read(file) if suffix == ".parquet" else _read_npz(file)
         about = json.loads(text)
@@ -53,16 +83,13 @@ def _read(file: Path) -> Episodes:
         parts_U = np.split(U, np.cumsum(steps)[:-1])
         episodes = [Episode(X=one, U=other) for one, other in zip(parts_X, parts_U, strict=True)]
         return Episodes(episodes, about["dt"], about["states"], about["inputs"])
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise LogError(
-            f"{file} holds no episodes that can be read: {error}; pass a file that Episodes.save wrote"
-        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogError(f"{file} holds no episodes that can be read: {error}; {parquet.ADVICE}") from error
 
 
 def _read_npz(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
-    # Opened here, for numpy leaves a file that it refuses open.
-    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
-        return held["X"], held["U"], held["steps"], str(held["about"])
+    held = read_arrays(file, ("X", "U", "steps", "about"))
+    return held["X"], held["U"], held["steps"], str(held["about"])
 
 
 def _suffix(file: Path) -> str:

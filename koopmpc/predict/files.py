@@ -6,6 +6,8 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from koopmpc import checks
+from koopmpc.data.npz import read_arrays
 from koopmpc.errors import LogError
 from koopmpc.values import Arrays, Value, from_data, to_data
 
@@ -14,11 +16,17 @@ _FORMAT = "koopmpc-1"
 
 
 def save_value(value: Value, path: str | Path) -> None:
-    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled."""
+    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled.
+
+    Raises
+    ------
+    LogError
+        The path cannot be written.
+    """
     arrays: Arrays = {}
     tree = {"format": _FORMAT, "value": to_data(value, arrays)}
     text = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
-    with Path(path).open("wb") as file:
+    with checks.writing(path) as file:
         np.savez_compressed(file, allow_pickle=False, tree=text, **arrays)
 
 
@@ -28,16 +36,17 @@ def load_value(path: str | Path, kind: type[V]) -> V:
     Raises
     ------
     LogError
-        The file is missing, damaged, or holds something else.
+        The file is missing, a folder, damaged, or holds something else.
     """
+    advice = f"pass the .npz of a saved {kind.__name__}"
+    source = checks.existing(path, advice)
     try:
-        with Path(path).open("rb") as source, np.load(source, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(source, ("tree",))
         tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
-    except FileNotFoundError as error:
-        raise LogError(f"{path} does not exist; check the path") from error
-    except Exception as error:  # numpy and zipfile raise a dozen kinds for damaged bytes
-        raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise LogError(f"{path} is damaged: the text in it cannot be read; {advice}") from error
+    except (OSError, ValueError) as error:
+        raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}; {advice}") from error
     node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
     if node.get("format") != _FORMAT:
         raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")

@@ -1,9 +1,9 @@
 """Files give back what was saved, to the bit, and refuse what they cannot read."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -84,31 +84,36 @@ def test_a_cut_file_is_refused(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_is_no_file_of_episodes_is_refused(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"data{suffix}"
-    with pytest.raises(LogError, match="is not there; check the path"):
+    with pytest.raises(LogError, match=r"does not exist; pass a file that Episodes\.save wrote"):
         load_episodes(file)
-    file.write_text("theta, omega\n1, 2\n")
-    with pytest.raises(LogError, match=r"pass a file that Episodes.save wrote"):
-        load_episodes(file)
+    for content in (b"", b"theta, omega\n1, 2\n", pickle.dumps([1])):
+        file.write_bytes(content)
+        told = rf"holds no episodes that can be read: it is no {suffix} file, or was cut; pass a file that Episodes"
+        with pytest.raises(LogError, match=told) as caught:
+            load_episodes(file)
+        assert "pickle" not in str(caught.value)
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(LogError, match=rf"folder{suffix} is a folder; pass a file that Episodes\.save wrote"):
+        load_episodes(tmp_path / f"folder{suffix}")
 
 
 def test_foreign_contents_are_refused(tmp_path: Path) -> None:
-    table, stale = tmp_path / "table.parquet", tmp_path / "rows.parquet"
-    pq.write_table(pa.table({"episode": [0, 0], "step": [0, 1], "x": [0.0, 1.0]}), table)
-    with pytest.raises(LogError, match="the table does not say dt, states and inputs"):
-        load_episodes(table)
+    stale = tmp_path / "rows.parquet"
     random_episodes([3, 2], 1, 1, 0).save(stale)
     held = pq.read_table(stale)
     pq.write_table(held.take([0, 1, 3, 4, 5, 6]), stale)
     with pytest.raises(LogError, match="rows are missing or out of order"):
         load_episodes(stale)
     np.savez(tmp_path / "other.npz", X=np.zeros((3, 1)))
-    with pytest.raises(LogError, match="U is not a file in the archive"):
+    with pytest.raises(LogError, match="it is of another program: it holds X, and lacks U, steps, about"):
         load_episodes(tmp_path / "other.npz")
 
 
 def test_no_pickle_is_opened(tmp_path: Path) -> None:
     np.savez(tmp_path / "evil.npz", X=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(LogError, match="allow_pickle=False"):
+    with pytest.raises(
+        LogError, match="it is damaged, or holds something other than arrays of numbers; pass a file"
+    ):
         load_episodes(tmp_path / "evil.npz")
 
 
@@ -133,3 +138,17 @@ def test_other_suffixes_and_taken_names_are_refused(tmp_path: Path) -> None:
         taken.save(tmp_path / "data.parquet")
     taken.save(tmp_path / "data.npz")
     assert load_episodes(tmp_path / "data.npz") == taken
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_folders_are_made_and_what_cannot_be_written_is_told(tmp_path: Path, suffix: str) -> None:
+    data, file = random_episodes([2], 1, 1, 0), tmp_path / "new" / "er" / f"data{suffix}"
+    data.save(file)
+    assert load_episodes(file) == data
+    with pytest.raises(
+        LogError, match=rf"data{suffix}/data{suffix} cannot be written: .+; pass another path"
+    ):
+        data.save(file / file.name)
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(LogError, match=rf"folder{suffix} is a folder; pass the path of a file in it"):
+        data.save(tmp_path / f"folder{suffix}")

@@ -65,15 +65,34 @@ def test_equality_sees_one_bit(saved: Path) -> None:
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"nothing\.npz does not exist; check the path"):
+    with pytest.raises(
+        LogError, match=r"nothing\.npz does not exist; pass the \.npz of a saved LinearPredictor"
+    ):
         load_predictor(tmp_path / "nothing.npz")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 no zip", pickle.dumps([1, 2])])
 def test_a_file_of_something_else(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "model.npz").write_bytes(content)
-    with pytest.raises(LogError, match="is no file that koopmpc saved, or is damaged"):
+    told = "is no file that koopmpc saved, or is damaged: it is no .npz file, or was cut; pass the .npz of a saved"
+    with pytest.raises(LogError, match=told) as caught:
         load_predictor(tmp_path / "model.npz")
+    assert "pickle" not in str(caught.value)
+
+
+def test_a_folder_is_said_to_be_one(saved: Path) -> None:
+    with pytest.raises(LogError, match=r"is a folder; pass the \.npz of a saved LinearPredictor"):
+        load_predictor(saved.parent)
+    with pytest.raises(LogError, match=r"is a folder; pass the path of a file in it"):
+        load_predictor(saved).save(saved.parent)
+
+
+def test_folders_are_made_and_what_cannot_be_written_is_told(saved: Path) -> None:
+    model = load_predictor(saved)
+    model.save(saved.parent / "new" / "er" / "model.npz")
+    assert load_predictor(saved.parent / "new" / "er" / "model.npz") == model
+    with pytest.raises(LogError, match=r"model\.npz/model\.npz cannot be written: .+; pass another path"):
+        model.save(saved / "model.npz")
 
 
 def outcome(path: Path) -> LinearPredictor | str:
@@ -105,7 +124,9 @@ def test_a_pickle_inside_is_not_opened(tmp_path: Path) -> None:
 
     path = tmp_path / "trap.npz"
     np.savez(path, tree=np.array([Trap()], dtype=object), allow_pickle=True)
-    with pytest.raises(LogError, match="is no file that koopmpc saved"):
+    with pytest.raises(
+        LogError, match="it is damaged, or holds something other than arrays of numbers; pass"
+    ):
         load_predictor(path)
     assert not opened
 
@@ -154,7 +175,12 @@ def test_a_file_made_by_hand_is_refused(change, text: str, saved: Path, tmp_path
 
 def test_a_file_without_its_text(tmp_path: Path) -> None:
     np.savez(tmp_path / "data.npz", X=np.zeros(3))
-    with pytest.raises(LogError, match="is no file that koopmpc saved"):
+    with pytest.raises(
+        LogError, match=r"it is of another program: it holds X, and lacks tree; pass the \.npz"
+    ):
+        load_predictor(tmp_path / "data.npz")
+    np.savez(tmp_path / "data.npz", tree=np.frombuffer(b"no json", dtype=np.uint8))
+    with pytest.raises(LogError, match=r"is damaged: the text in it cannot be read; pass the \.npz"):
         load_predictor(tmp_path / "data.npz")
 
 

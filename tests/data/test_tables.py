@@ -1,0 +1,119 @@
+"""A user's own .parquet table is read as the episodes that it holds, and what it lacks is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.storage import load_episodes
+from koopmpc.errors import DataError, LogError
+from tests.data.test_storage import random_episodes
+
+TOLD = {"dt": 0.1, "states": ["x"], "inputs": ["u"]}
+
+
+def written(file: Path, **columns: object) -> Path:
+    pq.write_table(pa.table(columns), file)
+    return file
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    lengths=st.lists(st.integers(1, 4), min_size=1, max_size=4),
+    nu=st.integers(0, 2),
+    last=st.sampled_from([None, 7.0]),
+    shuffled=st.booleans(),
+    text=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_table_is_its_episodes(
+    tmp_path: Path, lengths: list[int], nu: int, last: float | None, shuffled: bool, text: bool, seed: int
+) -> None:
+    """Rows in any order where their steps are told; episodes in the order in which they first come."""
+    data = random_episodes(lengths, 2, nu, seed)
+    columns: dict[str, list] = {"note": [], "episode": [], "step": []}
+    for name in (*data.states, *data.inputs):
+        columns[name] = []
+    for e, episode in enumerate(data):
+        for k in range(len(episode) + 1):
+            columns["note"].append("own")
+            columns["episode"].append(f"run {9 - e}" if text else 9 - e)
+            columns["step"].append(k + 5)
+            for name, x in zip(data.states, episode.X[k], strict=True):
+                columns[name].append(x)
+            for i, name in enumerate(data.inputs):
+                columns[name].append(episode.U[k, i] if k < len(episode) else last)
+    order = np.arange(len(columns["step"]))
+    if shuffled:
+        order = np.random.default_rng(seed).permutation(order)
+    else:
+        del columns["step"]
+    table = {name: pa.array(values).take(pa.array(order)) for name, values in columns.items()}
+    file = written(tmp_path / "own.parquet", **table)
+    first = list(dict.fromkeys(table["episode"].to_pylist()))
+    expected = [data[9 - int(str(label).split()[-1])] for label in first]
+    read = load_episodes(file, dt=data.dt, states=data.states, inputs=data.inputs)
+    assert read == Episodes(expected, data.dt, data.states, data.inputs)
+
+
+def test_without_a_column_episode_there_is_one(tmp_path: Path) -> None:
+    file = written(tmp_path / "own.parquet", x=[1, 2, 3], u=[4, 5, None])
+    expected = Episode(X=[[1.0], [2.0], [3.0]], U=[[4.0], [5.0]])
+    assert load_episodes(file, **TOLD) == Episodes([expected], 0.1, ["x"], ["u"])
+    assert load_episodes(file, file, **TOLD) == Episodes([expected] * 2, 0.1, ["x"], ["u"])
+    alone = load_episodes(file, dt=0.1, states=["x"], inputs=[])
+    assert alone == Episodes([Episode(X=[[1.0], [2.0], [3.0]])], 0.1, ["x"])
+
+
+def test_a_state_may_be_named_step(tmp_path: Path) -> None:
+    file = written(tmp_path / "own.parquet", step=[5.0, 0.0], u=[1.0, 0.0])
+    assert load_episodes(file, dt=1.0, states=["step"], inputs=["u"])[0].X.tolist() == [[5.0], [0.0]]
+
+
+@pytest.mark.parametrize(
+    ("columns", "told", "text"),
+    [
+        ({}, {}, r"does not say what it holds: pass dt=, states=, inputs=; its columns are x, u"),
+        ({}, {"dt": 0.1, "states": ["x"]}, r"does not say what it holds: pass inputs=; its columns"),
+        ({}, TOLD | {"states": "x"}, r"states is 'x'; pass a tuple of names"),
+        ({}, TOLD | {"states": ["v"]}, r"own\.parquet has no column 'v'; its columns are x, u"),
+        ({}, TOLD | {"dt": 0.0}, r"dt is 0 s; it must be above zero"),
+        ({"x": [1.0, None, 2.0]}, TOLD, r"own\.parquet, episode 0: X holds 1 NaN or inf, the first at \(1, 0\)"),
+        ({"u": [1.0, None, 2.0]}, TOLD, r"own\.parquet, episode 0: U holds 1 NaN or inf"),
+        ({"x": ["a", "b", "c"]}, TOLD, r"own\.parquet: x is not an array of numbers"),
+        ({"step": [0, 1, 3]}, TOLD, r"own\.parquet, episode 0: steps are missing or come twice"),
+        ({"step": [0, 1, 1]}, TOLD, r"own\.parquet, episode 0: steps are missing or come twice"),
+        ({"episode": [0, 0, 1]}, TOLD, r"episode 1 is too short: X has 1 row"),
+        ({"episode": ["a", "a", None]}, TOLD, r"has rows whose episode is null; give each row"),
+        ({"x": pa.array([], pa.float64()), "u": pa.array([], pa.float64())}, TOLD, r"there is no episode; pass at"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_named(tmp_path: Path, columns: dict, told: dict, text: str) -> None:
+    file = written(tmp_path / "own.parquet", **{"x": [1.0, 2.0, 3.0], "u": [1.0, 2.0, 3.0]} | columns)
+    with pytest.raises(DataError, match=text):
+        load_episodes(file, **told)
+
+
+def test_a_file_of_koopmpc_is_told_nothing(tmp_path: Path) -> None:
+    for name in ("data.npz", "data.parquet"):
+        random_episodes([2], 1, 1, 0).save(tmp_path / name)
+        with pytest.raises(
+            DataError, match=rf"{name} says itself what it holds; leave out dt, states and inputs"
+        ):
+            load_episodes(tmp_path / name, dt=0.1)
+
+
+def test_a_cut_table_is_refused(tmp_path: Path) -> None:
+    file = written(tmp_path / "own.parquet", x=np.arange(100.0), u=np.arange(100.0))
+    whole = file.read_bytes()
+    for kept in range(0, len(whole), len(whole) // 20):
+        file.write_bytes(whole[:kept])
+        with pytest.raises(
+            LogError, match=r"own\.parquet holds no episodes that can be read: it is no \.parquet"
+        ):
+            load_episodes(file, **TOLD)
