@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import overload
+from typing import cast, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -101,8 +101,13 @@ class Episodes(Value):
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
     ) -> None:
+        if not isinstance(cast(object, episodes), Sequence):
+            raise DataError(f"episodes is a {type(episodes).__name__}; pass a list of Episode(X=…, U=…)")
         if not episodes:
             raise DataError("there is no episode; pass at least one")
+        for i, episode in enumerate(episodes):
+            if not isinstance(cast(object, episode), Episode):
+                raise DataError(f"episode {i} is a {type(episode).__name__}; pass Episode(X=…, U=…)")
         nx, nu = episodes[0].X.shape[1], episodes[0].U.shape[1]
         for i, episode in enumerate(episodes):
             if len(episode) < 1:
@@ -178,9 +183,10 @@ class Episodes(Value):
         Raises
         ------
         DataError
-            One side would be empty.
+            One side would be empty; the fraction is no number.
         """
         total = len(self)
+        fraction = float(checks.array(fraction, "fraction", ()))
         count = round(fraction * total)
         if not 0 < count < total:
             raise DataError(
@@ -193,12 +199,14 @@ class Episodes(Value):
         return self._of([self.episodes[i] for i in train]), self._of([self.episodes[i] for i in held_out])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write a .npz or .parquet file, which `load_episodes` reads back to the bit.
+        """Write a .npz or .parquet file, its folders made, which `load_episodes` reads back to the bit.
 
         Raises
         ------
         DataError
             The suffix is another, or a .parquet column would be named twice.
+        LogError
+            The path cannot be written.
         """
         from koopmpc.data.storage import save_episodes  # storage builds Episodes, so it imports this file
 
@@ -216,3 +224,18 @@ def _names(names: Sequence[str] | None, what: str, letter: str, count: int) -> t
     if len(names) != count:
         raise ShapeError(f"{what} has {len(names)} names and the data {count} columns; give one name each")
     return tuple(names)
+
+
+def episodes_of(given: object) -> Episodes:
+    """Return `given` if it is Episodes.
+
+    Raises
+    ------
+    DataError
+        It is something else.
+    """
+    if isinstance(given, Episodes):
+        return given
+    raise DataError(
+        f"episodes is a {type(given).__name__}; pass Episodes([Episode(X=…, U=…), …], dt), or what collect returns"
+    )

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
@@ -53,7 +53,7 @@ def bilinear_edmd(
     Bruder, Fu & Vasudevan, "Advantages of bilinear Koopman realizations for the modeling and control of systems
     with unknown dynamics", IEEE Robot. Autom. Lett. 6, 2021.
     """
-    if episodes.nu == 0:
+    if episodes_of(episodes).nu == 0:
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
     ridge = float(checks.array(ridge, "ridge", ()))
     if ridge < 0:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
 from koopmpc.identify.fit import Regression, fit
 from koopmpc.identify.moments import moments
@@ -70,7 +70,7 @@ def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = N
     ----------
     Proctor, Brunton & Kutz, "Dynamic mode decomposition with control", SIAM J. Appl. Dyn. Syst. 15, 2016.
     """
-    if episodes.nu == 0:
+    if episodes_of(episodes).nu == 0:
         raise DataError("the episodes have no inputs; pass them to dmd, or give each Episode its U")
     known = None if B is None else checks.array(B, "B", (episodes.nx, episodes.nu))
     return fit(_regression(episodes, "dmdc", inputs=episodes.inputs, B=known), rank=rank)
@@ -80,7 +80,7 @@ def _regression(
     episodes: Episodes, method: str, *, inputs: tuple[str, ...], B: Float[np.ndarray, "nx nu"] | None = None
 ) -> Regression:
     """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
-    lifting = State().bind(episodes.states)
+    lifting = State().bind(episodes_of(episodes).states)
     nx, nu = episodes.nx, len(inputs)
     pairs = sum(len(e) for e in episodes)
     if pairs < nx + nu:  # the snapshots themselves are the few rows

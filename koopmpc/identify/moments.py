@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg.lapack import dtpqrt
 
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.chunks import ROWS, chunks, table
 from koopmpc.identify.solve import Rows, norms
-from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.state import State
 from koopmpc.values import Value
@@ -164,9 +164,10 @@ def moments(
     Raises
     ------
     DataError
-        An observable is not finite on the data.
+        An observable is not finite on the data; an argument is of another kind.
     """
-    bound = lifting.bind(episodes.states)
+    episodes = episodes_of(episodes)
+    bound = lifting_of(lifting).bind(episodes.states)
     pieces = chunks(episodes)
     if route is not None:
         return _read(episodes, bound, range(len(pieces)), route, bilinear)

@@ -120,6 +120,7 @@ class Lifting(Value, ABC):
 
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return both liftings one under the other; an observable that both name is held once."""
+        other = lifting_of(other)
         parts = [
             part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))
         ]
@@ -217,6 +218,21 @@ class Traced(Lifting):
     @cached_property
     def _graph(self) -> Graph:
         return self.graph
+
+
+def lifting_of(given: object) -> Lifting:
+    """Return `given` if it is a Lifting.
+
+    Raises
+    ------
+    DataError
+        It is something else, or the class itself.
+    """
+    if isinstance(given, Lifting):
+        return given
+    if isinstance(given, type) and issubclass(given, Lifting):
+        raise DataError(f"the lifting is the class {given.__name__}; pass one of it: {given.__name__}(…)")
+    raise DataError(f"{given!r} is no lifting; pass one, or a sum: State() + Constant()")
 
 
 def rows(lifting: Lifting, wanted: Lifting) -> Indices:

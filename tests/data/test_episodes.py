@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, KoopmpcError, ShapeError
 from koopmpc.values import from_data, to_data
+from tests.bare import shown
 
 LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=8)
 
@@ -153,3 +154,37 @@ def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> Episode:
 def test_messages(act: Callable[[], object], kind: type[KoopmpcError], text: str) -> None:
     with pytest.raises(kind, match=text):
         act()
+
+
+def test_what_is_no_episode_at_all() -> None:
+    """What the type hook of the tests would catch first, as users see it."""
+    lines = shown(
+        """
+X = np.zeros((4, 2))
+show(lambda: km.Episodes([X], 0.1))
+show(lambda: km.Episodes(X, 0.1))
+show(lambda: km.Episodes(km.Episode(X=X), 0.1))
+data = km.Episodes([km.Episode(X=X)] * 3, 0.1)
+show(lambda: data.split(float("nan")))
+show(lambda: data.split("half"))
+show(lambda: data.split(0.5, rng="a"))
+show(lambda: km.edmd([X], km.State()))
+show(lambda: km.edmd(X, km.State()))
+show(lambda: km.dmd(X))
+show(lambda: km.dmdc(X))
+from koopmpc.identify.bilinear import bilinear_edmd
+show(lambda: bilinear_edmd(X, km.State()))
+"""
+    )
+    episodes = "; pass Episodes([Episode(X=…, U=…), …], dt), or what collect returns"
+    assert lines == [
+        "DataError episode 0 is a ndarray; pass Episode(X=…, U=…)",
+        "DataError episodes is a ndarray; pass a list of Episode(X=…, U=…)",
+        "DataError episodes is a Episode; pass a list of Episode(X=…, U=…)",
+        "DataError fraction holds 1 NaN or inf, the first at (); remove or repair them first",
+        "DataError fraction is not an array of numbers: got str, None and text are no numbers;"
+        " pass numbers of one shape",
+        "DataError rng is 'a'; pass a seed (a whole number from 0 on) or a numpy Generator",
+        f"DataError episodes is a list{episodes}",
+        *[f"DataError episodes is a ndarray{episodes}"] * 4,
+    ]

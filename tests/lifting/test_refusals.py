@@ -17,6 +17,7 @@ from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import State
 from koopmpc.lifting.thin_plate import ThinPlate
 from koopmpc.values import from_data, to_data
+from tests.bare import shown
 from tests.lifting.families import NAMES
 
 
@@ -160,3 +161,22 @@ def test_a_lifting_that_a_file_spoils_is_a_log_error() -> None:
     tree["degree"] = 0
     with pytest.raises(LogError, match="'Monomials' that cannot be built: degree is 0"):
         from_data(tree)
+
+
+def test_what_is_no_lifting_at_all() -> None:
+    """What the type hook of the tests would catch first, as users see it."""
+    lines = shown(
+        """
+data = km.Episodes([km.Episode(X=np.zeros((4, 2)))], 0.1)
+show(lambda: km.State() + 3)
+show(lambda: km.State() + km.Constant)
+show(lambda: km.edmd(data, km.State))
+show(lambda: km.edmd(data, "State"))
+"""
+    )
+    assert lines == [
+        "DataError 3 is no lifting; pass one, or a sum: State() + Constant()",
+        "DataError the lifting is the class Constant; pass one of it: Constant(…)",
+        "DataError the lifting is the class State; pass one of it: State(…)",
+        "DataError 'State' is no lifting; pass one, or a sum: State() + Constant()",
+    ]
