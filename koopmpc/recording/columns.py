@@ -13,6 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
+from koopmpc import checks
 from koopmpc.errors import LogError
 
 _MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
@@ -141,13 +142,11 @@ def check_log(path: Path) -> None:
     LogError
         The file is missing, a folder, cannot be opened, or is no .rrd.
     """
-    if not path.exists():
-        raise LogError(f"{path} does not exist; pass the .rrd of a run")
-    if path.is_dir():
-        raise LogError(f"{path} is a folder; pass the .rrd of a run, a file")
     try:
-        with path.open("rb") as file:
+        with checks.existing(path, "pass the .rrd of a run").open("rb") as file:
             start = file.read(len(_MAGIC))
+    except LogError:
+        raise
     except OSError as error:
         raise LogError(f"{path} cannot be read: {error.strerror}") from error
     if start != _MAGIC:

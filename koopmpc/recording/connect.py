@@ -19,6 +19,14 @@ def find_viewer(port: int = PORT) -> str | None:
     return f"rerun+http://127.0.0.1:{port}/proxy"
 
 
+def why_none(port: int = PORT) -> str:
+    """Return in words why `find_viewer` found none."""
+    listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and"
+    if not has_display():
+        return f"{listens} there is no display to open one on"
+    return f"{listens} the one that was opened did not start; run `{program()}` to see what it says"
+
+
 def is_up(port: int) -> bool:
     """Return whether something listens at `port` of this machine."""
     try:
@@ -45,7 +53,7 @@ def open_viewer(logs: Sequence[str], port: int = PORT) -> bool:
 
 def start_viewer(*arguments: str, port: int) -> "subprocess.Popen[bytes] | None":
     """Start the viewer's process and return it as soon as it listens; None where it ends before, or never does."""
-    command = [str(_program()), "--bind", "127.0.0.1", "--port", str(port), *arguments]
+    command = [str(program()), "--bind", "127.0.0.1", "--port", str(port), *arguments]
     quiet = subprocess.DEVNULL
     viewer = subprocess.Popen(
         command,
@@ -65,7 +73,7 @@ def start_viewer(*arguments: str, port: int) -> "subprocess.Popen[bytes] | None"
     return None
 
 
-def _program() -> Path:
+def program() -> Path:
     """Return the viewer itself, not the script that starts it: that one would leave it behind when it ends."""
     import rerun_cli
 

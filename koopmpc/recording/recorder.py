@@ -16,7 +16,7 @@ from koopmpc.errors import DataError
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Step
 from koopmpc.predict.linear import LinearPredictor
-from koopmpc.recording.connect import PORT, find_viewer
+from koopmpc.recording.connect import PORT, find_viewer, why_none
 from koopmpc.recording.description import About
 from koopmpc.recording.rows import rows_of_run
 from koopmpc.recording.scenes import Scene
@@ -43,7 +43,9 @@ def record(
     Raises
     ------
     DataError
-        The metadata hold something other than numbers, names, lists and arrays.
+        The metadata hold something other than numbers, names, lists and arrays; the scene's shapes come and go.
+    LogError
+        The path cannot be written.
     """
     writer = Writer(About.of(run), path=Path(path), scene=scene, model=model, steps=run.steps)
     writer.write(rows_of_run(run))
@@ -78,6 +80,8 @@ class Recorder:
     ------
     DataError
         Neither a path nor live; dt is not positive; called outside of its `with` block.
+    LogError
+        The path cannot be written.
     """
 
     def __init__(
@@ -124,11 +128,7 @@ class Recorder:
                 self._streams[viewer] = self._stream(None, viewer)
             else:
                 kept = "the log is written all the same" if self._path else "nothing is recorded"
-                warnings.warn(
-                    f"no Rerun viewer listens at 127.0.0.1:{self._port}, and none could be opened; {kept}",
-                    UserWarning,
-                    stacklevel=2,
-                )
+                warnings.warn(f"{why_none(self._port)}; {kept}", UserWarning, stacklevel=2)
         self._open = True
         return self
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from time import sleep
 
 from koopmpc.errors import LogError
-from koopmpc.recording.connect import has_display, open_viewer, start_viewer
+from koopmpc.recording.columns import check_log
+from koopmpc.recording.connect import has_display, open_viewer, program, start_viewer
 
 _SETTLE = 2.5  # until plots have found their ranges [s]
 
@@ -18,16 +19,16 @@ def view(logs: str | Path | Sequence[str | Path]) -> None:
     Raises
     ------
     LogError
-        A log does not exist; there is no display; the viewer does not start.
+        A log does not exist, or is none; there is no display; the viewer does not start.
     """
     paths = _existing(logs)
     if not has_display():
         raise LogError(
             f"there is no display to open {paths[0]} on; copy it to a machine with a screen and run "
-            f"`rerun {Path(paths[0]).name}` there"
+            f"`koopmpc view {Path(paths[0]).name}` there"
         )
     if not open_viewer(paths, free_port()):
-        raise LogError(f"the viewer did not start; try `rerun {paths[0]}` to see what it says")
+        raise LogError(f"the viewer did not start; run `{program()} {paths[0]}` to see what it says")
 
 
 def screenshot(
@@ -38,7 +39,7 @@ def screenshot(
     Raises
     ------
     LogError
-        The log does not exist, or there is no Vulkan driver (Debian's is mesa-vulkan-drivers).
+        The log does not exist or is none, or there is no Vulkan driver (Debian's is mesa-vulkan-drivers).
     """
     from rerun.experimental import ViewerClient
 
@@ -63,9 +64,10 @@ def screenshot(
 
 def _existing(logs: str | Path | Sequence[str | Path]) -> list[str]:
     paths = [Path(p) for p in ([logs] if isinstance(logs, str | Path) else logs)]
-    missing = [str(p) for p in paths if not p.is_file()]
-    if missing or not paths:
-        raise LogError(f"{', '.join(missing) or 'no log'} does not exist; pass the .rrd of a run")
+    if not paths:
+        raise LogError("no log to open; pass the .rrd of a run")
+    for path in paths:
+        check_log(path)
     return [str(p) for p in paths]
 
 

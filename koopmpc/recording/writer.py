@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc import checks
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
@@ -57,8 +58,8 @@ class Writer:
         self._u: np.ndarray | None = None
         self._names = Names()
         if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
+            with checks.writing(path, "ab"):
+                pass  # Rerun makes no folders, and says nothing of what it cannot write
 
     def write(self, rows: Rows) -> None:
         """Write the rows that follow, block by block."""

@@ -25,7 +25,7 @@ def test_a_log_that_is_no_log(tmp_path: Path) -> None:
             LogError, match=rf"{path.name} is no log of koopmpc: it does not start as an \.rrd file does"
         ):
             load_run(path)
-    with pytest.raises(LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run, a file"):
+    with pytest.raises(LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run"):
         load_run(folder)
     with pytest.raises(LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
         load_run(tmp_path / "nowhere.rrd")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, LogError
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Step
 from koopmpc.recording import connect
@@ -86,10 +86,37 @@ def test_no_viewer_costs_one_warning_and_no_step(tmp_path: Path, monkeypatch: py
             feed(recorder, run)
     assert time.monotonic() - start < 4.0  # Rerun would wait five seconds for a viewer, twice
     assert [w.category for w in caught] == [UserWarning, UserWarning]
-    listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and none could be opened"
+    listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and there is no display to open one on"
     assert str(caught[0].message) == f"{listens}; the log is written all the same"
     assert str(caught[1].message) == f"{listens}; nothing is recorded"
     assert load_run(tmp_path / "run.rrd") == run
+
+
+def test_a_viewer_that_fails_to_start_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connect, "has_display", lambda: True)
+    monkeypatch.setattr(connect, "open_viewer", lambda logs, port: False)
+    run = make_run()
+    told = (
+        r"and the one that was opened did not start; run `.*rerun.*` to see what it says; the log is written"
+    )
+    with pytest.warns(UserWarning, match=told):  # noqa: SIM117
+        with Recorder(tmp_path / "run.rrd", live=True, port=free_port(), **about(run)) as recorder:
+            feed(recorder, run)
+    assert load_run(tmp_path / "run.rrd") == run
+
+
+def test_a_path_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
+    run = make_run()
+    (tmp_path / "file").touch()
+    with pytest.raises(LogError, match=rf"{tmp_path} is a folder; pass the path of a file in it"):
+        record(run, tmp_path)
+    with pytest.raises(LogError, match=r"file/run\.rrd cannot be written: .+; pass another path"):
+        record(run, tmp_path / "file" / "run.rrd")
+    with (
+        pytest.raises(LogError, match=rf"{tmp_path} is a folder"),
+        Recorder(tmp_path, **about(run)) as recorder,
+    ):
+        feed(recorder, run)
 
 
 def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
@@ -105,7 +132,9 @@ def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
     assert load_run(tmp_path / "seen.rrd") == run
 
 
-def test_a_viewer_that_dies_costs_one_warning_and_no_step(tmp_path: Path) -> None:
+def test_a_viewer_that_dies_costs_one_warning_and_no_step(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     run, port = make_run(T=40), free_port()
     viewer = start_viewer("--serve-grpc", port=port)
 

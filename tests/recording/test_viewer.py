@@ -46,16 +46,23 @@ def test_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_messages(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     with pytest.raises(
-        LogError, match=r"there is no display to open .*run\.rrd on; copy it to a machine with a screen"
+        LogError,
+        match=r"there is no display to open .*run\.rrd on; copy it to a machine with .* run `koopmpc view run\.rrd`",
     ):
         view(log)
     with pytest.raises(LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
         view([log, "nowhere.rrd"])
-    with pytest.raises(LogError, match=r"no log does not exist"):
+    notes = log.with_name("notes.rrd")
+    notes.write_text("these are notes")
+    with pytest.raises(LogError, match=r"notes\.rrd is no log of koopmpc: it does not start as"):
+        view([log, notes])
+    with pytest.raises(LogError, match=r"is a folder; pass the \.rrd of a run"):
+        screenshot(log.parent, "picture.png", time=0.0)
+    with pytest.raises(LogError, match=r"no log to open; pass the \.rrd of a run"):
         view([])
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: False)
-    with pytest.raises(LogError, match=r"the viewer did not start; try `rerun .*run\.rrd`"):
+    with pytest.raises(LogError, match=r"the viewer did not start; run `/.*rerun.* .*run\.rrd` to see"):
         view(log)
     monkeypatch.setattr(viewer, "start_viewer", lambda *arguments, port: None)
     with pytest.raises(
