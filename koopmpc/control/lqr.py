@@ -1,4 +1,4 @@
-"""LQR: u = u_r − K (ψ(x) − z_r), clipped to the input limits."""
+"""LQR: u = u_r − K (ψ(x) − z_r), clipped to the limits of the inputs and of their rates."""
 
 from time import perf_counter
 
@@ -8,10 +8,13 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
+from koopmpc.control.fallback import admitted
+from koopmpc.control.horizon import one_step
 from koopmpc.control.lifted import reference_rows, tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import stationary
+from koopmpc.errors import ShapeError
 from koopmpc.lifting.buffered import HUGE, buffered
 from koopmpc.predict.linear import LinearPredictor
 
@@ -22,16 +25,17 @@ class LQR:
     """u = u_r − K (ψ(x) − z_r) on a lifted predictor, or on a linearisation as `LinearPredictor.local` makes it.
 
     K is the limit of the Riccati difference equation for the cost's Q and R; (z_r, u_r) is the equilibrium that
-    holds the reference. The input is clipped to the limits (status SATURATED); other limits are not seen.
+    holds the reference. With R_delta it acts on [ψ(x) − z_r; u_{k−1} − u_r]. The input is clipped to the limits of
+    its change, soft or hard, and to its own (status SATURATED); other limits are not seen.
 
     Parameters
     ----------
     predictor
-        z⁺ = A z + B u.
+        z⁺ = A z + B u (+ E w).
     cost
-        Q and R; a terminal weight has no meaning here.
+        Q, R and R_delta; a terminal weight has no meaning here.
     limits
-        Input limits.
+        Input and rate limits.
 
     Raises
     ------
@@ -44,9 +48,13 @@ class LQR:
     def __init__(self, predictor: LinearPredictor, cost: Cost, limits: Limits | None = None) -> None:
         self.predictor, self.cost, self.limits = predictor, cost, limits
         track = tracking(predictor, cost, Limits() if limits is None else limits)
-        Q = track.C.T @ track.Q @ track.C
-        self.gain = stationary(predictor.A, predictor.B, Q, track.R, ITERATIONS)
+        step = one_step(predictor.A, predictor.B, track.C.T @ track.Q @ track.C, track.R, track.R_delta)
+        self.gain = stationary(step.A, step.B, step.Q, step.R, ITERATIONS, step.M)
+        self._K, self._K_rate = np.split(
+            self.gain.K, [predictor.nz], axis=1
+        )  # the second is of u_{k−1} − u_r
         self._targets, self._inputs, self._nr = track.targets, track.inputs, len(track.C)
+        self._rates = track.rates
         self._lift = buffered(predictor.lifting)
         self._reference_key: bytes | None = None
         self._feedforward = np.zeros(self.nu)
@@ -69,38 +77,67 @@ class LQR:
         return 0
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Set the input that is held if the first measurement is bad; by default zero inside the limits."""
-        held = np.zeros(self.nu) if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
-        self._last = np.clip(held, *self._inputs)
+        """Set the last input, from which rates count, and which is held if the first measurement is bad.
 
-    def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
-        """Return u for state y and a reference row (nr,), or rows of which the first counts."""
+        By default it is zero inside the limits.
+        """
+        zero = np.clip(np.zeros(self.nu), *self._inputs)
+        self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+
+    def __call__(
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+    ) -> Move:
+        """Return u for state y and a reference row (nr,), or rows of which the first counts.
+
+        `w` are measured disturbances (nw,), or rows of which the first counts: the target is the one that they push.
+        """
         start = perf_counter()
         x = checks.array(y, "y", (self.predictor.nx,), finite=False)
         target = np.asarray(reference, dtype=np.float64)
-        key = target.tobytes()
+        push = None if w is None else self._push(np.asarray(w, dtype=np.float64))
+        key = target.tobytes() if push is None else target.tobytes() + push.tobytes()
         if key != self._reference_key:
-            self._aim(target)
+            self._aim(target, push)
             self._reference_key = key
         if applied is not None:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
-            if np.isfinite(got).all():
-                self._last = np.clip(got, *self._inputs)
-        free = self._feedforward - self.gain.K @ self._lift(x)[0]
+            if (np.abs(got) < HUGE).all():
+                self._last = got
+        free = self._feedforward - self._K @ self._lift(x)[0]
+        if self._K_rate.size:
+            free -= self._K_rate @ self._last
         if not (np.abs(free) < HUGE).all():
+            self._last = admitted(self._last, self._inputs, self._rates, self._last)
             return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
-        u = np.clip(free, *self._inputs)
+        u = admitted(free, self._inputs, self._rates, self._last)
         status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED
         self._last = u
         return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
 
-    def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
+    def _push(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nz"]:
+        """Return E w, NaN where w cannot be."""
+        row = w[0] if w.ndim == 2 and len(w) else w
+        if row.shape != (self.predictor.nw,):
+            raise ShapeError(
+                f"w has shape {w.shape}, the predictor has {self.predictor.nw} disturbances; pass one value each"
+            )
+        return self.predictor.E @ np.where(np.abs(row) < HUGE, row, np.nan)
+
+    def _aim(self, reference: Float[np.ndarray, "..."], push: Float[np.ndarray, " nz"] | None) -> None:
         """Set the feedforward u_r + K z_r."""
         row = reference_rows(reference, 0, self._nr)
-        if not np.isfinite(row).all():
+        if not np.isfinite(row).all() or (push is not None and not np.isfinite(push).all()):
             self._feedforward = np.full(self.nu, np.nan)
             return
-        alpha = self._targets.coordinates(row)[0]
-        z_r = self._targets.z0 + self._targets.Z @ alpha
-        u_r = self._targets.u0 + self._targets.W @ alpha
-        self._feedforward = u_r + self.gain.K @ z_r
+        found = self._targets
+        alpha = found.coordinates(row, push)[0]
+        z_r, u_r = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
+        if push is not None:
+            z_r, u_r = z_r + found.z_push @ push, u_r + found.u_push @ push
+        self._feedforward = u_r + self._K @ z_r
+        if self._K_rate.size:
+            self._feedforward += self._K_rate @ u_r

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dpotrs
 
 from koopmpc import checks
 from koopmpc.errors import DataError, DefinitenessError
@@ -108,7 +109,7 @@ def recursion(
         p = p if e is None else p + P @ e
         K[k], L[k], P = _step(A, B, Q, R, P, M)
         g = B.T @ p if r is None else B.T @ p + r
-        v[k] = -scipy.linalg.cho_solve((L[k], True), g)
+        v[k] = -_solved(L[k], g)
         p = A.T @ p - K[k].T @ g if q is None else q + A.T @ p - K[k].T @ g
     return Law(K, L, v)
 
@@ -191,11 +192,16 @@ def _step(
             f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state"
             " that every input moves"
         ) from error
-    K = scipy.linalg.cho_solve((L, True), BP @ A if M is None else BP @ A + M.T)
+    K = _solved(L, BP @ A if M is None else BP @ A + M.T)
     P = Q + A.T @ (P @ (A - B @ K))
     if M is not None:
         P = P - M @ K
     return K, L, 0.5 * (P + P.T)
+
+
+def _solved(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> Float[np.ndarray, "nu n"]:
+    """Return S⁻¹ right for S = L Lᵀ; LAPACK itself, for SciPy's own checks take ten times as long."""
+    return np.ascontiguousarray(dpotrs(L, right, lower=1)[0])
 
 
 _UNSTABILISABLE = (

@@ -78,3 +78,46 @@ def test_messages():
     ):
         with pytest.raises(error, match=text):
             call()
+
+
+def test_with_a_weight_on_rates_it_is_the_unconstrained_mpc():
+    cost = km.Cost([2, 1], 0.1, R_delta=0.4)
+    model = linear(A, B, constant=[0.01, -0.02])
+    lqr, mpc = km.LQR(model, cost), km.KoopmanMPC(model, cost, horizon=60)
+    held = np.linalg.solve(np.eye(2) - A, B @ [0.1] + [0.01, -0.02])
+    x = np.array([0.4, -0.3])
+    for controller in (lqr, mpc):
+        controller.reset(u_prev=[0.2])
+    for _ in range(10):
+        u = mpc(x, held).u
+        np.testing.assert_allclose(lqr(x, held).u, u, atol=1e-6)
+        x = A @ x + B @ u + [0.01, -0.02]
+
+
+def test_rates_are_clipped():
+    lqr = km.LQR(linear(A, B), km.Cost([2, 1], 0.1), km.Limits(-0.5, 0.7, du_max=0.1))
+    lqr.reset(u_prev=[0.0])
+    us = [lqr([-0.9, 0.4], [0, 0]) for _ in range(9)]
+    np.testing.assert_allclose(np.diff([0.0, *(move.u[0] for move in us)])[:7], 0.1)
+    assert us[0].status is km.Status.SATURATED
+    assert us[-1].u[0] == 0.7
+    np.testing.assert_allclose(lqr([-0.9, 0.4], [0, 0], applied=[0.3]).u, [0.4])
+    np.testing.assert_allclose(lqr([-0.9, 0.4], [0, 0], applied=[9.0]).u, [0.7])  # the box wins
+    np.testing.assert_allclose(lqr([np.nan, 0], [0, 0]).u, [0.7])
+
+
+def test_a_measured_disturbance_moves_the_target():
+    plain = linear(A, B)
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, plain.states, plain.inputs, E=[[0.1], [0.3]])
+    lqr, push = km.LQR(model, km.Cost([2, 1], 0.1)), np.array([0.1, 0.3]) * 0.2
+    held = np.linalg.solve(np.eye(2) - A, B @ [0.1] + push)
+    x = np.zeros(2)
+    for k in range(300):
+        w = [0.2] if k % 2 else [[0.2], [0.7]]
+        x = A @ x + B @ lqr(x, held, w=w).u + push
+    np.testing.assert_allclose(x, held, atol=1e-9)
+    assert lqr(x, held, w=[np.nan]).status is km.Status.BAD_MEASUREMENT
+    with pytest.raises(
+        km.ShapeError, match=r"w has shape \(2,\), the predictor has 1 disturbances; pass one value"
+    ):
+        lqr(x, held, w=[0, 0])
