@@ -132,25 +132,38 @@ def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
     assert load_run(tmp_path / "seen.rrd") == run
 
 
-def test_a_viewer_that_dies_costs_one_warning_and_no_step(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    run, port = make_run(T=40), free_port()
-    viewer = start_viewer("--serve-grpc", port=port)
+_DYING = """
+import sys, time, warnings
+sys.path.insert(0, {root!r})
+from tests.recording.runs import about, make_run, steps_of
+from koopmpc.recording.connect import start_viewer
+from koopmpc.recording.recorder import Recorder
+run = make_run(T=40)
+viewer = start_viewer("--serve-grpc", port={port})
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    with Recorder({path!r}, live=True, port={port}, **about(run)) as recorder:
+        for step in steps_of(run):
+            recorder(step)
+            time.sleep(0.02)
+            if step.k == 15:
+                viewer.kill()
+                viewer.wait()
+for warning in caught:
+    print(warning.category.__name__, warning.message)
+"""
 
-    def loop() -> None:
-        with Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
-            for step in steps_of(run):
-                recorder(step)
-                time.sleep(0.02)
-                if step.k == 15:
-                    viewer.kill()
-                    viewer.wait()
 
-    with pytest.warns(UserWarning, match=rf"the recording to .*{port}/proxy is not complete") as caught:
-        loop()
-    assert len(caught) == 1
-    assert load_run(tmp_path / "run.rrd") == run
+def test_a_viewer_that_dies_costs_one_warning_and_no_step(tmp_path: Path) -> None:
+    """In a process of its own: Rerun prints what it thinks of it when the process ends."""
+    path, root, port = tmp_path / "run.rrd", str(Path(__file__).parents[2]), free_port()
+    code = _DYING.format(root=root, path=str(path), port=port)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    (said,) = done.stdout.splitlines()
+    assert said.startswith(
+        f"UserWarning the recording to rerun+http://127.0.0.1:{port}/proxy is not complete"
+    )
+    assert load_run(path) == make_run(T=40)
 
 
 def test_a_scene_that_raises_is_told_and_does_not_reach_the_loop(tmp_path: Path) -> None:
