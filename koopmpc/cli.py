@@ -1,5 +1,9 @@
 """The command line: each command parses, calls one function, and prints."""
 
+import os
+import shlex
+import shutil
+import sys
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -11,14 +15,13 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from koopmpc.errors import FitWarning, KoopmpcError
+from koopmpc.errors import FitWarning, KoopmpcError, LogError
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
 
 app = typer.Typer(
     name="koopmpc",
-    help="From a CasADi model or from data to a constrained controller with a lifted linear predictor.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -34,6 +37,24 @@ Controllers = Annotated[
     list[str] | None,
     typer.Option("--controller", "-c", help="One of the six; may be repeated. Default: all."),
 ]
+
+
+def _version(asked: bool) -> bool:
+    if asked:
+        from importlib.metadata import version
+
+        _console().print(f"koopmpc {version('koopmpc')}", highlight=False)
+        raise typer.Exit
+    return asked
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """From a CasADi model or from data to a constrained controller with a lifted linear predictor."""
 
 
 @app.command("list")
@@ -119,6 +140,7 @@ def _sweep(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from koopmpc.bench.controllers import chosen
+    from koopmpc.bench.results import telling
     from koopmpc.bench.sweep import sweep
     from koopmpc.bench.table import table
 
@@ -140,12 +162,28 @@ def _sweep(
     out = _console()
     out.print(table(rows))
     out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
-    logged = [row for row in rows if row.log is not None]
-    if logged:
-        shown = next((row for row in logged if row.controller == "koopman-mpc"), logged[0])
-        out.print(Text(f"look at a run: koopmpc view {shown.log}"), soft_wrap=True)
+    shown = telling(rows)
+    if shown is not None:
+        out.print(Text(f"look at a run: {shlex.join([*_program(), 'view', str(shown.log)])}"), soft_wrap=True)
     if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
+
+
+def _program() -> list[str]:
+    """Return how this program is called from the current folder, where the shell may not find it by its name."""
+    beside = shutil.which("koopmpc", path=str(Path(sys.executable).parent))
+    if beside is None:
+        return [_near(sys.executable), "-m", "koopmpc"]
+    known = shutil.which("koopmpc")
+    return ["koopmpc" if known is not None and Path(known).samefile(beside) else _near(beside)]
+
+
+def _near(path: str) -> str:
+    """Return the path from the current folder where that is shorter."""
+    try:
+        return min(os.path.relpath(path), path, key=len)
+    except ValueError:  # on another drive
+        return path
 
 
 def _console() -> Console:
@@ -164,6 +202,10 @@ def _new_folder(logs: Path, what: str) -> Path:
             folder.mkdir(parents=True)
         except FileExistsError:
             tries += 1
+        except OSError as error:
+            raise LogError(
+                f"--logs {logs}: no folder can be made there, {error.strerror}; pass a folder that you may write to"
+            ) from error
         else:
             return folder
 

@@ -1,15 +1,18 @@
 """The command line: exit codes, messages on stderr, files where they are said to be."""
 
 import os
+import shlex
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from koopmpc.bench.controllers import CONTROLLERS
 from koopmpc.bench.faults import FAULTS
-from koopmpc.cli import app
+from koopmpc.cli import _program, app
 from koopmpc.loop.metrics import metrics
 from koopmpc.recording.reader import load_run
 from tests.bench.tiny import write
@@ -43,7 +46,35 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
     assert "tiny:near" in result.stdout
     assert "does not reach" in result.stdout  # six steps are too few, and that is no failure
     assert f"logs{os.sep}{folder.name}" in result.stdout
-    assert f"koopmpc view logs{os.sep}{folder.name}{os.sep}tiny-near-koopman-mpc.rrd" in result.stdout
+    *program, view, log = shlex.split(result.stdout.split("look at a run: ")[1])
+    assert (view, log) == ("view", f"logs{os.sep}{folder.name}{os.sep}tiny-near-koopman-mpc.rrd")
+    shown = subprocess.run([*program, "inspect", log], capture_output=True, text=True, cwd=tmp_path)
+    assert shown.stdout.startswith("tiny near koopman-mpc")  # what is printed can be called as it stands
+
+
+def test_a_program_on_the_path_is_called_by_its_name(call, tmp_path, monkeypatch):
+    folder = Path(sys.executable).parent
+    monkeypatch.setenv("PATH", str(folder))
+    assert _program() == ["koopmpc"]
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.chdir(folder.parent)
+    assert [Path(part) for part in _program()] == [Path(folder.name) / "koopmpc"]
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    assert _program()[-2:] == ["-m", "koopmpc"]
+
+
+def test_the_version_is_shown(call):
+    result = call("--version")
+    assert (result.exit_code, result.stdout.strip()) == (0, f"koopmpc {version('koopmpc')}")
+
+
+@pytest.mark.parametrize("logs", ["note", "note/deeper", "/proc/logs"])
+def test_logs_that_cannot_be_written_name_the_option(call, tmp_path, logs):
+    (tmp_path / "note").write_text("a file")
+    result = call("run", f"{write(tmp_path)}:far", "-c", "lqr", "--logs", logs)
+    assert result.exit_code == 2
+    assert f"LogError: --logs {logs}: no folder can be made there, " in result.stderr
+    assert result.stdout == ""
 
 
 def test_run_takes_a_name_in_problems_and_one_case(call, tmp_path):
@@ -111,6 +142,16 @@ def test_mistakes_are_one_message_on_stderr_exit_two_and_leave_nothing(call, tmp
     assert "Traceback" not in result.output
     assert result.stdout == ""
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_problem_that_exits_is_shown_in_the_list_and_refused_by_run(call, tmp_path):
+    write(tmp_path / "problems", "sound")
+    (tmp_path / "problems" / "quitter.py").write_text('"""Quitter: exits."""\nraise SystemExit(3)\n')
+    listed = call("list")
+    assert listed.exit_code == 0
+    assert "quitter.py, line 2: SystemExit: 3" in " ".join(listed.stdout.split())
+    assert "near, far" in listed.stdout
+    assert call("run", "quitter").exit_code == 2
 
 
 def test_a_problem_that_raises_says_where(call, tmp_path):

@@ -1,5 +1,6 @@
 """Row: what one run amounts to, and whether it ended as it should."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from koopmpc.loop.metrics import Metrics, tracking_error
 from koopmpc.loop.run import Run
 
+ORACLE = "nonlinear-mpc"
 REACHED = 0.05  # the band around the reference, as a share of the first weighted error
 _TOLERANCE = 1e-9  # of an input limit, relative
 
@@ -43,6 +45,24 @@ class Row:
     log: Path | None = None
     failure: str | None = None
     fault: str | None = None
+
+
+def telling(rows: Sequence[Row]) -> Row | None:
+    """Return the run to look at first: koopman-mpc where it reaches and costs most beside the oracle.
+
+    Without an oracle, or where koopman-mpc reaches nowhere, its first run; without one, any that has a log.
+    """
+    logged = [row for row in rows if row.log is not None and row.fault is None]
+    koopman = [row for row in logged if row.controller == "koopman-mpc"]
+    oracle = {
+        (row.problem, row.case): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics
+    }
+
+    def ratio(row: Row) -> float:
+        best = oracle.get((row.problem, row.case), 0.0)
+        return row.metrics.cost / best if row.reached and row.metrics is not None and best > 0 else 0.0
+
+    return max(koopman, key=ratio) if koopman else next(iter(logged), None)
 
 
 def failures(run: Run, steps: int) -> list[str]:

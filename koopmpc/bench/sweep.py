@@ -108,27 +108,48 @@ def sweep(
 
 
 def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> Row:
-    """Run, log, read back and judge; whatever is raised on the way becomes the row's failure."""
+    """Run, judge, log and read back; whatever is raised on the way becomes the row's failure."""
     problem, (case, name, fault) = parts.problem.name, task
     log = folder / ("-".join((problem, *filter(None, task))) + ".rrd")
     try:
-        run = _run(parts, task, log, live)
-        found = failures(run, parts.problem.cases[case].steps)
+        run, drawn = _run(parts, task, live)
+        judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[case].steps)
+    except Exception as error:  # one run must not take the others with it; the exit code says so
+        return Row(problem, case, name, failure=_told(error, log), fault=fault)
+    try:
+        found += _recorded(run, log, drawn)
         if load_run(log) != run:
             found.append(f"{log.name} does not read back equal to the run")
-        training = parts.training_time if name in LEARNED else 0.0
-        failure = "; ".join(found) or None
-        return Row(problem, case, name, metrics(run), reached(run), training, log, failure, fault)
-    except Exception as error:  # one run must not take the others with it; the exit code says so
-        trace = log.with_suffix(".txt")
-        trace.write_text(traceback.format_exc())
-        failure = f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
-        kept = log if log.exists() else None
-        return Row(problem, case, name, log=kept, failure=failure, fault=fault)
+    except Exception as error:  # nor must a log take the figures of its run with it
+        found.append(_told(error, log))
+    if log.exists() and not log.stat().st_size:
+        log.unlink()
+    kept = log if log.exists() else None
+    training = parts.training_time if name in LEARNED else 0.0
+    return Row(problem, case, name, *judged, training, kept, "; ".join(found) or None, fault)
 
 
-def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
-    """Return the run of one controller on one case, written to `log`."""
+def _told(error: Exception, log: Path) -> str:
+    """Return the error as a row tells it; its traceback goes beside the log."""
+    trace = log.with_suffix(".txt")
+    trace.write_text("".join(traceback.format_exception(error)))
+    return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
+
+
+def _recorded(run: Run, log: Path, drawn: dict[str, Any]) -> list[str]:
+    """Write the log; where its scene cannot be drawn, write it without and return why."""
+    try:
+        record(run, log, **drawn)
+    except Exception as error:
+        if drawn["scene"] is None:
+            raise
+        record(run, log, **{**drawn, "scene": None})
+        return [f"the log is without its scene: drawing scene(x, u) raised {_told(error, log)}"]
+    return []
+
+
+def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]:
+    """Return the run of one controller on one case, and what is drawn with it."""
     problem, case, plant = parts.problem, parts.problem.cases[task.case], parts.truth_of(task.case)
     limits = problem.limits_of(task.case)
     controller = CONTROLLERS[task.controller](parts, limits)
@@ -158,17 +179,15 @@ def _run(parts: Prepared, task: _Task, log: Path, live: bool) -> Run:
         )
 
     if not live:
-        run = closed_loop()
-        record(run, log, **drawn)
-        return run
+        return closed_loop(), drawn
     names: dict[str, Any] = {
         "dt": plant.dt,
         "states": plant.states,
         "inputs": plant.inputs,
         "outputs": plant.outputs,
     }
-    with Recorder(log, live=True, **names, **about, **drawn) as recorder:
-        return closed_loop(recorder)
+    with Recorder(live=True, **names, **about, **drawn) as viewer:
+        return closed_loop(viewer), drawn
 
 
 def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:

@@ -10,10 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from koopmpc.bench.fault_table import FAULT_LEGEND, under_faults
-from koopmpc.bench.results import Row
+from koopmpc.bench.results import ORACLE, Row
 from koopmpc.loop.metrics import Metrics, duration
-
-ORACLE = "nonlinear-mpc"
 
 _STATUS = {
     "UNCONSTRAINED": "free",
@@ -31,7 +29,8 @@ LEGEND = (
     "cost: Σ‖x−r‖²_Q + ‖u−u_r‖²_R over the run, u_r the input that holds r, and its ratio to nonlinear-mpc. "
     "settles: time until the weighted error stays below 2 % of its first value; within 5 %, only 5 % is kept "
     "over the last tenth of the run; does not reach, not even that. off: largest entry of x−r at the end. "
-    "over: largest violation of a state or output limit. p50, p99: time of a step. Steps: free, the unconstrained optimum met all limits; "
+    "over: largest violation of a state or output limit. p50, p99: time of a step. Steps: free, the unconstrained "
+    "optimum met all limits; "
     "optimal, a QP or NLP was solved; unfinished, it was not, and a fallback took over; clipped, the feedback was "
     "cut to the input limits."
 )

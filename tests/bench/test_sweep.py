@@ -1,6 +1,7 @@
 """sweep: a row, a log and a verdict for every run; what one run raises stays with that run."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -10,7 +11,7 @@ from koopmpc.bench.controllers import CONTROLLERS, chosen
 from koopmpc.bench.faults import FAULTS, possible
 from koopmpc.bench.library import load_problem
 from koopmpc.bench.prepare import Prepared
-from koopmpc.bench.results import failures, reached
+from koopmpc.bench.results import Row, failures, reached, telling
 from koopmpc.bench.sweep import sweep
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
@@ -18,6 +19,7 @@ from koopmpc.errors import ProblemError
 from koopmpc.loop.metrics import metrics
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder
+from koopmpc.recording.scene import Disk
 from tests.bench.tiny import write
 
 SIX = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "nonlinear-mpc"]
@@ -165,12 +167,71 @@ def test_a_log_that_differs_is_a_failure(swept, tmp_path, monkeypatch):
     assert row.failure == "tiny-far-lqr.rrd does not read back equal to the run"
 
 
+@pytest.mark.parametrize("scene", ["raises", "is no list", "renames"])
+def test_a_scene_that_cannot_be_drawn_costs_the_drawing_and_nothing_else(swept, tmp_path, scene):
+    def drawn(x, u):
+        if scene == "raises" and x[0] < 0.9:
+            raise ZeroDivisionError("division by [zero]")
+        disk = Disk("b" if scene == "renames" and x[0] < 0.9 else "a", (0.0, 0.0), 0.1)
+        return 3 if scene == "is no list" else [disk]
+
+    problem = replace(swept[0].select("far"), scene=drawn)
+    rows = sweep([problem], ["lqr", "koopman-mpc"], folder=tmp_path)
+    whole = {row.controller: row for row in swept[1] if row.case == "far"}
+    for row in rows:
+        assert row.failure.startswith("the log is without its scene: drawing scene(x, u) raised ")
+        assert scene != "raises" or "ZeroDivisionError: division by [zero]" in row.failure
+        assert row.metrics.cost == whole[row.controller].metrics.cost
+        assert np.array_equal(load_run(row.log).U, load_run(whole[row.controller].log).U)
+        assert "drawn" in row.log.with_suffix(".txt").read_text() or scene != "raises"
+
+
+def test_a_log_that_cannot_be_written_takes_no_figures_and_is_not_offered(swept, tmp_path, monkeypatch):
+    def full(run, path, **drawn):
+        path.touch()
+        raise OSError("no space left")
+
+    monkeypatch.setattr("koopmpc.bench.sweep.record", full)
+    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    assert row.failure.startswith("OSError: no space left (the whole traceback is in ")
+    assert row.metrics is not None
+    assert row.log is None
+    assert not list(tmp_path.glob("*.rrd"))
+    assert telling([row]) is None
+
+
+def test_the_run_to_look_at_is_the_hardest_that_koopman_mpc_manages(swept):
+    def ran(case, controller, cost, reached=True, fault=None):
+        figures = replace(swept[1][0].metrics, cost=cost)
+        return Row("p", case, controller, figures, reached, log=Path(f"{case}.rrd"), fault=fault)
+
+    rows = [
+        ran("easy", "lqr", 1.0),
+        ran("easy", "koopman-mpc", 1.01),
+        ran("easy", "nonlinear-mpc", 1.0),
+        ran("hard", "koopman-mpc", 220.0),
+        ran("hard", "nonlinear-mpc", 200.0),
+        ran("lost", "koopman-mpc", 9.0, reached=False),
+        ran("lost", "nonlinear-mpc", 1.0),
+        ran("easy", "koopman-mpc", 5.0, fault="nan-sensor"),
+    ]
+    assert telling(rows) is rows[3]
+    assert telling(rows[:1]) is rows[0]
+    assert telling([rows[1], rows[3]]) is rows[1]
+    assert telling([rows[5]]) is rows[5]
+    assert telling([]) is None
+
+
 class Unseen(Recorder):
     """A Recorder that streams nowhere."""
 
-    def __init__(self, path, *, live, **about):
+    def __init__(self, *, live, **about):
         assert live
-        super().__init__(path, **about)
+        super().__init__(None, live=True, **about)
+
+    def __enter__(self):
+        self._open = True
+        return self
 
 
 def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
