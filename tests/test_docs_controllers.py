@@ -1,0 +1,49 @@
+"""Every Python block of docs/controllers.md runs, one after the other, and the page says what they show."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+TEXT = (Path(__file__).parents[1] / "docs" / "controllers.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def found():
+    names = {}
+    for source in re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL):
+        exec(compile(source, "docs/controllers.md", "exec"), names)
+    return names
+
+
+def test_the_examples_show_what_the_page_says(found):
+    km = found["km"]
+    offsets = []
+    for name in ("mpc", "exact"):
+        run = km.simulate(found["heavy"], found[name], x0=found["x"], reference=[0.5, 0.0], steps=250)
+        offsets.append(abs(run.X[-1, 0] - 0.5))
+    assert offsets[0] > 0.01
+    assert offsets[1] < 1e-6
+    assert abs(found["state"][0] - 0.5) < 1e-3
+    assert found["again"].iterations < found["move"].iterations
+    assert np.abs(found["run"].U).max() <= 25
+
+
+def test_every_row_of_the_table_leads_to_a_part_of_the_page():
+    headings = {
+        re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-")
+        for title in re.findall(r"^#+ (.*)$", TEXT, re.MULTILINE)
+    }
+    links = set(re.findall(r"\]\(#([^)]*)\)", TEXT))
+    assert links
+    assert links <= headings
+
+
+def test_every_source_that_the_table_names_is_at_its_foot():
+    table, foot = TEXT.split("## Sources")
+    named = {
+        key for group in re.findall(r"\[([mdal]\d+(?:, [mdal]\d+)*)\]", table) for key in group.split(", ")
+    }
+    given = set(re.findall(r"\b([mdal]\d+)\b", foot))
+    assert named == given
