@@ -4,8 +4,8 @@ A fault itself holds no state, so the same object serves any number of runs.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -105,12 +105,14 @@ def call(
     applied: ArrayLike | None,
     *,
     solver_fails: bool,
+    **more: ArrayLike,
 ) -> Move:
-    """Return the controller's move, its solver's answer lost if so told and if it has one."""
+    """Return the controller's move, its solver's answer lost if so told and if it has one; `more` is passed on."""
+    ask = cast("Callable[..., Move]", controller)
     if not (solver_fails and isinstance(controller, Fallible)):
-        return controller(y, reference, applied)
+        return ask(y, reference, applied, **more)
     controller.solver_fails = True
     try:
-        return controller(y, reference, applied)
+        return ask(y, reference, applied, **more)
     finally:
         controller.solver_fails = False

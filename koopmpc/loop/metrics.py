@@ -21,14 +21,14 @@ class Metrics(Value):
     Attributes
     ----------
     cost
-        Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, no dt; NaN where the run has no Cost
-        or no state.
+        Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, and with R_delta
+        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}; no dt; NaN where the run has no Cost or no state.
     tracking_rmse
         Root-mean-square of each tracked output's error over k = 1 … T, in its unit.
     final_error
         Each tracked output's error at T.
     violation
-        Largest violation of any state or output limit, in the unit of that limit.
+        Largest violation of any state, output or rate limit, in the unit of that limit.
     input_violation
         Largest violation of any input limit; a controller keeps it at zero.
     effort
@@ -94,12 +94,14 @@ def metrics(run: Run) -> Metrics:
     nr, nu = error.shape[1], run.U.shape[1]
     Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
     stage = np.einsum("ki,ij,kj->k", error, Q, error)
-    moved = run.U - run.u_reference
+    moved, changed = run.U - run.u_reference, np.diff(run.U, axis=0)
+    R_delta = None if run.cost is None else run.cost.rate(nu)
+    rates = 0.0 if R_delta is None else float(np.einsum("ki,ij,kj->", changed, R_delta, changed))
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
     return Metrics(
         cost=float("nan")
         if run.cost is None
-        else float(stage[1:].sum() + np.einsum("ki,ij,kj->", moved, R, moved)),
+        else float(stage[1:].sum() + np.einsum("ki,ij,kj->", moved, R, moved)) + rates,
         tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
         final_error=error[-1].copy(),
         violation=_violation(run),
@@ -145,7 +147,10 @@ def _violation(run: Run) -> float:
     if run.limits is None:
         return 0.0
     X = _states(run)[1:]
+    rates = run.limits.rates(run.U.shape[1])
     worst = _excess(X, *run.limits.states(X.shape[1]))
+    if rates is not None:
+        worst = max(worst, _excess(np.diff(run.U, axis=0), *rates))
     if run.limits.of is not None:
         outputs = run.limits.of.bind(run.states)(X)
         worst = max(worst, _excess(outputs, *run.limits.outputs(outputs.shape[1])))

@@ -35,6 +35,16 @@ def held_inputs(u_reference: ArrayLike | None, steps: int, nu: int) -> Float[np.
     return checks.array(values, "u_reference", (steps, nu))
 
 
+def measured_rows(measured: ArrayLike, steps: int, horizon: int) -> Float[np.ndarray, "T nw"]:
+    """Return steps + horizon rows of measured disturbances, the last one repeated."""
+    rows = np.atleast_1d(checks.array(measured, "measured"))
+    if rows.ndim == 1:
+        rows = np.broadcast_to(rows, (steps, len(rows)))
+    if rows.ndim != 2 or len(rows) != steps:
+        raise ShapeError(f"measured has shape {rows.shape}, expected (nw,) or (steps, nw) = ({steps}, nw)")
+    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
+
+
 def signal_of(
     signal: Signal | None, name: str, rows: int, n: int
 ) -> Callable[[int, np.random.Generator], Float[np.ndarray, " n"]] | None:

@@ -15,7 +15,7 @@ from koopmpc.control.move import Controller, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.injection import Fault, Injections, Wiring, call, named
 from koopmpc.loop.run import Plans, Run
-from koopmpc.loop.signals import Signal, held_inputs, noise_of, reference_rows, signal_of
+from koopmpc.loop.signals import Signal, held_inputs, measured_rows, noise_of, reference_rows, signal_of
 from koopmpc.plant.simulated import Plant, SimulatedPlant, require_plant
 from koopmpc.plant.step_map import StepMap
 
@@ -61,6 +61,7 @@ def simulate(
     u_reference: ArrayLike | None = None,
     disturbance: Signal | None = None,
     noise: Signal | None = None,
+    measured: ArrayLike | None = None,
     faults: Sequence[Fault] = (),
     rng: np.random.Generator | int = 0,
     observers: Sequence[Observer] = (),
@@ -89,6 +90,10 @@ def simulate(
         d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
     noise
         n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
+    measured
+        w_k, (nw,) or (steps, nw): disturbances that the controller is told as `w`, rows k … k+horizon−1, the last
+        one repeated; with ``preview=False`` row k throughout. What they do to the plant is a `disturbance`, such as
+        W @ E.T. Kept in the metadata.
     faults
         What breaks, see `koopmpc.loop.faults`; a signal passes through them in order, y_k after its noise. Run.Y is
         what the controller got and Run.U what the plant got, which the controller is told at the next step; the
@@ -136,6 +141,9 @@ def simulate(
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
     jitter = noise_of(noise, steps, ny)
     held = held_inputs(u_reference, steps, nu)
+    told = None if measured is None else measured_rows(measured, steps, controller.horizon)
+    if told is not None:
+        metadata = {**(metadata or {}), "measured": told[:steps].tolist()}
     injected = None
     if faults:
         box = (limits or Limits()).inputs(nu)
@@ -155,10 +163,9 @@ def simulate(
     for k in range(steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, rows.shape[1]))
         applied = U[k - 1] if k else None
-        if injected is None:
-            move = controller(Y[k].copy(), ahead, applied)
-        else:
-            move = call(controller, Y[k].copy(), ahead, applied, solver_fails=injected.solver_fails(k))
+        more = {} if told is None else {"w": told[k : k + max(N, 1)] if preview else told[k]}
+        fails = injected is not None and injected.solver_fails(k)
+        move = call(controller, Y[k].copy(), ahead, applied, solver_fails=fails, **more)
         if k == 0:
             checks.members(move, "what the controller returned", ("u", *_MOVE), "return a km.Move")
         if np.shape(move.u) != (nu,):

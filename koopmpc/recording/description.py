@@ -100,15 +100,9 @@ def to_markdown(about: About) -> str:
     lines += [f"**States** {', '.join(about.states)}  ", f"**Inputs** {', '.join(about.inputs)}  "]
     lines += [f"**Sampling time** {about.dt:g} s", ""]
     if about.cost is not None:
-        lines += [
-            "| cost | value |",
-            "|---|---|",
-            *_table(about.cost, ("Q", "R", "Q_N", "of", "u_target"), about),
-            "",
-        ]
+        lines += ["| cost | value |", "|---|---|", *_table(about.cost, about), ""]
     if about.limits is not None:
-        names = ("u_min", "u_max", "x_min", "x_max", "of", "y_min", "y_max", "slack")
-        lines += ["| limits | value |", "|---|---|", *_table(about.limits, names, about), ""]
+        lines += ["| limits | value |", "|---|---|", *_table(about.limits, about), ""]
     rows = [(key, value) for key, value in about.metadata.items() if key != "title"]
     rows.append(("written with", _versions()))
     lines += ["| run | value |", "|---|---|", *(f"| {key} | {_short(value)} |" for key, value in rows), ""]
@@ -135,8 +129,8 @@ def metrics_to_markdown(metrics: Metrics, tracked: tuple[str, ...]) -> str:
     return "\n".join(["| metric | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
 
 
-def _table(value: Value, names: tuple[str, ...], about: About) -> list[str]:
-    pairs = [(name, getattr(value, name)) for name in names]
+def _table(value: Cost | Limits, about: About) -> list[str]:
+    pairs = [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)]
     pairs = [(n, ", ".join(v.bind(about.states).names) if isinstance(v, Lifting) else v) for n, v in pairs]
     return [f"| {name} | {_short(v)} |" for name, v in pairs if v is not None]
 
