@@ -21,6 +21,7 @@ from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder
 from koopmpc.recording.scene import Disk
 from tests.bench.tiny import write
+from tests.control.kkt import CheckedOSQP
 
 SIX = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "nonlinear-mpc"]
 
@@ -93,6 +94,12 @@ def test_a_run_is_the_same_when_it_is_repeated(swept, tmp_path):
     again = sweep([problem.select("near")], ["koopman-mpc"], folder=tmp_path)
     first = next(row for row in rows if (row.case, row.controller) == ("near", "koopman-mpc"))
     assert np.array_equal(load_run(again[0].log).U, load_run(first.log).U)
+
+
+def test_the_qps_of_a_sweep_are_held_to_their_kkt_conditions(swept, tmp_path):
+    before = CheckedOSQP.checked
+    sweep([swept[0].select("far")], ["koopman-mpc", "linear-mpc"], folder=tmp_path)
+    assert CheckedOSQP.checked > before
 
 
 def test_data_and_model_are_made_once(swept):
