@@ -1,4 +1,4 @@
-"""The examples in docs/problems.md and docs/faults.md run as they stand."""
+"""The examples in README, docs/problems.md and docs/faults.md run as they stand."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,24 @@ import numpy as np
 
 from koopmpc.bench.faults import FAULTS
 from koopmpc.bench.library import load_problem
+from koopmpc.bench.results import reached
 from koopmpc.bench.sweep import sweep
+from koopmpc.loop.metrics import metrics
+from koopmpc.recording.reader import load_run
+
+
+def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypatch, capsys):
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    found = {}
+    exec(source, found)
+    run = found["run"]
+    assert load_run("pendulum.rrd") == run
+    assert capsys.readouterr().out == f"{metrics(run)}\n"
+    assert reached(run)
+    assert np.abs(run.U).max() <= 25
+    assert {status.name for status in run.status} <= {"UNCONSTRAINED", "OPTIMAL"}
 
 
 def test_the_example_of_the_documentation_runs_and_reaches(tmp_path):
