@@ -25,19 +25,22 @@ class Episode(Value):
         (T+1, nx), time down.
     U
         (T, nu); without it the plant is autonomous and nu is 0.
+    W
+        (T, nw) disturbances w_0 … w_{T−1} that were measured; without it nw is 0.
 
     Raises
     ------
     ShapeError
-        X has not one row more than U.
+        X has not one row more than U and W.
     DataError
         There is NaN or inf.
     """
 
     U: Float[np.ndarray, "T nu"]
     X: Float[np.ndarray, "T+1 nx"]
+    W: Float[np.ndarray, "T nw"]
 
-    def __init__(self, *, X: ArrayLike, U: ArrayLike | None = None) -> None:
+    def __init__(self, *, X: ArrayLike, U: ArrayLike | None = None, W: ArrayLike | None = None) -> None:
         states = checks.array(X, "X", (None, None))
         if len(states) == 0:
             raise ShapeError("X has no row; an episode holds x_0 at least")
@@ -47,8 +50,12 @@ class Episode(Value):
                 f"U has {len(inputs)} rows and X {len(states)}: X must have one row more than U; "
                 "x_0 … x_T, u_0 … u_{T-1}"
             )
+        disturbances = np.empty((len(inputs), 0)) if W is None else checks.array(W, "W", (None, None))
+        if len(disturbances) != len(inputs):
+            raise ShapeError(f"W has {len(disturbances)} rows and U {len(inputs)}; both have one a step")
         object.__setattr__(self, "U", inputs)
         object.__setattr__(self, "X", states)
+        object.__setattr__(self, "W", disturbances)
 
     def __len__(self) -> int:
         """Return the number of steps T."""
@@ -75,16 +82,18 @@ class Episodes(Value):
     Parameters
     ----------
     episodes
-        At least one, each of at least one step, all with the same nx and nu.
+        At least one, each of at least one step, all with the same nx, nu and nw.
     dt
         Sample time [s].
     states, inputs
         Names with units; ``x0, x1, …`` and ``u0, u1, …`` by default.
+    disturbances
+        Names of the measured disturbances with units; ``w0, w1, …`` by default.
 
     Raises
     ------
     ShapeError
-        The episodes, or the names, differ in nx or nu.
+        The episodes, or the names, differ in nx, nu or nw.
     DataError
         There is no episode, one is too short, dt is not above zero, or a name is used twice.
     """
@@ -93,6 +102,7 @@ class Episodes(Value):
     dt: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
 
     def __init__(
         self,
@@ -100,6 +110,7 @@ class Episodes(Value):
         dt: float,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
+        disturbances: Sequence[str] | None = None,
     ) -> None:
         if not isinstance(cast(object, episodes), Sequence):
             raise DataError(f"episodes is a {type(episodes).__name__}; pass a list of Episode(X=…, U=…)")
@@ -108,7 +119,7 @@ class Episodes(Value):
         for i, episode in enumerate(episodes):
             if not isinstance(cast(object, episode), Episode):
                 raise DataError(f"episode {i} is a {type(episode).__name__}; pass Episode(X=…, U=…)")
-        nx, nu = episodes[0].X.shape[1], episodes[0].U.shape[1]
+        nx, nu, nw = episodes[0].X.shape[1], episodes[0].U.shape[1], episodes[0].W.shape[1]
         for i, episode in enumerate(episodes):
             if len(episode) < 1:
                 raise DataError(
@@ -121,11 +132,18 @@ class Episodes(Value):
                     f"episode {i} has {own[0]} states and {own[1]} inputs, episode 0 has {nx} and {nu}; "
                     "episodes of one set come from one plant"
                 )
+            if episode.W.shape[1] != nw:
+                raise ShapeError(
+                    f"episode {i} has {episode.W.shape[1]} measured disturbances, episode 0 has {nw}; "
+                    "measure the same ones throughout"
+                )
         object.__setattr__(self, "episodes", tuple(episodes))
         object.__setattr__(self, "dt", checks.positive(dt, "dt", "s"))
         object.__setattr__(self, "states", _names(states, "states", "x", nx))
         object.__setattr__(self, "inputs", _names(inputs, "inputs", "u", nu))
-        repeated = [name for name, n in Counter(self.states + self.inputs).items() if n > 1]
+        object.__setattr__(self, "disturbances", _names(disturbances, "disturbances", "w", nw))
+        names = self.states + self.inputs + self.disturbances
+        repeated = [name for name, n in Counter(names).items() if n > 1]
         if repeated:
             raise DataError(f"two states or inputs are named {repeated[0]!r}; rename one")
 
@@ -138,6 +156,11 @@ class Episodes(Value):
     def nu(self) -> int:
         """Number of inputs."""
         return len(self.inputs)
+
+    @property
+    def nw(self) -> int:
+        """Number of measured disturbances."""
+        return len(self.disturbances)
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -162,6 +185,7 @@ class Episodes(Value):
         for mine, theirs, what in (
             (self.states, other.states, "states"),
             (self.inputs, other.inputs, "inputs"),
+            (self.disturbances, other.disturbances, "disturbances"),
         ):
             if mine != theirs:
                 raise DataError(
@@ -176,6 +200,13 @@ class Episodes(Value):
             U=np.concatenate([episode.U for episode in self.episodes]),
             X_next=np.concatenate([episode.X[1:] for episode in self.episodes]),
         )
+
+    def driven(self) -> "Episodes":
+        """Return the same with the measured disturbances behind the inputs: both drive the plant."""
+        if not self.nw:
+            return self
+        joined = [Episode(X=e.X, U=np.hstack([e.U, e.W])) for e in self.episodes]
+        return Episodes(joined, self.dt, self.states, self.inputs + self.disturbances)
 
     def split(self, fraction: float, rng: np.random.Generator | int = 0) -> "tuple[Episodes, Episodes]":
         """Return (train, held_out): whole episodes drawn at random, of which `fraction` trains.
@@ -213,7 +244,7 @@ class Episodes(Value):
         save_episodes(self, path)
 
     def _of(self, episodes: Sequence[Episode]) -> "Episodes":
-        return Episodes(episodes, self.dt, self.states, self.inputs)
+        return Episodes(episodes, self.dt, self.states, self.inputs, self.disturbances)
 
 
 def _names(names: Sequence[str] | None, what: str, letter: str, count: int) -> tuple[str, ...]:

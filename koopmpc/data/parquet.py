@@ -92,7 +92,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
         raise ValueError("rows are missing or out of order")
     last = step == steps[episode]
     X = [table[name].to_numpy() for name in named["states"]]
-    U = [table[name].to_numpy()[~last] for name in named["inputs"]]
+    U = [table[name].to_numpy()[~last] for name in named["inputs"] + named.get("disturbances", [])]
     return (
         np.stack(X, axis=1),
         np.array(U).reshape(len(U), -1).T if U else np.empty((steps.sum(), 0)),

@@ -21,15 +21,17 @@ def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     file = Path(path)
     suffix = _suffix(file)
     X = np.concatenate([episode.X for episode in episodes])
-    U = np.concatenate([episode.U for episode in episodes])
+    driven = episodes.driven()  # U with W behind it
+    U = np.concatenate([episode.U for episode in driven])
     steps = np.array([len(episode) for episode in episodes])
     # Python writes a float so that it reads back to the bit.
-    about = json.dumps({"dt": episodes.dt, "states": episodes.states, "inputs": episodes.inputs})
+    names = {"states": episodes.states, "inputs": episodes.inputs, "disturbances": episodes.disturbances}
+    about = json.dumps({"dt": episodes.dt, **names})
     if suffix == ".parquet":
-        parquet.check_names(episodes.states + episodes.inputs)
+        parquet.check_names(driven.states + driven.inputs)
     with checks.writing(file) as stream:
         if suffix == ".parquet":
-            parquet.write(stream, X, U, steps, episodes.states + episodes.inputs, about)
+            parquet.write(stream, X, U, steps, driven.states + driven.inputs, about)
         else:
             np.savez(stream, X=X, U=U, steps=steps, about=np.array(about))
 
@@ -79,10 +81,13 @@ def _read(
     try:
         X, U, steps, text = parquet.read(file) if suffix == ".parquet" else _read_npz(file)
         about = json.loads(text)
+        disturbances = about.get("disturbances", [])
+        nu = U.shape[1] - len(disturbances)
         parts_X = np.split(X, np.cumsum(steps + 1)[:-1])
         parts_U = np.split(U, np.cumsum(steps)[:-1])
-        episodes = [Episode(X=one, U=other) for one, other in zip(parts_X, parts_U, strict=True)]
-        return Episodes(episodes, about["dt"], about["states"], about["inputs"])
+        parts = zip(parts_X, parts_U, strict=True)
+        episodes = [Episode(X=one, U=other[:, :nu], W=other[:, nu:]) for one, other in parts]
+        return Episodes(episodes, about["dt"], about["states"], about["inputs"], disturbances)
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"{file} holds no episodes that can be read: {error}; {parquet.ADVICE}") from error
 

@@ -55,6 +55,8 @@ def bilinear_edmd(
     """
     if episodes_of(episodes).nu == 0:
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
+    if episodes.nw:
+        raise DataError("the episodes hold measured disturbances, which a bilinear fit leaves out; use edmd")
     ridge = float(checks.array(ridge, "ridge", ()))
     if ridge < 0:
         raise DataError(f"ridge is {ridge:g}; it must be 0 or above")

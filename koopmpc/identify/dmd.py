@@ -72,6 +72,10 @@ def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = N
     """
     if episodes_of(episodes).nu == 0:
         raise DataError("the episodes have no inputs; pass them to dmd, or give each Episode its U")
+    if episodes.nw:
+        raise DataError(
+            "the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()"
+        )
     known = None if B is None else checks.array(B, "B", (episodes.nx, episodes.nu))
     return fit(_regression(episodes, "dmdc", inputs=episodes.inputs, B=known), rank=rank)
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.identify.fit import Regression, fit
 from koopmpc.identify.moments import Moments, moments
 from koopmpc.identify.solve import solve
@@ -14,7 +14,7 @@ from koopmpc.predict.linear import LinearPredictor
 def edmd(
     episodes: Episodes, lifting: Lifting, *, ridge: float = 0.0, rank: int | None = None
 ) -> LinearPredictor:
-    """Fit ψ(x⁺) = A ψ(x) + B u by least squares on M snapshot pairs, with inputs where the data have them.
+    """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
 
     Nothing is added to the lifting: no state, no constant. C picks the states where the lifting holds them,
     by name, else it is the least-squares fit of x by ψ(x), its residual in ``report.state_residual``.
@@ -47,8 +47,24 @@ def edmd(
     Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
     25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018.
     """
-    total = moments(episodes, lifting)
-    return fit(regression(total, "edmd"), ridge=ridge, rank=rank)
+    episodes = episodes_of(episodes)
+    fitted = fit(regression(moments(episodes.driven(), lifting), "edmd"), ridge=ridge, rank=rank)
+    if not episodes.nw:
+        return fitted
+    B, E = np.split(fitted.B, [episodes.nu], axis=1)
+    return LinearPredictor(
+        fitted.A,
+        B,
+        fitted.C,
+        fitted.lifting,
+        fitted.dt,
+        fitted.states,
+        episodes.inputs,
+        fitted.report,
+        fitted.exact_modes,
+        E,
+        episodes.disturbances,
+    )
 
 
 def regression(total: Moments, method: str) -> Regression:

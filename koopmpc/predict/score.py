@@ -48,7 +48,7 @@ class Score(Value):
 
 
 def score(predictor: LinearPredictor, episodes: Episodes, horizon: int, *, stride: int = 1) -> Score:
-    """Return the errors of x̂_{k+h} = C z_h, z_{i+1} = A z_i + B u_{k+i}, z_0 = ψ(x_k), h = 1 … horizon.
+    """Return the errors of x̂_{k+h} = C z_h, z_{i+1} = A z_i + B u_{k+i} + E w_{k+i}, z_0 = ψ(x_k), h = 1 … horizon.
 
     Parameters
     ----------
@@ -98,6 +98,8 @@ def _add(
     z = predictor.lift(episode.X[starts])
     for h in range(1, len(error) + 1):
         z = z @ predictor.A.T + episode.U[starts + h - 1] @ predictor.B.T
+        if predictor.nw:
+            z += episode.W[starts + h - 1] @ predictor.E.T
         truth = episode.X[starts + h]
         error[h - 1] += np.sum((z @ predictor.C.T - truth) ** 2, axis=0)
         size[h - 1] += np.sum(truth**2, axis=0)

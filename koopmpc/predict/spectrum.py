@@ -90,9 +90,9 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
         They have another dt, an eigenfunction is 0 on all of them, or A is defective.
     """
     same_names(predictor, episodes)
-    forced = predictor.left_eigenvectors @ predictor.B
+    forced = predictor.left_eigenvectors @ np.hstack([predictor.B, predictor.E])
     error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
-    for episode in episodes:
+    for episode in episodes.driven() if predictor.nw else episodes:
         for first in range(0, len(episode), _ROWS):
             phi = predictor.eigenfunctions(episode.X[first : first + _ROWS + 1])
             gap = phi[1:] - phi[:-1] * predictor.eigenvalues - episode.U[first : first + _ROWS] @ forced.T
@@ -106,10 +106,11 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
 
 
 def same_names(predictor: LinearPredictor, episodes: Episodes) -> None:
-    """Raise where data and predictor differ in states, inputs or dt."""
+    """Raise where data and predictor differ in states, inputs, the disturbances that it knows, or dt."""
     for mine, theirs, what in (
         (predictor.states, episodes.states, "states"),
         (predictor.inputs, episodes.inputs, "inputs"),
+        (predictor.disturbances, episodes.disturbances if predictor.nw else (), "disturbances"),
     ):
         if mine != theirs:
             raise ShapeError(

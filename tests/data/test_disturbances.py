@@ -1,0 +1,109 @@
+"""Measured disturbances in the data, in files, in the fit, and in the predictor."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+A, B, E = np.array([[0.9, 0.1], [-0.2, 0.8]]), np.array([[0.0], [0.1]]), np.array([[0.3, 0.0], [0.1, -0.2]])
+
+
+def data(episodes=6, steps=15, seed=0):
+    rng = np.random.default_rng(seed)
+    runs = []
+    for _ in range(episodes):
+        X, U, W = rng.normal(size=(steps + 1, 2)), rng.normal(size=(steps, 1)), rng.normal(size=(steps, 2))
+        for k in range(steps):
+            X[k + 1] = A @ X[k] + B @ U[k] + E @ W[k]
+        runs.append(km.Episode(X=X, U=U, W=W))
+    return km.Episodes(runs, 0.1, ("a", "b"), ("u",), ("load [N]", "wind [m/s]"))
+
+
+def test_edmd_finds_them():
+    episodes = data()
+    model = km.edmd(episodes, km.State() + km.Constant())
+    np.testing.assert_allclose(model.A[:2, :2], A, atol=1e-12)
+    np.testing.assert_allclose(model.B[:2], B, atol=1e-12)
+    np.testing.assert_allclose(model.E[:2], E, atol=1e-12)
+    assert (model.nu, model.nw) == (1, 2)
+    assert (model.inputs, model.disturbances) == (("u",), ("load [N]", "wind [m/s]"))
+    held_out = data(seed=1)
+    for episode in held_out:
+        np.testing.assert_allclose(model.rollout(episode.X[0], episode.U, episode.W), episode.X, atol=1e-10)
+    assert km.score(model, held_out, 10).total < 1e-10
+    np.testing.assert_allclose(km.linearity_error(model, held_out), 0.0, atol=1e-10)
+    blind = km.LinearPredictor(model.A, model.B, model.C, model.lifting, 0.1, model.states, model.inputs)
+    assert blind.nw == 0
+    assert km.score(blind, held_out, 10).total > 0.1
+    zero = np.zeros((15, 2))
+    np.testing.assert_array_equal(model.rollout([1, 0], episode.U, zero), model.rollout([1, 0], episode.U))
+
+
+def test_a_reduced_fit_keeps_them():
+    model = km.edmd(data(), km.State() + km.Monomials(2), rank=4)
+    assert model.E.shape == (4, 2)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".parquet"])
+def test_files_hold_them(tmp_path, suffix):
+    episodes, path = data(), tmp_path / f"data{suffix}"
+    episodes.save(path)
+    assert km.load_episodes(path) == episodes
+    half = episodes[:3]
+    assert half.disturbances == episodes.disturbances
+    assert half + episodes[3:] == episodes
+    assert all(part.nw == 2 for part in episodes.split(0.5))
+    model = km.edmd(episodes, km.State())
+    model.save(tmp_path / "model.npz")
+    assert km.load_predictor(tmp_path / "model.npz") == model
+
+
+def test_messages():
+    X, U = np.zeros((4, 2)), np.zeros((3, 1))
+    one, other = km.Episode(X=X, U=U, W=np.zeros((3, 1))), km.Episode(X=X, U=U)
+    assert other.W.shape == (3, 0)
+    model = km.edmd(data(), km.State())
+    named = km.Episodes([one], 0.1, ("a", "b"), ("u",), ("gust",))
+    for error, text, call in (
+        (
+            km.ShapeError,
+            r"W has 2 rows and U 3; both have one a step",
+            lambda: km.Episode(X=X, U=U, W=[[0], [0]]),
+        ),
+        (
+            km.ShapeError,
+            r"episode 1 has 0 measured disturbances, episode 0 has 1; measure the same ones throughout",
+            lambda: km.Episodes([one, other], 0.1),
+        ),
+        (
+            km.ShapeError,
+            r"disturbances has 2 names and the data 1 columns",
+            lambda: km.Episodes([one], 0.1, disturbances=("p", "q")),
+        ),
+        (km.DataError, r"which dmdc does not fit; use edmd on State\(\)", lambda: km.dmdc(data())),
+        (km.DataError, r"a bilinear fit leaves out; use edmd", lambda: km.bilinear_edmd(data(), km.State())),
+        (
+            km.ShapeError,
+            r"the episodes have disturbances \(gust\), the predictor has \(load \[N\], wind \[m/s\]\)",
+            lambda: km.score(model, named, 2),
+        ),
+        (
+            km.DataError,
+            r"the episodes differ in disturbances: gust and w0",
+            lambda: named + km.Episodes([one], 0.1, ("a", "b"), ("u",)),
+        ),
+        (
+            km.ShapeError,
+            r"W has shape \(3, 1\), expected \(3, 2\)",
+            lambda: model.rollout([0, 0], U, [[0]] * 3),
+        ),
+        (
+            km.ShapeError,
+            r"disturbances has 1 names and E 2 columns; give one name each",
+            lambda: km.LinearPredictor(
+                A, B, np.eye(2), km.State(), 0.1, ("a", "b"), ("u",), E=E, disturbances=("p",)
+            ),
+        ),
+    ):
+        with pytest.raises(error, match=text):
+            call()
