@@ -364,3 +364,9 @@ def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path):
     assert not any(row.failure for row in rows)
     assert possible(Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
     assert "actuator-loss" not in possible(Limits(u_min=-np.inf))
+
+
+def test_a_run_that_diverged_reaches_nothing_and_warns_of_nothing(swept):
+    run = load_run(next(row.log for row in swept[1] if row.case == "far"))
+    for value in (np.inf, np.nan, 1e200):
+        assert not reached(replace(run, X=np.full_like(run.X, value)))
