@@ -6,6 +6,7 @@ This file is the table of contents; see README.md for ten lines that use it.
 from koopmpc.bench.library import list_problems, load_problem
 from koopmpc.bench.problem import Case, Problem, Training
 from koopmpc.bench.sweep import sweep
+from koopmpc.control.bilinear_mpc import BilinearMPC
 from koopmpc.control.cost import Cost
 from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
 from koopmpc.control.limits import Limits
@@ -30,6 +31,7 @@ from koopmpc.errors import (
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.kalman import LiftedKalman
 from koopmpc.estimate.observer import Estimator
+from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.dmd import dmd, dmdc
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.moments import Moments, moments
@@ -58,6 +60,7 @@ from koopmpc.plant.dynamics import Dynamics
 from koopmpc.plant.integrators import CVODES, RK4, Collocation, Euler, ImplicitMidpoint
 from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import Affine, StepMap, discretize
+from koopmpc.predict.bilinear import BilinearPredictor, load_bilinear_predictor
 from koopmpc.predict.linear import LinearPredictor, load_predictor
 from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
@@ -75,6 +78,8 @@ __all__ = [
     "ActuatorDelay",
     "ActuatorLoss",
     "Affine",
+    "BilinearMPC",
+    "BilinearPredictor",
     "Box",
     "Case",
     "Chirp",
@@ -143,6 +148,7 @@ __all__ = [
     "Training",
     "Uniform",
     "amplitudes",
+    "bilinear_edmd",
     "collect",
     "continuous_eigenvalues",
     "discretize",
@@ -152,6 +158,7 @@ __all__ = [
     "edmd",
     "linearity_error",
     "list_problems",
+    "load_bilinear_predictor",
     "load_episodes",
     "load_predictor",
     "load_problem",

@@ -97,7 +97,7 @@ def bench(
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
-    """Compare the six controllers on several problems."""
+    """Compare the seven controllers on several problems."""
     from koopmpc.bench.library import load_problem, shipped
 
     with _friendly():

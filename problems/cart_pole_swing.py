@@ -99,6 +99,6 @@ problem = km.Problem(
         "aside": km.Case(x0=[0.4, 0.0, -2.0, 0.8], reference=[0.0, 0.0, 0.0, 1.0, 0.0], steps=200),
     },
     angles=(2,),
-    controllers=("koopman-mpc", "nonlinear-mpc"),
+    controllers=("koopman-mpc", "bilinear-mpc", "nonlinear-mpc"),
     scene=scene,
 )

@@ -1,9 +1,10 @@
-"""The six controllers of the bench: one cost, one set of limits and one horizon for all."""
+"""The seven controllers of the bench: one cost, one set of limits and one horizon for all."""
 
 from collections.abc import Callable, Iterable
 
 from koopmpc.bench.names import nearest
 from koopmpc.bench.prepare import Prepared
+from koopmpc.control.bilinear_mpc import BilinearMPC
 from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
 from koopmpc.control.limits import Limits
 from koopmpc.control.lqr import LQR
@@ -44,9 +45,14 @@ def _offset_free(parts: Prepared, limits: Limits) -> Controller:
     return KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
 
 
+def _bilinear_mpc(parts: Prepared, limits: Limits) -> Controller:
+    """Real-time iterations on the bilinear predictor, lifted anew at every step of the plan."""
+    return BilinearMPC(parts.bilinear, parts.problem.cost, limits, parts.problem.horizon)
+
+
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the model itself: the oracle where the model is the truth."""
-    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon)
+    """MPC on the model itself, the best of four starts: the oracle where the model is the truth."""
+    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=4)
 
 
 CONTROLLERS: dict[str, Build] = {
@@ -55,14 +61,15 @@ CONTROLLERS: dict[str, Build] = {
     "linear-mpc": _linear_mpc,
     "koopman-mpc": _koopman_mpc,
     "offset-free": _offset_free,
+    "bilinear-mpc": _bilinear_mpc,
     "nonlinear-mpc": _nonlinear_mpc,
 }
 
-LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free")
+LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc")
 
 
 def chosen(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the names of controllers, all six by default.
+    """Return the names of controllers, all seven by default.
 
     Raises
     ------

@@ -30,7 +30,7 @@ def under_faults(title: str, rows: Sequence[Row]) -> Table:
     )
     lines.add_column("fault", no_wrap=True)
     for controller in whole:
-        lines.add_column(controller, justify="right", no_wrap=True)
+        lines.add_column(controller.replace("-", "\n"), justify="right", no_wrap=True)
     for fault in dict.fromkeys(fault for fault, _ in found):
         cells = [_cell(found[fault, name], whole[name]) for name in whole]
         failed = any(found[fault, name].failure for name in whole)

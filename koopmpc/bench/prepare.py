@@ -11,10 +11,12 @@ from koopmpc.control.equilibrium import Equilibria
 from koopmpc.control.outputs import outputs
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
+from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.edmd import edmd
 from koopmpc.plant.dynamics import Dynamics
 from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import StepMap, discretize
+from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 
 
@@ -93,3 +95,8 @@ class Prepared:
         model = edmd(self.data, self.problem.lifting, ridge=self.problem.ridge)
         self.training_time = time.perf_counter() - start
         return model
+
+    @cached_property
+    def bilinear(self) -> BilinearPredictor:
+        """z⁺ = A z + B u + Σ uᵢ Nᵢ z fitted to the same data with the same lifting."""
+        return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True)

@@ -3,16 +3,15 @@
 
 from typing import Any
 
-from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.description import About
-from koopmpc.recording.eigenvalues import reach
+from koopmpc.recording.eigenvalues import Model, reach
 from koopmpc.recording.scenes import BACKGROUND, Bounds
 from koopmpc.recording.styles import input_limits
 
 _SEPARATE = 4  # up to so many states have a plot each
 
 
-def blueprint(about: About, *, bounds: Bounds | None, model: LinearPredictor | None) -> Any:
+def blueprint(about: About, *, bounds: Bounds | None, model: Model | None) -> Any:
     """Return the layout of one run: what the data cannot fill has no view.
 
     `bounds` is what the animation shows, None where there is no scene.

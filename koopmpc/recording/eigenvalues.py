@@ -5,12 +5,16 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 
 _WIDEST = 3.0  # beyond it an eigenvalue is not in the picture
 
 
-def draw_eigenvalues(model: LinearPredictor) -> dict[str, Any]:
+Model = LinearPredictor | BilinearPredictor
+
+
+def draw_eigenvalues(model: Model) -> dict[str, Any]:
     """Return static archetypes by entity; eigenvalues outside the unit circle are red. Rerun's y points down."""
     import rerun as rr
 
@@ -34,7 +38,7 @@ def draw_eigenvalues(model: LinearPredictor) -> dict[str, Any]:
     }
 
 
-def reach(model: LinearPredictor) -> float:
+def reach(model: Model) -> float:
     """Return how far the picture goes: over the unit circle, and over eigenvalues not far outside."""
     values = np.asarray(model.eigenvalues)
     return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)

@@ -15,9 +15,9 @@ from koopmpc.control.move import Plan
 from koopmpc.errors import DataError
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Step
-from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.connect import PORT, find_viewer, why_none
 from koopmpc.recording.description import About
+from koopmpc.recording.eigenvalues import Model
 from koopmpc.recording.rows import rows_of_run
 from koopmpc.recording.scenes import Scene
 from koopmpc.recording.stream import Stream
@@ -26,9 +26,7 @@ from koopmpc.recording.writer import Writer
 _PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
 
 
-def record(
-    run: Run, path: str | Path, *, scene: Scene | None = None, model: LinearPredictor | None = None
-) -> None:
+def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Model | None = None) -> None:
     """Write `run` as a complete Rerun log; `load_run(path)` equals `run` to the bit.
 
     Parameters
@@ -97,7 +95,7 @@ class Recorder:
         angles: Sequence[int] = (),
         metadata: Mapping[str, Any] | None = None,
         scene: Scene | None = None,
-        model: LinearPredictor | None = None,
+        model: Model | None = None,
         live: bool = False,
         port: int = PORT,
     ) -> None:

@@ -15,10 +15,9 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
-from koopmpc.predict.linear import LinearPredictor
 from koopmpc.recording.blueprint import blueprint
 from koopmpc.recording.description import About, metrics_to_markdown, to_json, to_markdown
-from koopmpc.recording.eigenvalues import draw_eigenvalues
+from koopmpc.recording.eigenvalues import Model, draw_eigenvalues
 from koopmpc.recording.rows import Rows, blocks
 from koopmpc.recording.scenes import Bounds, Drawing, Names, Scene, draw, draw_ahead, stages
 from koopmpc.recording.styles import input_limits, styles
@@ -40,7 +39,7 @@ class Writer:
         path: Path | None,
         viewer: str | None = None,
         scene: Scene | None = None,
-        model: LinearPredictor | None = None,
+        model: Model | None = None,
         steps: int | None = None,
     ) -> None:
         """Check what is told; `viewer` is the address of a viewer that is up."""

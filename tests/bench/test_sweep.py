@@ -23,7 +23,7 @@ from koopmpc.recording.scene import Disk
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
 
-SIX = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "nonlinear-mpc"]
+SEVEN = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "bilinear-mpc", "nonlinear-mpc"]
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +38,15 @@ def swept(tmp_path_factory):
 def test_every_controller_meets_every_case_once(swept):
     _, rows, _, told = swept
     assert [(r.problem, r.case, r.controller) for r in rows] == [
-        ("tiny", case, name) for case in ("near", "far") for name in SIX
+        ("tiny", case, name) for case in ("near", "far") for name in SEVEN
     ]
-    assert [done for _, done, _ in told] == list(range(13))
-    assert {total for *_, total in told} == {12}
+    assert [done for _, done, _ in told] == list(range(15))
+    assert {total for *_, total in told} == {14}
 
 
 def test_all_end_as_they_should_and_the_short_case_is_no_failure(swept):
     _, rows, _, _ = swept
-    assert [row.failure for row in rows] == [None] * 12
+    assert [row.failure for row in rows] == [None] * 14
     assert all(row.reached for row in rows if row.case == "near")
     assert not any(
         row.reached for row in rows if row.case == "far"
@@ -137,7 +137,12 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
 def test_a_model_that_cannot_be_learned_takes_only_its_own_controllers(tmp_path):
     broken = write(tmp_path, **{"km.Noise(-2.0, 2.0)": "lambda k, y, rng: [float('nan')]"})
     rows = sweep([load_problem(f"{broken}:far")], folder=tmp_path)
-    assert [row.controller for row in rows if row.failure] == ["koopman-lqr", "koopman-mpc", "offset-free"]
+    assert [row.controller for row in rows if row.failure] == [
+        "koopman-lqr",
+        "koopman-mpc",
+        "offset-free",
+        "bilinear-mpc",
+    ]
 
 
 class Cheat:
@@ -287,7 +292,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(chosen(None)) == SIX
+    assert list(chosen(None)) == SEVEN
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
@@ -308,7 +313,7 @@ def faulty(swept, tmp_path_factory):
 def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(faulty):
     rows, folder = faulty
     assert [(r.case, r.fault, r.controller) for r in rows] == [
-        (case, fault, name) for case in ("near", "far") for fault in (None, *FAULTS) for name in SIX
+        (case, fault, name) for case in ("near", "far") for fault in (None, *FAULTS) for name in SEVEN
     ]
     assert [row.failure for row in rows] == [None] * len(rows)
     assert len({row.log for row in rows}) == len(rows)
