@@ -35,7 +35,7 @@ Faults = Annotated[
 ]
 Controllers = Annotated[
     list[str] | None,
-    typer.Option("--controller", "-c", help="One of the six; may be repeated. Default: all."),
+    typer.Option("--controller", "-c", help="One of the seven; may be repeated. Default: all."),
 ]
 
 

@@ -20,7 +20,7 @@ from koopmpc.loop.injection import Fault, named
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Observer, simulate
-from koopmpc.recording.connect import find_viewer
+from koopmpc.recording.connect import find_viewer, why_none
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 
@@ -82,7 +82,7 @@ def sweep(
     if live and find_viewer() is None:
         live = False
         warnings.warn(
-            "no Rerun viewer is up, and there is no display to open one on; the runs are recorded all the same",
+            f"{why_none()}; the runs are recorded all the same",
             UserWarning,
             stacklevel=2,
         )

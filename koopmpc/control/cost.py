@@ -53,6 +53,8 @@ class Cost(Value):
     def __post_init__(self) -> None:
         for name in ("Q", "R", "Q_N", "R_delta"):
             value = getattr(self, name)
+            if value is None and name in ("Q", "R"):
+                raise DataError(f"{name} is None; pass a weight, 0 for none")
             if value is not None:
                 stored = checks.array(value, name)
                 checks.weight(stored, name)

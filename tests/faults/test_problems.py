@@ -72,7 +72,10 @@ def test_references_are_equilibria_and_cases_fit(problem):
     x, u = problem.equilibrium
     np.testing.assert_allclose(np.array(right_side(problem.dynamics)(x, u)).ravel(), 0.0, atol=1e-12)
     f = right_side(problem.dynamics)
-    for name, case in problem.cases.items():  # both are affine in u: one input holds the reference, inside the limits
+    for (
+        name,
+        case,
+    ) in problem.cases.items():  # both are affine in u: one input holds the reference, inside the limits
         free = np.array(f(case.reference, [0.0])).ravel()
         gain = np.array(f(case.reference, [1.0])).ravel() - free
         held = -float(gain @ free) / float(gain @ gain)
