@@ -8,8 +8,9 @@ from koopmpc.bench.problem import Case, Problem, Training
 from koopmpc.bench.sweep import sweep
 from koopmpc.control.bilinear_mpc import BilinearMPC
 from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
+from koopmpc.control.koopman_mpc import KoopmanMPC
 from koopmpc.control.limits import Limits
+from koopmpc.control.linear_mpc import LinearMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.nonlinear_mpc import NonlinearMPC

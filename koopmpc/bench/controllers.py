@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterable
 from koopmpc.bench.names import nearest
 from koopmpc.bench.prepare import Prepared
 from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
+from koopmpc.control.koopman_mpc import KoopmanMPC
 from koopmpc.control.limits import Limits
+from koopmpc.control.linear_mpc import LinearMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear_mpc import NonlinearMPC

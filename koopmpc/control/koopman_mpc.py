@@ -22,7 +22,6 @@ from koopmpc.control.plan_map import PlanMap
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Observer
 from koopmpc.lifting.buffered import HUGE
-from koopmpc.plant.step_map import StepMap
 from koopmpc.predict.linear import LinearPredictor
 
 _VIEWS = ("_z", "_u_prev", "_W", "_d", "_drive", "_met", "_met_low", "_met_high")
@@ -391,43 +390,6 @@ class KoopmanMPC:
         self._planned = False
         u, fallback = self._memory.instead(free, applied)
         return Move(u, status, fallback, perf_counter() - start, iterations)
-
-
-class LinearMPC(KoopmanMPC):
-    """KoopmanMPC on the linearisation of `step_map` at (x, u): the linear MPC that a lifted one is compared with."""
-
-    def __init__(
-        self,
-        step_map: StepMap,
-        x: ArrayLike,
-        u: ArrayLike,
-        cost: Cost,
-        limits: Limits | None = None,
-        horizon: int = 20,
-        *,
-        estimator: Estimator | None = None,
-        latency: int = 0,
-        moves: int | Sequence[int] | None = None,
-        disturbed: bool = False,
-        coordinates: Coordinates = "auto",
-        solver: Literal["osqp", "daqp"] = "osqp",
-        settings: Mapping[str, Any] | None = None,
-        time_limit: float | None = None,
-    ) -> None:
-        super().__init__(
-            LinearPredictor.local(step_map, x, u),
-            cost,
-            limits,
-            horizon,
-            estimator=estimator,
-            latency=latency,
-            moves=moves,
-            disturbed=disturbed,
-            coordinates=coordinates,
-            solver=solver,
-            settings=settings,
-            time_limit=time_limit,
-        )
 
 
 def _hard(rates: Box | None, linear: Float[np.ndarray, " nu"]) -> Box | None:

@@ -261,7 +261,7 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
 
 def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: None)
-    with pytest.warns(UserWarning, match="no Rerun viewer is up") as caught:
+    with pytest.warns(UserWarning, match="no Rerun viewer listens at") as caught:
         rows = sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, live=True)
     assert len(caught) == 1
     assert [row.failure for row in rows] == [None, None]

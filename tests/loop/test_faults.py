@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC, LinearMPC
+from koopmpc.control.koopman_mpc import KoopmanMPC
 from koopmpc.control.limits import Limits
+from koopmpc.control.linear_mpc import LinearMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Fallback, Fallible, Move, Status
 from koopmpc.control.nonlinear_mpc import NonlinearMPC
