@@ -27,18 +27,17 @@ def with_disturbances(model, E):
 
 
 def terminal(model, cost, N):
-    """The cost's own P, or the limit of the difference equation on z or on [z; u] in its textbook form."""
+    """The cost's own P, or that of the difference equation on z or on [z; u], 10 N steps of it."""
     if cost.Q_N is not None:
         return np.diag(cost.Q_N)
     nz, nu = model.B.shape
     Q, R = model.C.T @ np.diag(cost.Q) @ model.C, np.diag(cost.R)
     if cost.R_delta is None:
         return stationary(model.A, model.B, Q, R, 10 * N).P
-    # [z; u_{k−1}] and Δu as the input: z⁺ = A z + B (u + Δu)
-    A = np.block([[model.A, model.B], [np.zeros((nu, nz)), np.eye(nu)]])
-    B = np.vstack([model.B, np.eye(nu)])
-    M = np.vstack([np.zeros((nz, nu)), R])
-    return stationary(A, B, scipy.linalg.block_diag(Q, R), R + np.diag(cost.R_delta), 10 * N, M).P
+    A, B = scipy.linalg.block_diag(model.A, np.zeros((nu, nu))), np.vstack([model.B, np.eye(nu)])
+    R_delta = np.diag(cost.R_delta)
+    M = np.vstack([np.zeros((nz, nu)), -R_delta])
+    return stationary(A, B, scipy.linalg.block_diag(Q, R_delta), R + R_delta, 10 * N, M).P
 
 
 def draw(rng):
@@ -119,7 +118,7 @@ def equals_cvxpy(seed, coordinates):
             assert move.status is km.Status.INFEASIBLE
         else:
             assert move.status in SOLVED
-            np.testing.assert_allclose(mpc.plan().U, found[0], atol=5e-5)
+            np.testing.assert_allclose(mpc.plan().U, found[0], atol=2e-5)
             X = mpc.plan().X
             z = model.lift(x)
             for k in range(N):
