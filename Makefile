@@ -12,10 +12,10 @@ bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
 
 test: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m pytest --cov --cov-report=term
+	$(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable --cov --cov-report=term
 
 full: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m pytest -m "(slow or not slow) and not speed" --cov --cov-report=term
+	$(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable -m "(slow or not slow) and not speed" --cov --cov-report=term
 
 speed: $(VENV)/installed-dev
 	KOOPMPC_NO_TYPE_HOOK=1 $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
