@@ -224,7 +224,9 @@ def test_each_name_is_one_class():
 def test_a_repr_is_a_line_without_numbers():
     data = km.Episodes([km.Episode(X=np.zeros((9, 2)), U=np.zeros((8, 1)))] * 7, 0.1)
     assert repr(data[0]) == "Episode(U=array(8, 1), X=array(9, 2), W=array(8, 0))"
-    assert repr(data[:1]).startswith("Episodes(episodes=(Episode,), dt=0.1, states=('x0', 'x1'), inputs=('u0',)")
+    assert repr(data[:1]).startswith(
+        "Episodes(episodes=(Episode,), dt=0.1, states=('x0', 'x1'), inputs=('u0',)"
+    )
     assert repr(data).startswith(
         "Episodes(episodes=(Episode, Episode, Episode, Episode, … 7 in all), dt=0.1,"
     )
