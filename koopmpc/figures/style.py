@@ -1,0 +1,174 @@
+"""How every figure looks: for one column or two of a page, to be read in black and white, the same bytes each time.
+
+A figure is a `matplotlib.figure.Figure` of its own: nothing of pyplot, so no display, no backend, and nothing that
+stays when it is let go. matplotlib is imported where it is used.
+"""
+# pyright: basic
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Width = Literal["one column", "two columns"]
+
+WIDTHS: dict[str, float] = {"one column": 3.5, "two columns": 7.16}  # of a page in two columns [in]
+TRUTH: dict[str, Any] = {"color": "#000000", "linestyle": "-", "linewidth": 1.4}
+REFERENCE: dict[str, Any] = {"color": "#000000", "linestyle": ":", "linewidth": 1.1}
+LIMIT: dict[str, Any] = {"color": "#8c1d18", "linestyle": (0, (6, 2)), "linewidth": 0.9}
+SEQUENTIAL = "viridis"  # its lightness grows evenly, so it reads in grey
+_COLORS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#7b3294",
+    "#c28e00",
+    "#5a5a5a",
+)  # told apart by colour-blind readers
+_DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
+_MARKERS = ("o", "s", "^", "D", "v", "x")
+_SUFFIXES = (".png", ".pdf", ".svg")
+_RC: dict[str, Any] = {
+    "font.size": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#dcdcdc",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 3.6,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "figure.dpi": 200.0,
+    "savefig.dpi": 200.0,
+    "pdf.fonttype": 42,  # text stays text
+    "svg.fonttype": "path",
+    "svg.hashsalt": "koopmpc",  # or ids are random
+}
+_METADATA: dict[str, dict[str, Any]] = {
+    ".png": {"Software": None},
+    ".pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    ".svg": {"Creator": None, "Date": None},
+}
+
+
+def styled(plot: Callable[P, T]) -> Callable[P, T]:
+    """Return `plot`, drawn in this style whatever the user's own settings are; those come back after it."""
+
+    @wraps(plot)
+    def within(*args: P.args, **kwargs: P.kwargs) -> T:
+        with _settings():
+            return plot(*args, **kwargs)
+
+    return within
+
+
+@styled
+def figure(
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    width: Width = "one column",
+    height: float | None = None,
+    **more: Any,
+) -> "tuple[Figure, np.ndarray]":
+    """Return a figure and its (rows, columns) axes, an array of objects.
+
+    Parameters
+    ----------
+    rows, columns
+        How many axes.
+    width
+        "one column" or "two columns" of a page.
+    height
+        [in]; 1.5 in a row by default, and 0.6 for what is around them.
+    more
+        For `Figure.subplots`: ``sharex``, ``height_ratios``, …
+
+    Raises
+    ------
+    DataError
+        The width is another word.
+    """
+    from matplotlib.figure import Figure
+
+    if width not in WIDTHS:
+        raise DataError(f"width is {width!r}; pass one of {', '.join(WIDTHS)}")
+    size = (WIDTHS[width], 0.6 + 1.5 * rows if height is None else checks.positive(height, "height", "in"))
+    made = Figure(figsize=size, layout="constrained")
+    return made, made.subplots(rows, columns, squeeze=False, **more)
+
+
+def line(i: int, points: int = 0) -> dict[str, Any]:
+    """Return the look of the i-th of several curves: colour, dashes and marker all differ.
+
+    Parameters
+    ----------
+    i
+        From 0 on.
+    points
+        Of the curve: about eight of them get the marker, none if it is 0.
+    """
+    look: dict[str, Any] = {"color": _COLORS[i % len(_COLORS)], "linestyle": _DASHES[i % len(_DASHES)]}
+    if points:
+        every = max(1, points // 8)
+        look |= {"marker": _MARKERS[i % len(_MARKERS)], "markevery": (i * every // 3 % every, every)}
+    return look
+
+
+def band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = None) -> None:
+    """Shade from `low` to `high` in the colour of the i-th curve, with thin edges that print in grey."""
+    color = line(i)["color"]
+    axes.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0.0, label=label)
+    for edge in (low, high):
+        axes.plot(x, edge, color=color, linewidth=0.5, alpha=0.7)
+
+
+@styled
+def save(made: "Figure", path: str | PathLike[str]) -> None:
+    """Write the figure as .png, .pdf or .svg, by the path's ending: the same figure, the same bytes.
+
+    Raises
+    ------
+    DataError
+        The path ends otherwise.
+    LogError
+        The path cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise DataError(f"{path} is no picture by its name; end it with one of {', '.join(_SUFFIXES)}")
+    with checks.writing(path) as stream:
+        made.savefig(stream, format=suffix[1:], metadata=_METADATA[suffix])
+
+
+@contextmanager
+def _settings() -> Iterator[None]:
+    import matplotlib as mpl
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(cast("Any", _RC))
+        yield

@@ -1,0 +1,75 @@
+"""One look for all figures; files that are the same each time; no state of pyplot."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from koopmpc.errors import DataError, LogError
+from koopmpc.figures.style import WIDTHS, band, figure, line, save, styled
+
+
+@styled
+def _drawn():
+    made, axes = figure(2, 1)
+    x = np.linspace(0, 1, 50)
+    axes[0, 0].plot(x, x**2, **line(0, 50))
+    band(axes[1, 0], x, x - 1, x + 1, 1)
+    return made
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
+def test_the_same_figure_is_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    first, second = tmp_path / "a" / "b" / f"one{suffix}", tmp_path / f"two{suffix}"
+    save(_drawn(), first)
+    save(_drawn(), second)
+    assert first.read_bytes() == second.read_bytes()
+    assert len(first.read_bytes()) > 1000
+
+
+def test_a_users_settings_change_nothing_and_come_back(tmp_path: Path) -> None:
+    save(_drawn(), tmp_path / "a.png")
+    with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 30.0}):
+        save(_drawn(), tmp_path / "b.png")
+        assert mpl.rcParams["lines.linewidth"] == 9.0
+        assert styled(lambda: mpl.rcParams["font.size"])() == 8.0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize("width", list(WIDTHS))
+def test_figures_are_as_wide_as_columns(width) -> None:
+    assert figure(width=width, height=2.0)[0].get_size_inches() == pytest.approx([WIDTHS[width], 2.0])
+
+
+def test_curves_differ_in_more_than_colour() -> None:
+    looks = [line(i, 40) for i in range(6)]
+    assert len({str(look["linestyle"]) for look in looks}) == 6
+    assert len({look["marker"] for look in looks}) == 6
+    assert len({look["color"] for look in looks}) == 6
+
+
+def test_neither_the_library_nor_its_figures_import_pyplot(tmp_path: Path) -> None:
+    code = f"""
+import sys
+import koopmpc.figures.style as style
+assert "matplotlib" not in sys.modules
+made, axes = style.figure()
+axes[0, 0].plot([0, 1], [0, 1])
+style.save(made, {str(tmp_path / "a.svg")!r})
+assert "matplotlib.pyplot" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_messages(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
+        save(_drawn(), tmp_path / "a.gif")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match=r"cannot be written: .*; pass another path"):
+        save(_drawn(), tmp_path / "file" / "a.png")
+    with pytest.raises(DataError, match="height is -1 in; it must be above zero"):
+        figure(height=-1.0)
