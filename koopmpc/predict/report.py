@@ -33,6 +33,8 @@ class FitReport(Value):
         Root-mean-square of x − C ψ(x) for each state: zero where the lifting holds the state itself.
     warnings
         Sentences, one for each doubt.
+    changes
+        Sentences, one for each thing that a prior, a limit on the spectral radius or a penalty changed.
     """
 
     method: str
@@ -45,3 +47,4 @@ class FitReport(Value):
     residual: Float[np.ndarray, " nx"]
     state_residual: Float[np.ndarray, " nx"]
     warnings: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
