@@ -51,7 +51,7 @@ class Equilibria:
     def __init__(self, step_map: StepMap, cost: Cost, outputs: Outputs, most: int) -> None:
         self._step_map, self._cost, self._outputs, self._most = step_map, cost, outputs, most
         self._nr = len(outputs.Q)
-        self._of_state = isinstance(cost.of, State)
+        self._of_state = isinstance(cost.of, State) and cost.of.whole
         if cost.Q_N is not None:
             checks.weight(cost.Q_N, "Q_N", step_map.nx)
             if not self._of_state:

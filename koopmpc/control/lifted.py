@@ -74,10 +74,10 @@ def tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> Tracking
 
 
 def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr nz"]:
-    """Return the matrix that reads the observables `of` from z: the predictor's own C for the state."""
+    """Return the matrix that reads the observables `of` from z: the predictor's own C for states."""
     wanted = of.bind(predictor.states)
     if isinstance(wanted, State):
-        return predictor.C
+        return predictor.C[wanted.chosen]
     return np.eye(predictor.nz)[rows(predictor.lifting, wanted)]
 
 

@@ -8,7 +8,7 @@ from koopmpc.control.condense import Condensed, Coordinates, condense
 from koopmpc.control.cost import Cost
 from koopmpc.control.horizon import Horizon, end, one_step, stages
 from koopmpc.control.lifted import Tracking, tracking
-from koopmpc.control.limits import Limits, Softness
+from koopmpc.control.limits import Box, Limits, Softness
 from koopmpc.control.program import Group, Program, program
 from koopmpc.control.riccati import recursion, stationary
 from koopmpc.control.target import margin
@@ -24,7 +24,8 @@ class PlanMap:
     t = [v; lowest and highest target], v the plan as in `Condensed`. u_{−1} is there where the change of inputs is
     weighed or limited, g = [w_0 … w_{N−1}; d] where disturbances are known. With a g the last column holds the part
     of a reference whose targets no limit moves, and the last rows of t show where one does: `correction` is then
-    added. Without a g the last column holds all.
+    added. Without a g the last column holds all. The first `moves` entries of t are the inputs, `box` is their
+    limits, and `deviation` tells how a solution of the QP moves them.
 
     Parameters
     ----------
@@ -53,6 +54,8 @@ class PlanMap:
         found = track.targets
         law = recursion(stages(horizon, found), horizon.P_N, end(horizon, found))
         self.maps = condense(horizon, law, found, coordinates)
+        self.moves = len(blocks) * predictor.nu
+        self.deviation = self.maps.deviation[: self.moves]
         self.hard = _program(self.maps, track, horizon, soft_rows=False)
         self.soft = (
             _program(self.maps, track, horizon, soft_rows=True) if np.isfinite(self.hard.most).any() else None
@@ -79,6 +82,7 @@ class PlanMap:
         self._checked = checked
         self.planned = nv
         self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
+        self.box = Box(self.low[: self.moves], self.high[: self.moves])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = self.maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
@@ -121,7 +125,7 @@ def _horizon(
     else:
         given = np.asarray(cost.Q_N)
         own = len(given) if given.ndim else nx
-        on_state = own == nx and isinstance(cost.of, State)
+        on_state = own == nx and isinstance(cost.of, State) and cost.of.whole
         if own == nx != nz and not on_state:
             raise ShapeError(
                 f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})"

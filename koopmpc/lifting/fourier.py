@@ -1,6 +1,5 @@
 """Harmonics of angles."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, short
+from koopmpc.lifting.chosen import Chosen, frozen, indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +25,17 @@ class Fourier(Lifting):
     """
 
     harmonics: int
-    states: int | str | Sequence[int | str] | None = None
+    states: Chosen | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "harmonics", checks.count(self.harmonics, "harmonics"))
-        if self.states is not None:
-            chosen = (self.states,) if isinstance(self.states, int | str | np.integer) else self.states
-            object.__setattr__(self, "states", tuple(s if isinstance(s, str) else int(s) for s in chosen))
+        object.__setattr__(self, "states", frozen(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"sin(theta)"`` and ``"cos(2 theta)"``."""
         return tuple(
             f"{function}({'' if k == 1 else f'{k} '}{short(states[i])})"
-            for i in self._indices(states)
+            for i in indices(self.states, states, "Fourier")
             for k in range(1, self.harmonics + 1)
             for function in ("sin", "cos")
         )
@@ -59,22 +56,4 @@ class Fourier(Lifting):
 
     @cached_property
     def _chosen(self) -> list[int]:
-        return self._indices(self._states)
-
-    def _indices(self, states: tuple[str, ...]) -> list[int]:
-        if self.states is None:
-            return list(range(len(states)))
-        chosen = [self.states] if isinstance(self.states, int | str) else self.states
-        return [_index(state, states) for state in chosen]
-
-
-def _index(state: int | str, states: tuple[str, ...]) -> int:
-    if isinstance(state, str):
-        found = [i for i, name in enumerate(states) if state in (name, short(name))]
-        if len(found) == 1:
-            return found[0]
-    elif -len(states) <= state < len(states):
-        return state % len(states)
-    raise DataError(
-        f"Fourier is asked for state {state!r}; the states are {', '.join(states)}, or 0 … {len(states) - 1}"
-    )
+        return indices(self.states, self._states, "Fourier")

@@ -1,25 +1,48 @@
-"""The state itself."""
+"""The state itself, or some of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.chosen import Chosen, frozen, indices
 
 
 @dataclass(frozen=True, eq=False)
 class State(Lifting):
-    """ψ(x) = x; the observables have the states' full names."""
+    """ψ(x) = x, or the chosen xᵢ; the observables have the states' full names.
+
+    Parameters
+    ----------
+    states
+        The chosen states, by index or by name, with or without the unit; all of them by default.
+    """
+
+    states: Chosen | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "states", frozen(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the states' names."""
-        return states
+        """Return the names of the chosen states."""
+        return tuple(states[i] for i in indices(self.states, states, "State"))
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return x."""
-        return x
+        """Return the chosen states."""
+        return x if self.whole else x[self.chosen]
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        Z[:] = x.T
+        Z[:] = (x if self.whole else x[self.chosen]).T
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is all of the state, in its order."""
+        return self.states is None
+
+    @cached_property
+    def chosen(self) -> list[int]:
+        """Indices of the chosen states, once bound."""
+        return indices(self.states, self._states, "State")
