@@ -1,24 +1,34 @@
 """Bilinear extended dynamic mode decomposition: z⁺ = A z + B u + Σ uᵢ Nᵢ z on z = ψ(x)."""
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.errors import DataError, FitWarning
+from koopmpc.errors import DataError, FitWarning, ObservableError
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
-from koopmpc.identify.fit import cut
-from koopmpc.identify.moments import moments, product_names
-from koopmpc.identify.solve import Rows, scaled_rank, solve
+from koopmpc.identify.fit import rule
+from koopmpc.identify.moments import Moments, moments, product_names
+from koopmpc.identify.rank import Rank, leading, lost
+from koopmpc.identify.ridge import Ridge, ridge_of
+from koopmpc.identify.solve import Rows, solve
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.projected import Projected
 from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.report import FitReport
 
 
 def bilinear_edmd(
-    episodes: Episodes, lifting: Lifting, *, ridge: float = 0.0, difference: bool = False
+    episodes: Episodes,
+    lifting: Lifting,
+    *,
+    ridge: Ridge = 0.0,
+    rank: Rank = None,
+    products: Sequence[str] | None = None,
+    difference: bool = False,
 ) -> BilinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
 
@@ -32,7 +42,12 @@ def bilinear_edmd(
         ψ: R^nx → R^nz. C picks the states where it holds them, by name, else it is fitted.
     ridge
         Tikhonov weight on unit-norm columns of [ψ(x) u u⊗ψ(x)]. With 0, singular values below eps · max(M, n) of
-        the largest are cut.
+        the largest are cut. "gcv" chooses it by generalised cross-validation.
+    rank
+        As in `edmd`: z = U_rᵀ ψ(x) on unscaled columns, and u⊗z for the products.
+    products
+        Names of the observables that inputs multiply, for an input-affine model ψ(x⁺) = A ψ(x) + G(x) u whose G
+        is spanned by 1 and these; all by default.
     difference
         Regress ψ(x⁺) − ψ(x), and A = I + what is found. Without a ridge and on independent columns it is the same
         model; a ridge, or a cut, then draws z⁺ towards z ("nothing changes") instead of towards zero, which is
@@ -41,7 +56,10 @@ def bilinear_edmd(
     Raises
     ------
     DataError
-        The data have no inputs, ridge is negative, or an observable is not finite on the data.
+        The data have no inputs, ridge is negative, products and a rank are both given, or an observable is not
+        finite on the data.
+    ObservableError
+        The lifting does not hold one of the products.
 
     Warns
     -----
@@ -57,35 +75,78 @@ def bilinear_edmd(
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
     if episodes.nw:
         raise DataError("the episodes hold measured disturbances, which a bilinear fit leaves out; use edmd")
-    ridge = float(checks.array(ridge, "ridge", ()))
-    if ridge < 0:
-        raise DataError(f"ridge is {ridge:g}; it must be 0 or above")
+    ridge = ridge_of(ridge)
+    if rank is not None and products is not None:
+        raise DataError(
+            "a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two"
+        )
     total = moments(episodes, lifting, bilinear=True)
     task = regression(total, "bilinear_edmd")
-    given, bound, nz, nu = task.rows, task.lifting, total.nz, episodes.nu
-    names = product_names(bound, total.inputs, total.products)
-    sentences = doubts(given, bound.names, (*total.inputs, *names), regular=ridge > 0)
-    start = np.eye(len(given.P[0]), nz) * difference  # what stands in K before anything is learned
-    change = Rows(given.P, given.T[:, :nz] - given.P @ start, given.rest[:nz], given.samples)
-    solution = solve(change, ridge=ridge)
-    K = solution.K + start
-    N = np.zeros((nu, nz, nz))
-    N[:, :, total.products] = K[nz + nu :].reshape(nu, -1, nz).transpose(0, 2, 1)
     assert task.C is not None, "an extended regression has its C"
+    bound, nz, nu = task.lifting, total.nz, episodes.nu
+    which = total.products if products is None else _named(total, products)
+    given = _with_products(task.rows, total, which)
+    names = product_names(bound, total.inputs, which)
+    regular = ridge != 0 or rank is not None
+    sentences, condition = doubts(given, bound.names, (*total.inputs, *names), regular=regular)
+    P, C, basis, state_residual, words = given.P, task.C, np.eye(nz), task.state_residual, ""
+    if rank is not None:
+        basis, words = leading(given, nz, rank, sentences)
+        P, C, bound = _projected(P, basis, nu, which), C @ basis, Projected(bound, basis)
+        state_residual = np.hypot(state_residual, lost(given.P[:, :nz], basis, task.C, given.samples))
+        which = np.arange(len(basis.T))
+    r = len(basis.T)
+    start = np.eye(P.shape[1], r) @ basis.T * difference  # what stands in K before anything is learned
+    change = Rows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples)
+    solution = solve(change, ridge=ridge)
+    K = (solution.K + start) @ basis
+    N = np.zeros((nu, r, r))
+    N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
+    seen = Rows(P, given.T, given.rest, given.samples)
+    solved = rule(seen, ridge, solution.ridge)
     report = FitReport(
         method="bilinear_edmd",
-        route=f"{task.route}, {cut(task, given, ridge, None)}",
+        route=f"{task.route}, {words}, {solved}" if words else f"{task.route}, {solved}",
         samples=given.samples,
-        condition=scaled_rank(given, given.P)[1],
+        condition=condition,
         rank=solution.rank,
-        columns=given.P.shape[1],
-        ridge=ridge,
-        residual=given.residual(task.x_next, K @ task.C.T),
-        state_residual=task.state_residual,
+        columns=P.shape[1],
+        ridge=solution.ridge,
+        residual=seen.residual(task.x_next, K @ C.T),
+        state_residual=state_residual,
         warnings=tuple(sentences),
     )
     for sentence in sentences:
         warnings.warn(sentence, FitWarning, stacklevel=2)
-    return BilinearPredictor(
-        K[:nz].T, K[nz : nz + nu].T, N, task.C, bound, task.dt, task.states, task.inputs, report
-    )
+    return BilinearPredictor(K[:r].T, K[r : r + nu].T, N, C, bound, task.dt, task.states, task.inputs, report)
+
+
+def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
+    """Return where the observables of these names are; a Constant is left out, for u times it is u."""
+    place = {name: i for i, name in enumerate(total.lifting.names)}
+    for name in products:
+        if name not in place:
+            raise ObservableError(
+                f"products names {name!r}, which the lifting lacks; it holds {', '.join(total.lifting.names)}"
+            )
+    return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
+
+
+def _with_products(rows: Rows, total: Moments, which: Int[np.ndarray, " np"]) -> Rows:
+    """Return the rows with u⊗ψ(x) of these observables only."""
+    first = total.nz + len(total.inputs)
+    block = np.flatnonzero(np.isin(total.products, which))
+    columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
+    return Rows(rows.P[:, np.concatenate([np.arange(first), *columns])], rows.T, rows.rest, rows.samples)
+
+
+def _projected(
+    P: Float[np.ndarray, "m n"], basis: Float[np.ndarray, "nz r"], nu: int, which: Int[np.ndarray, " np"]
+) -> Float[np.ndarray, "m _"]:
+    """Return [z u u⊗z], z = basisᵀ ψ, from [ψ u u⊗ψ] without u times a Constant, which is u."""
+    nz = len(basis)
+    U = P[:, nz : nz + nu]
+    constant = np.delete(basis, which, axis=0).sum(axis=0)
+    parts = P[:, nz + nu :].reshape(len(P), nu, -1)
+    mixed = [parts[:, i] @ basis[which] + U[:, i : i + 1] * constant for i in range(nu)]
+    return np.hstack([P[:, :nz] @ basis, U, *mixed])

@@ -1,5 +1,7 @@
 """Dynamic mode decomposition on the states themselves, without and with inputs."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -7,14 +9,16 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
-from koopmpc.identify.fit import Regression, fit
+from koopmpc.identify.fit import Method, Regression, fit
 from koopmpc.identify.moments import moments
+from koopmpc.identify.rank import Rank
 from koopmpc.identify.solve import Rows
+from koopmpc.identify.total import complete
 from koopmpc.lifting.state import State
 from koopmpc.predict.linear import LinearPredictor
 
 
-def dmd(episodes: Episodes, *, rank: int | None = None) -> LinearPredictor:
+def dmd(episodes: Episodes, *, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
     """Fit x⁺ = A x, A = X′X⁺ by truncated SVD of the unscaled snapshots; inputs in the data are left out.
 
     With fewer snapshots than states it works on the small side, and with `rank` it forms no (nx, nx) array.
@@ -25,12 +29,18 @@ def dmd(episodes: Episodes, *, rank: int | None = None) -> LinearPredictor:
         Snapshots; no pair spans two episodes.
     rank
         Keep r singular vectors: z = U_rᵀ x, A = Ã (r, r), C = U_r, exact modes X′ V Σ⁻¹ W. By default
-        singular values below eps · max(M, nx) of the largest are cut, and A is (nx, nx).
+        singular values below eps · max(M, nx) of the largest are cut, and A is (nx, nx). A share in (0, 1)
+        keeps the fewest directions with that part of the energy Σσ²; "hard-threshold" keeps those above the
+        optimal threshold for white noise of unknown size (Gavish & Donoho 2014).
+    method
+        "ls", least squares: noise in x shrinks A, so that modes seem to decay faster. "tls", total least
+        squares, takes x and x⁺ as noisy alike; "fb" fits forward and backward, A = (A_f A_b⁻¹)^½, which needs
+        no noise of one size, but a motion that can be run backward.
 
     Raises
     ------
     DataError
-        rank is above nx.
+        rank is above nx, too few pairs for "tls", or a motion that "fb" cannot run backward.
 
     Warns
     -----
@@ -39,12 +49,16 @@ def dmd(episodes: Episodes, *, rank: int | None = None) -> LinearPredictor:
 
     References
     ----------
-    Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. Dyn. 1, 2014.
+    Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. Dyn. 1, 2014; noise: Dawson,
+    Hemati, Williams & Rowley, "Characterizing and correcting for the effect of sensor noise in the dynamic mode
+    decomposition", Exp. Fluids 57, 2016.
     """
-    return fit(_regression(episodes, "dmd", inputs=()), rank=rank)
+    return fit(_regression(episodes, "dmd", inputs=(), noisy=method != "ls"), rank=rank, method=method)
 
 
-def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = None) -> LinearPredictor:
+def dmdc(
+    episodes: Episodes, *, rank: Rank = None, B: ArrayLike | None = None, method: Method = "ls"
+) -> LinearPredictor:
     """Fit x⁺ = A x + B u by truncated SVD of the unscaled snapshots [X; U], or of X alone where B is known.
 
     Parameters
@@ -55,11 +69,13 @@ def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = N
         Keep r singular vectors of X, as in `dmd`; the cut without it is also that of `dmd`.
     B
         (nx, nu), known; identified by default.
+    method
+        As in `dmd`; inputs are exact in "tls" and "fb".
 
     Raises
     ------
     DataError
-        The data have no inputs, or rank is above nx.
+        The data have no inputs, or as in `dmd`.
 
     Warns
     -----
@@ -77,22 +93,30 @@ def dmdc(episodes: Episodes, *, rank: int | None = None, B: ArrayLike | None = N
             "the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()"
         )
     known = None if B is None else checks.array(B, "B", (episodes.nx, episodes.nu))
-    return fit(_regression(episodes, "dmdc", inputs=episodes.inputs, B=known), rank=rank)
+    task = _regression(episodes, "dmdc", inputs=episodes.inputs, B=known, noisy=method != "ls")
+    return fit(task, rank=rank, method=method)
 
 
 def _regression(
-    episodes: Episodes, method: str, *, inputs: tuple[str, ...], B: Float[np.ndarray, "nx nu"] | None = None
+    episodes: Episodes,
+    method: str,
+    *,
+    inputs: tuple[str, ...],
+    B: Float[np.ndarray, "nx nu"] | None = None,
+    noisy: bool,
 ) -> Regression:
     """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
     lifting = State().bind(episodes_of(episodes).states)
     nx, nu = episodes.nx, len(inputs)
     pairs = sum(len(e) for e in episodes)
     if pairs < nx + nu:  # the snapshots themselves are the few rows
-        data = episodes.snapshots()
-        rows = Rows(np.hstack([data.X, data.U[:, :nu]]), data.X_next, np.zeros(nx), pairs)
+        X, X_next = _stacked([e.X[:-1] for e in episodes]), _stacked([e.X[1:] for e in episodes])
+        P = np.hstack([X, _stacked([e.U for e in episodes])]) if nu else X
+        rows = Rows(P, X_next, np.zeros(nx), pairs)
     else:
         total = moments(episodes, lifting, route="qr")
-        rows = total.rows(total.regressors[: nx + nu], total.targets)
+        columns = total.regressors[: nx + nu]
+        rows = complete(total, columns) if noisy else total.rows(columns, total.targets)
     return Regression(
         method=method,
         route="svd",
@@ -107,3 +131,8 @@ def _regression(
         B=B,
         scaled=False,
     )
+
+
+def _stacked(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+    """Return the parts as one array; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)

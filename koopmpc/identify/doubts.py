@@ -12,8 +12,12 @@ _ILL_CONDITIONED = 1e10
 _NAMED = 3  # dependent columns that a message names
 
 
-def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, regular: bool) -> list[str]:
-    """Return one sentence for each reason to doubt a regression on [ψ(x) u], P of `rows`.
+def doubts(
+    rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, regular: bool
+) -> tuple[list[str], float]:
+    """Return one sentence for each reason to doubt a regression on [ψ(x) u], P of `rows`, and its condition number.
+
+    The condition number is that of columns scaled to unit norm; inf where they are dependent.
 
     Parameters
     ----------
@@ -35,23 +39,23 @@ def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, reg
             f"{_listed([names[j] for j in zero])} was 0 in all snapshots, so its coefficients are set to 0; "
             "excite it or drop it"
         )
-    live = np.flatnonzero(size > 0)
-    Z, U = rows.P[:, live[live < nz]], rows.P[:, live[live >= nz]]
-    rank, condition = scaled_rank(rows, rows.P[:, live])
     if rows.samples < nz + nu:
         if not regular:
             found.append(
                 f"rank-deficient: {rows.samples} snapshot pairs cannot determine {nz + nu} coefficients "
                 "a row; the minimum-norm solution is taken; collect more, or lift to fewer observables"
             )
-        return found
+        return found, np.inf
+    live = np.flatnonzero(size > 0)
+    Z, U = rows.P[:, live[live < nz]], rows.P[:, live[live >= nz]]
+    rank, condition = scaled_rank(rows, rows.P[:, live])
     if rank == len(live):
         if condition > _ILL_CONDITIONED and not regular:
             found.append(
                 f"ill-conditioned: the observables have condition number {condition:.1e} on unit-norm "
                 "columns; pass a ridge, or drop observables that are almost functions of others"
             )
-        return found
+        return found, condition if rank == nz + nu else np.inf
     rank_z, rank_u = scaled_rank(rows, Z)[0], scaled_rank(rows, U)[0]
     for P, own, part, what in (
         (Z, rank_z, live[live < nz], "observables"),
@@ -69,7 +73,7 @@ def doubts(rows: Rows, observables: Sequence[str], inputs: Sequence[str], *, reg
             f"(rank [Z U] = {rank}, rank Z + rank U = {rank_z + rank_u}); the minimum-norm split is taken; "
             "add noise to the input, or pass a known B to dmdc"
         )
-    return found
+    return found, condition
 
 
 def _dependent(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:

@@ -4,15 +4,18 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.identify.fit import Regression, fit
+from koopmpc.identify.fit import Method, Regression, fit
 from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.rank import Rank
+from koopmpc.identify.ridge import Ridge
 from koopmpc.identify.solve import solve
+from koopmpc.identify.total import complete
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.linear import LinearPredictor
 
 
 def edmd(
-    episodes: Episodes, lifting: Lifting, *, ridge: float = 0.0, rank: int | None = None
+    episodes: Episodes, lifting: Lifting, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls"
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
 
@@ -27,15 +30,23 @@ def edmd(
         ψ: R^nx → R^nz.
     ridge
         Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz + nu) of the
-        largest, on unit-norm columns, are cut; the report's route says so.
+        largest, on unit-norm columns, are cut; the report's route says so. "gcv" chooses by generalised
+        cross-validation, each observable counted relative to its size; the report says what.
     rank
         With rank=r the columns are unscaled, and the predictor is reduced to z = U_rᵀ ψ(x), A = Ã (r, r),
-        C = C U_r, with the exact modes X′ V Σ⁻¹ W. A truncated SVD depends on the units of the data.
+        C = C U_r, with the exact modes X′ V Σ⁻¹ W. A truncated SVD depends on the units of the data. A share
+        in (0, 1) keeps the fewest directions with that part of the energy Σσ²; "hard-threshold" keeps those
+        above the optimal threshold for white noise of unknown size (Gavish & Donoho 2014).
+    method
+        "ls", least squares: noise in ψ(x) shrinks A. "tls", total least squares, takes ψ(x) and ψ(x⁺) as noisy
+        alike, relative to each observable's size; inputs and a Constant as exact. "fb", forward and backward,
+        supposes no sizes, but that the motion can be run backward. Both suppose that noise in x adds to ψ(x).
 
     Raises
     ------
     DataError
-        ridge is negative, rank too large, or an observable not finite on the data.
+        ridge is negative or given with "tls" or "fb", rank too large, an observable not finite on the data, or
+        too few pairs for "tls", or a motion that "fb" cannot run backward.
 
     Warns
     -----
@@ -45,10 +56,11 @@ def edmd(
     References
     ----------
     Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
-    25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018.
+    25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
     """
     episodes = episodes_of(episodes)
-    fitted = fit(regression(moments(episodes.driven(), lifting), "edmd"), ridge=ridge, rank=rank)
+    task = regression(moments(episodes.driven(), lifting), "edmd", noisy=method != "ls")
+    fitted = fit(task, ridge=ridge, rank=rank, method=method)
     if not episodes.nw:
         return fitted
     B, E = np.split(fitted.B, [episodes.nu], axis=1)
@@ -67,16 +79,17 @@ def edmd(
     )
 
 
-def regression(total: Moments, method: str) -> Regression:
-    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included."""
+def regression(total: Moments, method: str, *, noisy: bool = False) -> Regression:
+    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included; `noisy` keeps all of T."""
     states = total.lifting._states
     place = {name: i for i, name in enumerate(total.full.names)}
     where = np.array([place[name] for name in states])
     C, residual = _decoder(total, where)
+    regressors = total.regressors
     return Regression(
         method=method,
         route=total.route,
-        rows=total.rows(total.regressors, total.targets),
+        rows=complete(total, regressors) if noisy else total.rows(regressors, total.targets),
         x_next=where,
         lifting=total.lifting,
         states=states,

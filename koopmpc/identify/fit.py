@@ -2,18 +2,26 @@
 
 import warnings
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from koopmpc import checks
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.doubts import doubts
-from koopmpc.identify.solve import Rows, cutoff, scaled_rank, solve
+from koopmpc.identify.forward_backward import forward_backward
+from koopmpc.identify.rank import Rank, leading, lost
+from koopmpc.identify.ridge import Ridge, ridge_of
+from koopmpc.identify.solve import Rows, cutoff, solve
+from koopmpc.identify.total import denoised
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.projected import Projected
 from koopmpc.predict.linear import LinearPredictor, eigen
 from koopmpc.predict.report import FitReport
+
+Method = Literal["ls", "tls", "fb"]
+_WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +60,7 @@ class Regression:
     scaled: bool = True
 
 
-def fit(task: Regression, *, ridge: float = 0.0, rank: int | None = None) -> LinearPredictor:
+def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
     """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖² and report; a doubtful fit warns once, with FitWarning.
 
     Parameters
@@ -60,101 +68,138 @@ def fit(task: Regression, *, ridge: float = 0.0, rank: int | None = None) -> Lin
     task
         The regression.
     ridge
-        Weight of ‖[A B] S‖², S the diagonal of column norms; 0 takes the minimum-norm solution.
+        Weight of ‖[A B] S‖², S the diagonal of column norms; 0 takes the minimum-norm solution, "gcv" chooses.
     rank
-        Keep this many left singular vectors U_r of the snapshots ψ(x), columns unscaled: z = U_rᵀ ψ(x).
+        Keep so many left singular vectors U_r of the snapshots ψ(x), columns unscaled: z = U_rᵀ ψ(x).
+    method
+        "ls", or "tls" or "fb" for snapshots with noise, whose rows hold all of T.
     """
-    ridge = float(checks.array(ridge, "ridge", ()))
-    if ridge < 0:
-        raise DataError(f"ridge is {ridge:g}; it must be 0 or above")
+    ridge = ridge_of(ridge)
+    if method not in _WORDS:
+        raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
+    if method != "ls" and ridge != 0:
+        raise DataError(
+            f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two'
+        )
     rows, nz = task.rows, task.lifting.nz
     if task.B is not None:  # what is known of x⁺ goes to the left side
         known = rows.P[:, nz:] @ task.B.T
         rows = Rows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
     free = task.inputs if task.B is None else ()
-    sentences = doubts(rows, task.lifting.names, free, regular=ridge > 0 or rank is not None)
-    condition = scaled_rank(rows, rows.P)[1]
-    if rank is None:
-        whole, used = _whole(task, rows, ridge)
-    else:
-        whole, used = _reduced(task, rows, ridge, checks.count(rank, "rank"), sentences)
-    A, B, C, lifting, residual, state_residual, modes = whole
+    sentences, condition = doubts(rows, task.lifting.names, free, regular=ridge != 0 or rank is not None)
+    found = (
+        _whole(task, rows, ridge, method)
+        if rank is None
+        else _reduced(task, rows, ridge, rank, method, sentences)
+    )
     report = FitReport(
         method=task.method,
-        route=f"{task.route}, {cut(task, rows, ridge, rank)}",
+        route=f"{task.route}, {_WORDS[method]}{found.rule}",
         samples=rows.samples,
         condition=condition,
-        rank=used,
+        rank=found.rank,
         columns=rows.P.shape[1],
-        ridge=ridge,
-        residual=residual,
-        state_residual=state_residual,
+        ridge=found.ridge,
+        residual=found.residual,
+        state_residual=found.state_residual,
         warnings=tuple(sentences),
     )
     for sentence in sentences:
         warnings.warn(sentence, FitWarning, stacklevel=3)
-    return LinearPredictor(A, B, C, lifting, task.dt, task.states, task.inputs, report, modes)
+    return LinearPredictor(
+        found.A, found.B, found.C, found.lifting, task.dt, task.states, task.inputs, report, found.modes
+    )
 
 
-Whole = tuple[
-    Float[np.ndarray, "nz nz"],
-    Float[np.ndarray, "nz nu"],
-    Float[np.ndarray, "nx nz"],
-    Lifting,
-    Float[np.ndarray, " nx"],
-    Float[np.ndarray, " nx"],
-    Complex[np.ndarray, "nl nz"] | None,
-]  # A, B, C, lifting, residual, state_residual, exact modes
+class _Found(NamedTuple):
+    A: Float[np.ndarray, "nz nz"]
+    B: Float[np.ndarray, "nz nu"]
+    C: Float[np.ndarray, "nx nz"]
+    lifting: Lifting
+    residual: Float[np.ndarray, " nx"]
+    state_residual: Float[np.ndarray, " nx"]
+    modes: Complex[np.ndarray, "nl nz"] | None
+    rank: int
+    ridge: float
+    rule: str
 
 
-def _whole(task: Regression, rows: Rows, ridge: float) -> tuple[Whole, int]:
-    solution = solve(rows, ridge=ridge, scaled=task.scaled)
+def _whole(task: Regression, rows: Rows, ridge: Ridge, method: Method) -> _Found:
     nz = task.lifting.nz
-    K = solution.K[:, :nz]
-    C = np.eye(nz) if task.C is None else task.C
-    residual = rows.residual(task.x_next, K @ C.T)
+    given = Rows(rows.P, rows.T[:, :nz], rows.rest[:nz], rows.samples)
+    if method == "tls":
+        given = _denoised(task, given, nz)
+    solution = (
+        forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=task.scaled)
+    )
+    K = solution.K
     B = K[nz:].T if task.B is None else task.B
-    return (K[:nz].T, B, C, task.lifting, residual, task.state_residual, None), solution.rank
+    C = np.eye(nz) if task.C is None else task.C
+    return _Found(
+        A=K[:nz].T,
+        B=B,
+        C=C,
+        lifting=task.lifting,
+        residual=rows.residual(task.x_next, K @ C.T),
+        state_residual=task.state_residual,
+        modes=None,
+        rank=solution.rank,
+        ridge=solution.ridge,
+        rule=rule(rows, ridge, solution.ridge, scaled=task.scaled),
+    )
 
 
 def _reduced(
-    task: Regression, rows: Rows, ridge: float, rank: int, sentences: list[str]
-) -> tuple[Whole, int]:
+    task: Regression, rows: Rows, ridge: Ridge, rank: Rank, method: Method, sentences: list[str]
+) -> _Found:
     """Regress on [U_rᵀψ(x) u]; Ã = U_rᵀ X′ V_r Σ_r⁻¹ without input (Tu et al. 2014)."""
     nz = task.lifting.nz
-    if rank > nz:
-        raise DataError(f"rank is {rank}, but the lifting has {nz} observables; pass {nz} or less")
-    Z, free = rows.P[:, :nz], rows.P[:, nz:]
-    _, s, Vt = np.linalg.svd(Z, full_matrices=False)
-    held = int(np.sum(s > cutoff(rows) * s[0]))
-    if held < rank:
-        sentences.append(
-            f"rank-deficient: rank {rank} was asked for, the snapshots have rank {held}, which is taken; "
-            f"pass rank={held}, or collect richer data"
-        )
-    r = max(min(held, rank), 1)
-    basis = np.ascontiguousarray(Vt[:r].T)
-    Z_r = Z @ basis
-    small = Rows(np.hstack([Z_r, free]), rows.T, rows.rest, rows.samples)
-    K = solve(small, ridge=ridge).K
-    forward = K[:r, :nz].T  # X′ V_r Σ_r⁻¹, (nz, r)
+    basis, words = leading(rows, nz, rank, sentences)
+    r = len(basis.T)
+    given = Rows(rows.P, rows.T[:, :nz], rows.rest[:nz], rows.samples)
+    if method == "tls":
+        given = _denoised(task, given, r)
+        basis = leading(given, nz, r, [])[0]
+    P = np.hstack([given.P[:, :nz] @ basis, given.P[:, nz:]])
+    if method == "fb":
+        solution = forward_backward(Rows(P, given.T @ basis, np.zeros(r), rows.samples), r)
+        forward, drive = basis @ solution.K[:r].T, basis @ solution.K[r:].T
+    else:
+        solution = solve(Rows(P, given.T, given.rest, rows.samples), ridge=ridge)
+        forward, drive = solution.K[:r].T, solution.K[r:].T  # forward = X′ V_r Σ_r⁻¹, (nz, r)
     A = basis.T @ forward
-    B = basis.T @ (K[r:, :nz].T if task.B is None else task.B)
+    B = basis.T @ (drive if task.B is None else task.B)
     C = basis if task.C is None else task.C @ basis
-    given = Rows(np.hstack([Z_r, task.rows.P[:, nz:]]), task.rows.T, rows.rest, rows.samples)
-    residual = given.residual(task.x_next, np.vstack([A.T, B.T]) @ C.T)
-    lost = Z - Z_r @ basis.T
-    lost = lost if task.C is None else lost @ task.C.T
-    state_residual = np.hypot(task.state_residual, np.sqrt(np.sum(lost**2, axis=0) / rows.samples))
-    modes = forward @ eigen(A)[1]
-    return (A, B, C, Projected(task.lifting, basis), residual, state_residual, modes), r
+    Z = rows.P[:, :nz]
+    seen = Rows(np.hstack([Z @ basis, task.rows.P[:, nz:]]), task.rows.T, rows.rest, rows.samples)
+    return _Found(
+        A=A,
+        B=B,
+        C=C,
+        lifting=Projected(task.lifting, basis),
+        residual=seen.residual(task.x_next, np.vstack([A.T, B.T]) @ C.T),
+        state_residual=np.hypot(task.state_residual, lost(Z, basis, task.C, rows.samples)),
+        modes=forward @ eigen(A)[1],
+        rank=r,
+        ridge=solution.ridge,
+        rule=words if ridge == 0 else f"{words}, {rule(seen, ridge, solution.ridge)}",
+    )
 
 
-def cut(task: Regression, rows: Rows, ridge: float, rank: int | None) -> str:
-    """Return what the solve cut or added, in words."""
-    if rank is not None:
-        return f"truncated SVD of unscaled columns at rank {rank}"
+def _denoised(task: Regression, rows: Rows, directions: int) -> Rows:
+    """Return the rows without the noise of ψ; a Constant and inputs have none."""
+    nz, one = task.lifting.nz, Constant().bind(task.states).names[0]
+    exact = [*(i for i, name in enumerate(task.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
+    constants = sum(i < nz for i in exact)
+    return denoised(rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=task.scaled)
+
+
+def rule(rows: Rows, asked: Ridge, ridge: float, *, scaled: bool = True) -> str:
+    """Return what a solve without a rank cut or added, in words."""
+    columns = "unit-norm" if scaled else "unscaled"
+    how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
     if ridge > 0:
-        return f"ridge {ridge:g} on unit-norm columns"
-    columns = "unit-norm" if task.scaled else "unscaled"
-    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns"
+        return f"ridge {ridge:.6g} on {columns} columns{how}"
+    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns" + (
+        ", ridge 0" + how if how else ""
+    )

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.identify.ridge import Ridge, cross_validated
+
 
 @dataclass(frozen=True, eq=False)
 class Rows:
@@ -31,21 +33,23 @@ class Rows:
         self, columns: Int[np.ndarray, " c"], K: Float[np.ndarray, "n c"]
     ) -> Float[np.ndarray, " c"]:
         """Return the root-mean-square of T − P K for these columns of T."""
-        error = self.T[:, columns] - self.P @ K
-        return np.sqrt((np.sum(error**2, axis=0) + self.rest[columns]) / self.samples)
+        error = self.P @ K
+        np.subtract(self.T[:, columns], error, out=error)
+        return np.sqrt((np.einsum("ij,ij->j", error, error) + self.rest[columns]) / self.samples)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """K (n, nt), and how many singular directions of P it uses."""
+    """K (n, nt), how many singular directions of P it uses, and the ridge that it was found with."""
 
     K: Float[np.ndarray, "n nt"]
     rank: int
+    ridge: float
 
 
 def norms(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
     """Return the Euclidean norm of each column."""
-    return np.sqrt(np.sum(P**2, axis=0))
+    return np.sqrt(np.einsum("ij,ij->j", P, P))
 
 
 def unit(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
@@ -59,19 +63,25 @@ def cutoff(rows: Rows) -> float:
     return float(np.finfo(float).eps * max(rows.samples, rows.P.shape[1]))
 
 
-def solve(rows: Rows, *, ridge: float = 0.0, scaled: bool = True) -> Solution:
+def solve(rows: Rows, *, ridge: Ridge = 0.0, scaled: bool = True) -> Solution:
     """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag of the columns' norms.
 
     With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
-    takes norm and cut on columns of unit norm, where units of the data mean nothing.
+    takes norm and cut on columns of unit norm, where units of the data mean nothing. "gcv" chooses the ridge by
+    generalised cross-validation.
     """
     size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
     size[size == 0] = 1.0
     U, s, Vt = np.linalg.svd(rows.P / size, full_matrices=False)
-    held = s > cutoff(rows) * s.max(initial=0.0)
+    cut = cutoff(rows)
+    held = s > cut * s.max(initial=0.0)
+    shares = U.T @ rows.T
+    if ridge == "gcv":
+        outside = np.sum((rows.T - U @ shares) ** 2, axis=0) + rows.rest
+        ridge = cross_validated(s, shares, outside, rows.samples, cut)
     gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
-    K = (Vt.T * gain) @ (U.T @ rows.T) / size[:, None]
-    return Solution(K, int(held.sum()))
+    K = (Vt.T * gain) @ shares / size[:, None]
+    return Solution(K, int(held.sum()), ridge)
 
 
 def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:

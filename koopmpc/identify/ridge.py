@@ -1,0 +1,84 @@
+"""The ridge that generalised cross-validation chooses: min M · RSS(λ) / (M − tr H(λ))²."""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+
+Ridge = float | Literal["gcv"]
+
+_ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
+_LARGEST = 1e3  # times σ₁²: beyond it next to nothing is left of K
+_POINTS = 300  # of the first grid, about ten a decade
+_ZOOMS = 5  # each ten times finer than the one before
+
+
+def ridge_of(given: object) -> Ridge:
+    """Return a ridge that is 0 or above, or "gcv"; raise DataError for anything else."""
+    if isinstance(given, str):
+        if given != "gcv":
+            raise DataError(f'ridge is {given!r}; pass a number, or "gcv"')
+        return "gcv"
+    ridge = float(checks.array(given, "ridge", ()))  # pyright: ignore[reportArgumentType]  # array refuses what is none
+    if ridge < 0:
+        raise DataError(f"ridge is {ridge:g}; it must be 0 or above")
+    return ridge
+
+
+def cross_validated(
+    s: Float[np.ndarray, " k"],
+    shares: Float[np.ndarray, "k nt"],
+    outside: Float[np.ndarray, " nt"],
+    samples: int,
+    cut: float,
+) -> float:
+    """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
+
+    Each target counts relative to its own size, so that units mean nothing. A target that P holds to rounding
+    says nothing about noise and is left out; where all are, λ is 0.
+
+    Parameters
+    ----------
+    s
+        Singular values of P on unit-norm columns.
+    shares
+        Uᵀ T.
+    outside
+        Energy of each target that P cannot reach.
+    samples
+        M.
+    cut
+        The smallest λ tried is (cut · σ₁)².
+
+    References
+    ----------
+    Golub, Heath & Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",
+    Technometrics 21, 1979.
+    """
+    live = s > cut * s.max(initial=0.0)
+    energy = np.sum(shares**2, axis=0) + outside
+    lost = outside + np.sum(shares[~live] ** 2, axis=0)
+    noisy = lost > _ROUNDING * energy
+    if samples <= live.sum():  # P reaches every target, with noise and all
+        noisy = energy > 0
+    if not noisy.any() or not live.any():
+        return 0.0
+    power = np.sum(shares[:, noisy] ** 2 / energy[noisy], axis=1)
+    rest = float(np.sum(outside[noisy] / energy[noisy]))
+    squares = s**2
+
+    def score(ridge: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        left = ridge[:, None] / (squares + ridge[:, None])  # I − H along each singular direction
+        free = samples - len(s) + np.sum(left, axis=1)
+        return samples * (left**2 @ power + rest) / free**2
+
+    low, high = (cut * float(s[0])) ** 2, _LARGEST * float(s[0]) ** 2
+    low, high, points = np.log(low), np.log(high), _POINTS
+    for _ in range(_ZOOMS):
+        grid = np.linspace(low, high, points)
+        best = int(np.argmin(score(np.exp(grid))))
+        low, high, points = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, points - 1)]), 21
+    return float(np.exp(0.5 * (low + high)))
