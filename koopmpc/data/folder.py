@@ -71,7 +71,7 @@ class Files(Source):
 
 
 @dataclass(frozen=True, eq=False)
-class FilePart:
+class FilePart(Part):
     """Files that are read as one part."""
 
     files: tuple[Path, ...]

@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sized
 from dataclasses import dataclass
-from typing import Protocol
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -11,12 +10,12 @@ from koopmpc.errors import DataError
 Change = Callable[[Episodes], Episodes]
 
 
-class Part(Protocol):
+class Part(ABC):
     """A share of a source; ``str(part)`` says in messages where it is from."""
 
+    @abstractmethod
     def load(self) -> Episodes:
         """Return its episodes; where it pickles, in another process too."""
-        ...
 
 
 class Source(ABC):
@@ -90,7 +89,7 @@ class Held(Source):
 
     def parts(self, history: int = 0) -> list[Part]:
         """Return the one part."""
-        return [Loaded(self.episodes, "the episodes")]
+        return [Loaded(self.episodes, "these data")]
 
 
 class Changed(Source):
@@ -129,7 +128,7 @@ class Changed(Source):
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
+class Loaded(Part):
     """A part that is in memory."""
 
     episodes: Episodes
@@ -144,7 +143,7 @@ class Loaded:
 
 
 @dataclass(frozen=True, eq=False)
-class ChangedPart:
+class ChangedPart(Part):
     """A part, and what is done to its episodes."""
 
     part: Part

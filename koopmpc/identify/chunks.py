@@ -46,17 +46,22 @@ def table(
     `products` are the observables that u is multiplied with; without them the rows are [ψ(x) u ψ(x⁺)].
     """
     of = episodes.episodes
-    states = [of[i].X[first : last + 1] for i, first, last in chunk]
-    Z = lifting(states[0] if len(states) == 1 else np.concatenate(states))
-    nz, nu = lifting.nz, episodes.nu
+    nz, nu, cuts = lifting.nz, episodes.nu, len(chunk)
     last = nz + nu + nu * len(products)
-    D = np.empty((len(Z) - len(chunk), last + nz))
-    if len(chunk) == 1:
-        D[:, :nz], D[:, last:] = Z[:-1], Z[1:]
+    if cuts == 1:
+        i, first, end = chunk[0]
+        D = np.empty((end - first + 1, last + nz))
+        lifting._lift(of[i].X[first : end + 1], D[:, :nz])
+        D[:-1, last:] = D[1:, :nz]
+        D = D[:-1]
     else:
-        ends = np.cumsum([len(X) for X in states]) - 1
-        now = np.delete(np.arange(len(Z)), ends)
-        D[:, :nz], D[:, last:] = Z[now], Z[now + 1]
+        X = np.concatenate([of[i].X[first : end + 1] for i, first, end in chunk])
+        Z = np.empty((len(X), nz))
+        lifting._lift(X, Z)
+        now = np.ones(len(X), dtype=bool)
+        now[np.cumsum([end - first + 1 for _, first, end in chunk]) - 1] = False
+        D = np.empty((len(X) - cuts, last + nz))
+        D[:, :nz], D[:, last:] = Z[now], Z[1:][now[:-1]]
     if nu:
         U = D[:, nz : nz + nu]
         U[:] = np.concatenate([of[i].U[first:end] for i, first, end in chunk])

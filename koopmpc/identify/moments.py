@@ -1,33 +1,34 @@
 """Second moments of the rows [ψ(x) u ψ(x⁺)], or [ψ(x) u u⊗ψ(x) ψ(x⁺)]: all that the regressions need."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sized
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal
+from functools import cached_property, reduce
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg.lapack import dtpqrt
 
-from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Held, Part, Source, source_of
 from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.chunks import ROWS, chunks, table
+from koopmpc.identify.chunks import ROWS
+from koopmpc.identify.reading import Reading, Route, Sums, absorbed, read, spread
 from koopmpc.identify.solve import Rows, norms
+from koopmpc.identify.weights import Weights
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.state import State
+from koopmpc.parallel import Progress, map_tasks
 from koopmpc.values import Value
 
-Route = Literal["gram", "qr"]
 _WELL_CONDITIONED = 1e6  # scaled cond(Z) up to which normal equations lose nothing
-_PILOT = 4  # least number of chunks that choose the route
-_PANEL = 16  # columns that dtpqrt eliminates at once
+_PILOT = 4  # parts, and least number of chunks, that choose the route
 
 
 @dataclass(frozen=True, eq=False)
 class Moments(Value):
-    """Second moments of the rows d = [ψ(x) u ψ(x⁺)] of M snapshot pairs: G = Σ dᵀd, or R with RᵀR = Σ dᵀd.
+    """Second moments of the rows d = [ψ(x) u ψ(x⁺)] of M snapshot pairs: G = Σ w dᵀd, or R with RᵀR = Σ w dᵀd.
 
     They add: ``a + b`` are the moments of both data sets, in any grouping, to rounding. Where ψ lacks a
     state, the state is appended to it in these rows, so that C and the residuals need no second pass.
@@ -41,7 +42,9 @@ class Moments(Value):
     dt
         Sample time [s].
     samples
-        M.
+        M, the pairs of weight above 0.
+    weight
+        Σ w; M where the pairs are not weighted.
     route
         "gram" for raw sums of products, "qr" for the triangular factor: twice the digits, six times the cost.
     sums
@@ -54,6 +57,7 @@ class Moments(Value):
     inputs: tuple[str, ...]
     dt: float
     samples: int
+    weight: float
     route: str
     sums: Float[np.ndarray, "nd nd"]
     bilinear: bool = False
@@ -105,9 +109,10 @@ class Moments(Value):
                 "the moments differ in lifting, inputs or dt, or one is bilinear; "
                 "add moments of one plant in one lifting only"
             )
-        samples = self.samples + other.samples
+        both = replace(self, samples=self.samples + other.samples, weight=self.weight + other.weight)
         if self.route == other.route == "qr":
-            return replace(self, samples=samples, sums=_absorbed(self.sums, other.sums))
+            R = absorbed(self.sums.copy(order="F"), other.sums.copy(order="F"))
+            return replace(both, sums=np.ascontiguousarray(R))
         if self.route != other.route:
             warnings.warn(
                 "a triangular factor was added to Gram sums: the result is Gram sums, with half the digits; "
@@ -115,15 +120,18 @@ class Moments(Value):
                 FitWarning,
                 stacklevel=2,
             )
-        return replace(self, samples=samples, route="gram", sums=self._gram() + other._gram())
+        return replace(both, route="gram", sums=self._gram() + other._gram())
 
     def rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> Rows:
-        """Return a few rows [P T] with the same second moments as these columns of all M rows."""
-        n = len(regressors)
+        """Return a few rows [P T] with the same second moments as these columns of all M rows.
+
+        Weights are taken with mean 1, so that a root of the mean over M rows is one over the weighted rows.
+        """
+        n, scale = len(regressors), self.samples / self.weight
         if self.route == "qr":
-            R = _triangle(self.sums[:, np.concatenate([regressors, targets])])
+            R = _triangle(np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])])
             return Rows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
-        G = self.sums
+        G = scale * self.sums
         size = np.sqrt(G.diagonal()[regressors])
         size[size == 0] = 1.0
         values, vectors = np.linalg.eigh(G[np.ix_(regressors, regressors)] / np.outer(size, size))
@@ -141,66 +149,124 @@ class Moments(Value):
 
 
 def moments(
-    episodes: Episodes, lifting: Lifting, *, route: Route | None = None, bilinear: bool = False
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    route: Route | None = None,
+    bilinear: bool = False,
+    weights: Weights | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
 ) -> Moments:
-    """Return Σ dᵀd, or its triangular factor, over the rows d = [ψ(x) u ψ(x⁺)] of all snapshot pairs.
+    """Return Σ w dᵀd, or its triangular factor, over the rows d = [ψ(x) u ψ(x⁺)] of all snapshot pairs.
 
-    Chunks of fixed size are lifted, added in order and forgotten: memory does not grow with the data, and
-    one BLAS build and thread count gives one result to the bit. Data too large for memory, or a stream, are
-    fed part by part and added: ``moments(part, lifting, route="qr") + …``.
+    Each part of the source is summed from zero, in chunks that are lifted, added in order and forgotten, and the
+    parts are added in order: memory does not grow with the data, and with one BLAS build and thread count the
+    result is the same to the bit here, on local processes and on a cluster.
 
     Parameters
     ----------
     episodes
-        At least one step in all.
+        Episodes, or a Source: ``Files("logs")``, ``Stream(iterator)``.
     lifting
-        ψ; it is bound to the episodes' states.
+        ψ; it is bound to the states.
     route
         "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a
-        pilot of sampled chunks chooses: Gram up to 1e6, else QR; if the whole is worse, it is read again.
+        pilot, chunks sampled from up to 4 parts, chooses: Gram up to 1e6, else QR; if the whole turns out worse,
+        it is read again. A stream that can be read only once is summed in QR.
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
+    weights
+        w of each pair, 0 or above; by default 1. With Episodes one item an episode, a number or (T,), one a step;
+        with any source a function Episode → number or (T,). They weigh pairs against each other: residuals are
+        weighted means, and a common factor changes nothing.
+    workers, scheduler, progress
+        As in `koopmpc.parallel.map_tasks`: local processes, a Dask cluster, and what is called after each part.
 
     Raises
     ------
     DataError
-        An observable is not finite on the data; an argument is of another kind.
+        An observable is not finite on the data; a weight is negative, or all are 0; a file differs from the first
+        one in dt or names; a stream is read twice; an argument is of another kind.
+    ShapeError
+        The weights do not fit the episodes.
+    LogError
+        A file cannot be read.
+    KoopmpcError
+        A worker died on the same part each time, or no scheduler answers.
     """
-    episodes = episodes_of(episodes)
-    bound = lifting_of(lifting).bind(episodes.states)
-    pieces = chunks(episodes)
+    source = source_of(episodes)
+    bound = lifting_of(lifting).bind(source.states)
+    if not (weights is None or callable(weights) or isinstance(source, Held)):
+        raise DataError(
+            "weights are a list, which only Episodes have an order for; pass a function of an Episode"
+        )
+    task = _Task(source, bound, _products(bound, bilinear), bilinear, weights)
+
+    def whole(route: Route) -> Moments:
+        parts = source.parts()
+        readings = (task.reading(part, route) for part in parts)
+        every = list(readings) if isinstance(parts, Sized) else readings
+        return task.total(
+            map_tasks(read, every, workers=workers, scheduler=scheduler, progress=progress), route
+        )
+
+    if route is None and not source.replayable:
+        route = "qr"
     if route is not None:
-        return _read(episodes, bound, range(len(pieces)), route, bilinear)
-    width = bound.nz + episodes.nu * (1 + len(_products(bound, bilinear)))
-    pilot = _spread(len(pieces), max(_PILOT, -(-4 * width // ROWS)))
-    first = _read(episodes, bound, pilot, "gram", bilinear)
-    if first.condition <= _WELL_CONDITIONED:
-        whole = range(len(pieces))
-        total = first if len(pilot) == len(pieces) else _read(episodes, bound, whole, "gram", bilinear)
+        return whole(route)
+    pilot, complete = task.pilot()
+    if pilot.condition <= _WELL_CONDITIONED:
+        total = pilot if complete else whole("gram")
         if total.condition <= _WELL_CONDITIONED:
             return total
-    return _read(episodes, bound, range(len(pieces)), "qr", bilinear)
+    return whole("qr")
 
 
-def _spread(total: int, wanted: int) -> list[int]:
-    """Return at most `wanted` of the indices 0 … total − 1, evenly spread."""
-    return sorted({round(i * (total - 1) / (wanted - 1)) for i in range(wanted)})
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What a call of `moments` asks for."""
 
+    source: Source
+    lifting: Lifting
+    products: Int[np.ndarray, " np"]
+    bilinear: bool
+    weights: Weights | None
 
-def _read(
-    episodes: Episodes, lifting: Lifting, which: Sequence[int], route: Route, bilinear: bool
-) -> Moments:
-    full, pieces, products = _with_states(lifting), chunks(episodes), _products(lifting, bilinear)
-    width = 2 * full.nz + episodes.nu * (1 + len(products))
-    sums, samples = np.zeros((width, width)), 0
-    for i in which:
-        D = table(episodes, full, pieces[i], products)
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
-            sums = sums + D.T @ D if route == "gram" else _absorbed(sums, D)
-        samples += len(D)
-        size = sums.diagonal() if route == "gram" else np.abs(D).max(axis=0)
-        _require_finite(size, full, episodes.inputs, products)
-    return Moments(lifting, episodes.inputs, episodes.dt, samples, route, sums, bilinear)
+    @cached_property
+    def full(self) -> Lifting:
+        return _with_states(self.lifting)
+
+    def reading(self, part: Part, route: Route, limit: int | None = None) -> Reading:
+        inputs, names = self.source.inputs, self.full.names
+        every = (*names, *inputs, *product_names(self.full, inputs, self.products), *names)
+        return Reading(part, self.full, every, self.products, route, self.weights, limit)
+
+    def pilot(self) -> tuple[Moments, bool]:
+        """Return Gram sums of chunks sampled from a few parts, and whether they are all there are."""
+        parts = self.source.parts()
+        if isinstance(parts, list):
+            chosen = [parts[i] for i in spread(len(parts), _PILOT)]
+            every = len(chosen) == len(parts)
+        else:
+            chosen, every = list(islice(parts, _PILOT)), False
+        width = self.lifting.nz + self.source.nu * (1 + len(self.products))
+        limit = -(-max(_PILOT, -(-4 * width // ROWS)) // len(chosen))
+        read_now = [read(self.reading(part, "gram", limit)) for part in chosen]
+        return self.total(read_now, "gram"), every and all(sums.whole for sums in read_now)
+
+    def total(self, parts: Iterable[Sums], route: Route) -> Moments:
+        """Return the sums of the parts, added in their order."""
+        source = self.source
+        every = (
+            Moments(self.lifting, source.inputs, source.dt, s.samples, s.weight, route, s.sums, self.bilinear)
+            for s in parts
+        )
+        result = reduce(Moments.__add__, every)
+        if result.samples == 0:
+            raise DataError("all weights are 0; give some pair a weight above 0")
+        return result
 
 
 def _products(lifting: Lifting, bilinear: bool) -> Int[np.ndarray, " np"]:
@@ -208,37 +274,15 @@ def _products(lifting: Lifting, bilinear: bool) -> Int[np.ndarray, " np"]:
     return np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
 
 
-def _absorbed(R: Float[np.ndarray, "nd nd"], rows: Float[np.ndarray, "m nd"]) -> Float[np.ndarray, "nd nd"]:
-    """Return the triangular factor of [R; rows]."""
-    if not np.isfinite(rows).all():
-        return np.full_like(R, np.nan)
-    result, _, _, info = dtpqrt(0, min(_PANEL, len(R)), R, rows)
-    assert info == 0, f"dtpqrt refused argument {-info}"
-    return np.ascontiguousarray(np.triu(result))
-
-
-def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
-    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
-
-
-def _require_finite(
-    size: Float[np.ndarray, " nd"], full: Lifting, inputs: tuple[str, ...], which: Int[np.ndarray, " np"]
-) -> None:
-    bad = np.flatnonzero(~np.isfinite(size))
-    if bad.size:
-        products = product_names(full, inputs, which)
-        name = (*full.names, *inputs, *products, *full.names)[int(bad[0])]
-        raise DataError(
-            f"the observable {name!r} is NaN, infinite or above 1e154 on these data; "
-            "drop it, or the episodes where it is"
-        )
-
-
 def product_names(
     lifting: Lifting, inputs: tuple[str, ...], products: Int[np.ndarray, " np"]
 ) -> tuple[str, ...]:
     """Return ``"force [N] * theta [rad]"``, …, in the order of u⊗ψ(x)."""
     return tuple(f"{u} * {lifting.names[int(i)]}" for u in inputs for i in products)
+
+
+def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
+    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
 
 
 def _with_states(lifting: Lifting) -> Lifting:

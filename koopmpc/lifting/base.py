@@ -101,9 +101,7 @@ class Lifting(Value, ABC):
             raise ShapeError(self._misfit(rows.shape[-1] if rows.ndim in (1, 2) else rows.shape))
         table = rows.reshape(-1, nx)
         Z = np.empty((len(table), self.nz))
-        for first in range(0, len(table), _BLOCK):
-            block = slice(first, first + _BLOCK)
-            self._fill(np.ascontiguousarray(table[block].T), Z[block])
+        self._lift(table, Z)
         return Z if rows.ndim == 2 else Z[0]
 
     def symbolic(self, x: ca.SX) -> ca.SX:
@@ -136,6 +134,12 @@ class Lifting(Value, ABC):
         if Value._kinds.get(type(self).__name__) is type(self):
             return self
         return Traced(self._graph, self.names, bound=self._states)
+
+    def _lift(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
+        """Write ψ of the rows of X into the rows of Z, a block at a time."""
+        for first in range(0, len(X), _BLOCK):
+            block = slice(first, first + _BLOCK)
+            self._fill(np.ascontiguousarray(X[block].T), Z[block])
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         """Write ψ of the columns of x into the rows of Z."""

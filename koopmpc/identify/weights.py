@@ -1,0 +1,44 @@
+"""Weights of snapshot pairs: Σ w dᵀd, so that a pair of weight 2 counts as if it came twice."""
+
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, ShapeError
+
+Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
+Steps = list[Float[np.ndarray, " T"]]  # of each episode, one a step
+
+
+def weights_of(weights: Weights, episodes: Episodes) -> Steps:
+    """Return the weight of each step of each episode.
+
+    Raises
+    ------
+    ShapeError
+        There is not one item an episode, or an item is neither a number nor one a step.
+    DataError
+        A weight is below zero or not finite.
+    """
+    if callable(weights):
+        given = [weights(episode) for episode in episodes]
+    else:
+        given = list(cast("Sequence[ArrayLike]", weights))
+        if len(given) != len(episodes):
+            raise ShapeError(
+                f"there are {len(given)} weights and {len(episodes)} episodes; give each episode a number, or "
+                "an array of one a step"
+            )
+    steps = [
+        checks.vector(item, f"the weight of episode {i}", len(episode))
+        for i, (item, episode) in enumerate(zip(given, episodes, strict=True))
+    ]
+    for i, own in enumerate(steps):
+        if own.min() < 0:
+            raise DataError(f"the weight of episode {i} is {own.min():g}; weights are 0 or above")
+    return steps
