@@ -32,6 +32,11 @@ from koopmpc.errors import (
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.kalman import LiftedKalman
 from koopmpc.estimate.observer import Estimator
+from koopmpc.figures.eigenfunctions import plot_eigenfunctions
+from koopmpc.figures.error import plot_error
+from koopmpc.figures.series import plot_rollout, plot_run
+from koopmpc.figures.spectrum import plot_spectrum
+from koopmpc.figures.style import save as save_figure
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.dmd import dmd, dmdc
 from koopmpc.identify.edmd import edmd
@@ -167,8 +172,14 @@ __all__ = [
     "lqr",
     "metrics",
     "moments",
+    "plot_eigenfunctions",
+    "plot_error",
+    "plot_rollout",
+    "plot_run",
+    "plot_spectrum",
     "reconstruct",
     "record",
+    "save_figure",
     "score",
     "simulate",
     "sweep",

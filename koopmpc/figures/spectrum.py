@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LEAST = 1e-12  # residuals below it are rounding
+_CROWDED = 0.35  # share of the picture below which the eigenvalues get one of their own
 
 
 @styled
@@ -51,25 +52,41 @@ def plot_spectrum(
     values: Any = predictor.eigenvalues
     known = None if residuals is None else checked_residuals(residuals, len(values))
     limit = checks.positive(tolerance, "tolerance")
-    made, grid = figure(height=3.1)
-    axes = grid[0, 0]
-    turn = np.linspace(0, 2 * np.pi, 361)
-    axes.plot(np.cos(turn), np.sin(turn), color="#555555", linewidth=0.9, gid="unit circle")
-    if known is None:
-        axes.plot(values.real, values.imag, "o", color="#0072b2", markeredgecolor="black", gid="eigenvalues")
-    else:
-        _with_residuals(made, axes, values, known, limit)
+    whole = 1.12 * max(1.0, float(np.abs(values).max(initial=0.0)))
+    views = [(0.0, 0.0, whole)]
+    middle, half = _box(values)
+    if half < _CROWDED * whole:
+        views.append((middle.real, middle.imag, 1.4 * half + 1e-3))
+    made, grid = figure(1, len(views), width="one column" if len(views) == 1 else "two columns", height=3.1)
+    turn = np.linspace(0, 2 * np.pi, 721)
+    points: Any = None
+    for axes, (x, y, size) in zip(grid[0], views, strict=True):
+        axes.plot(np.cos(turn), np.sin(turn), color="#555555", linewidth=0.9, gid="unit circle")
+        if known is None:
+            axes.plot(
+                values.real, values.imag, "o", color="#0072b2", markeredgecolor="black", gid="eigenvalues"
+            )
+        else:
+            points = _with_residuals(axes, values, known, limit)
+        axes.set(xlim=(x - size, x + size), ylim=(y - size, y + size), aspect="equal")
+        axes.set(xlabel="Re λ", ylabel="Im λ", title="closer" if size < whole else "")
+    if known is not None:
+        made.colorbar(points, ax=grid[0, -1], label="residual of the eigenpair", shrink=0.85)
         fine: dict[str, Any] = {"marker": "o", "color": "#404040", "label": f"residual ≤ {limit:g}"}
         bad: dict[str, Any] = {
             "marker": "x",
             "color": "black",
-            "label": f"above: may be spurious ({np.sum(known > limit)})",
+            "label": f"above: may be spurious ({np.sum(known > limit)} of {len(known)})",
         }
         handles = [Line2D([], [], linestyle="none", **look) for look in (fine, bad)]
         made.legend(handles=handles, loc="outside lower center", ncols=2, handlelength=1.0)
-    size = 1.12 * max(1.0, float(np.abs(values).max(initial=0.0)))
-    axes.set(xlim=(-size, size), ylim=(-size, size), aspect="equal", xlabel="Re λ", ylabel="Im λ")
     return made
+
+
+def _box(values: Any) -> tuple[complex, float]:
+    """Return the middle of the eigenvalues and half the side of a square that holds them."""
+    low, high = values.real.min() + 1j * values.imag.min(), values.real.max() + 1j * values.imag.max()
+    return (low + high) / 2, max((high - low).real, (high - low).imag) / 2
 
 
 def checked_residuals(residuals: ArrayLike, nz: int) -> np.ndarray:
@@ -80,27 +97,32 @@ def checked_residuals(residuals: ArrayLike, nz: int) -> np.ndarray:
     return known
 
 
-def _with_residuals(made: Any, axes: Any, values: Any, residuals: np.ndarray, limit: float) -> None:
-    from matplotlib.colors import LogNorm
+def _with_residuals(axes: Any, values: Any, residuals: np.ndarray, limit: float) -> Any:
+    """Draw the points and return them: the smaller the residual the darker and larger."""
+    import matplotlib as mpl
+    from matplotlib.colors import ListedColormap, LogNorm
 
     shown = np.maximum(residuals, _LEAST)
     low, high = min(float(shown.min()), limit / 10), max(float(shown.max()), limit * 10)
     norm = LogNorm(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
     sizes = 12.0 + 40.0 * (1.0 - np.asarray(norm(shown)))
+    shades = ListedColormap(
+        mpl.colormaps[SEQUENTIAL](np.linspace(0, 0.85, 256))
+    )  # its end is too light for points
     points = None
     for chosen, marker in ((residuals <= limit, "o"), (residuals > limit, "x")):
-        look = {"edgecolors": "black"} if marker == "o" else {}
+        look: dict[str, Any] = {"edgecolors": "black"} if marker == "o" else {}
         points = axes.scatter(
             values.real[chosen],
             values.imag[chosen],
             c=shown[chosen],
             s=sizes[chosen],
             marker=marker,
-            cmap=SEQUENTIAL,
+            cmap=shades,
             norm=norm,
             linewidths=0.5 if marker == "o" else 1.3,
             zorder=3,
             gid="eigenvalues" if marker == "o" else "spurious eigenvalues",
             **look,
         )
-    made.colorbar(points, ax=axes, label="residual of the eigenpair", shrink=0.85)
+    return points

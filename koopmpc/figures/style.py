@@ -139,11 +139,11 @@ def line(i: int, points: int = 0) -> dict[str, Any]:
 
 
 def band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = None) -> None:
-    """Shade from `low` to `high` in the colour of the i-th curve, with thin edges that print in grey."""
-    color = line(i)["color"]
-    axes.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0.0, label=label)
+    """Shade from `low` to `high` in the colour of the i-th curve, with thin edges in its dashes that print in grey."""
+    look = line(i)
+    axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0, label=label)
     for edge in (low, high):
-        axes.plot(x, edge, color=color, linewidth=0.5, alpha=0.7)
+        axes.plot(x, edge, color=look["color"], linestyle=look["linestyle"], linewidth=0.6)
 
 
 @styled

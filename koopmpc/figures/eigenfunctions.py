@@ -1,0 +1,135 @@
+"""plot_eigenfunctions: φ_j over a plane of two states, magnitude and phase."""
+# pyright: basic
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from koopmpc.figures.style import SEQUENTIAL, Width, figure, styled
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.plane import Axes, Over, Plane, eigenfunctions_on, plane_through
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_CUT = 0.8 * np.pi  # no lines of equal phase near ±π, where it jumps
+_QUARTERS = {-np.pi / 2: "−π/2", 0.0: "0", np.pi / 2: "π/2"}
+
+
+@styled
+def plot_eigenfunctions(
+    predictor: LinearPredictor,
+    which: int | Sequence[int],
+    plane: Axes,
+    over: Over,
+    *,
+    at: ArrayLike | None = None,
+    points: int = 121,
+) -> "Figure":
+    """Draw φ_j(x) = ξ_jᴴ ψ(x) over two states: |φ_j| and its phase; of a real eigenvalue φ_j itself.
+
+    The largest |φ_j| of the plane is 1. Level sets of |φ_j| are where the motion goes in step, of the phase where
+    it goes at one time.
+
+    Parameters
+    ----------
+    predictor
+        Linear.
+    which
+        Indices j in the order of ``predictor.eigenvalues``.
+    plane
+        The two states, by index or name: across, up.
+    over
+        Two ranges ((low, high), (low, high)), or episodes: then what they cover.
+    at
+        (nx,) what the other states are held at; by default the median of the episodes, else 0.
+    points
+        Grid lines along each axis.
+
+    Raises
+    ------
+    DataError
+        There is no such eigenfunction or state, a range is empty, A is defective, or φ_j is 0 on the plane.
+    """
+    grid = plane_through(predictor.states, plane, over, at, points)
+    phi = eigenfunctions_on(predictor, which, grid)
+    chosen = [which] if isinstance(which, int | np.integer) else list(which)
+    values: Any = predictor.eigenvalues[chosen]
+    real = values.imag == 0
+    cells: list[tuple[int, str]] = []
+    for k, alone in enumerate(real):
+        if not alone and len(cells) % 2:
+            cells.append((k, "empty"))  # magnitude and phase stand side by side
+        cells += [(k, "real")] if alone else [(k, "magnitude"), (k, "phase")]
+    columns = min(len(cells), 2)
+    rows = -(-len(cells) // columns)
+    width: Width = "one column" if columns == 1 else "two columns"
+    made, axes = figure(rows, columns, width=width, height=0.4 + 2.4 * rows)
+    drawn = axes.flat[: len(cells)]
+    for panel, (k, kind) in zip(drawn, cells, strict=True):
+        _draw(made, panel, grid, phi[k], values[k], f"φ{_subscript(chosen[k])}", kind)
+    for empty in (
+        *axes.flat[len(cells) :],
+        *(p for p, (_, kind) in zip(drawn, cells, strict=True) if kind == "empty"),
+    ):
+        empty.remove()
+    return made
+
+
+def _draw(made: Any, axes: Any, plane: Plane, phi: Any, value: complex, name: str, kind: str) -> None:
+    match kind:
+        case "real":
+            _surface(made, axes, plane, phi.real, name)
+        case "magnitude":
+            _surface(made, axes, plane, np.abs(phi), f"|{name}|")
+        case "phase":
+            _phase(made, axes, plane, np.angle(phi), f"phase of {name} [rad]")
+        case _:
+            return
+    turn = "" if value.imag == 0 else f" {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
+    axes.set(title=f"λ = {value.real:.4g}{turn}", xlabel=plane.names[0], ylabel=plane.names[1])
+    axes.grid(visible=False)
+
+
+def _subscript(j: int) -> str:
+    return str(j).translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
+
+
+def _surface(made: Any, axes: Any, plane: Plane, values: np.ndarray, label: str) -> None:
+    """Draw the values as shades, and lines of equal value that are labelled; dashed below zero."""
+    mesh = axes.pcolormesh(
+        plane.across, plane.up, values, cmap=SEQUENTIAL, shading="gouraud", rasterized=True
+    )
+    made.colorbar(mesh, ax=axes, label=label)
+    if np.ptp(values) > 1e-9:
+        lines = axes.contour(plane.across, plane.up, values, levels=6, colors="white", linewidths=0.7)
+        axes.clabel(lines, fontsize=6, fmt="%g")
+
+
+def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) -> None:
+    """Draw the phase in colours that close at ±π, with lines at the quarters that can be read in grey."""
+    mesh = axes.pcolormesh(
+        plane.across,
+        plane.up,
+        phase,
+        cmap="twilight",
+        vmin=-np.pi,
+        vmax=np.pi,
+        shading="nearest",
+        rasterized=True,
+    )
+    bar = made.colorbar(mesh, ax=axes, label=label)
+    bar.set_ticks([-np.pi, *_QUARTERS, np.pi], labels=["−π", *_QUARTERS.values(), "π"])
+    inner = np.where(np.abs(phase) < _CUT, phase, np.nan)
+    inside = np.abs(inner[np.isfinite(inner)])
+    if inside.size and np.ptp(phase) > 1e-9:
+        look: dict[str, Any] = {
+            "levels": list(_QUARTERS),
+            "colors": "black",
+            "linewidths": 0.8,
+            "linestyles": ["--", "-", ":"],
+        }
+        lines = axes.contour(plane.across, plane.up, inner, **look)
+        axes.clabel(lines, fontsize=6, fmt=_QUARTERS)

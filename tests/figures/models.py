@@ -1,0 +1,31 @@
+"""A linear plant that its predictor knows to the digit, and one that it does not."""
+
+import numpy as np
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.lifting.state import State
+from koopmpc.predict.linear import LinearPredictor
+
+STATES, INPUTS = ("angle [rad]", "rate [rad/s]"), ("torque [N m]",)
+DT = 0.1
+
+
+def turning(radius: float = 0.95, angle: float = 0.3) -> LinearPredictor:
+    A = radius * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return LinearPredictor(A, [[0.0], [1.0]], np.eye(2), State(), DT, STATES, INPUTS)
+
+
+def episodes(count: int = 12, steps: int = 30, noise: float = 0.0) -> Episodes:
+    rng, model = np.random.default_rng(4), turning()
+    made = []
+    for _ in range(count):
+        U = rng.normal(size=(steps, 1))
+        X = model.rollout(rng.normal(size=2), U)
+        made.append(Episode(X=X + noise * rng.normal(size=X.shape), U=U))
+    return Episodes(made, DT, STATES, INPUTS)
+
+
+def curve(axes, label: str):
+    """Return x and y of the curve with this label."""
+    (found,) = [one for one in axes.get_lines() if one.get_label() == label]
+    return found.get_xdata(), found.get_ydata()

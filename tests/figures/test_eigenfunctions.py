@@ -1,0 +1,61 @@
+"""Eigenfunctions of a known linear system over its plane."""
+
+import numpy as np
+import pytest
+
+from koopmpc.errors import DataError
+from koopmpc.figures.eigenfunctions import plot_eigenfunctions
+from koopmpc.figures.style import save
+from koopmpc.lifting.state import State
+from koopmpc.predict.linear import LinearPredictor
+from tests.figures.models import STATES, episodes, turning
+
+SQUARE = [(-1, 1), (-2, 2)]
+
+
+def _mesh(axes):
+    return np.asarray(axes.collections[0].get_array()).reshape(-1)
+
+
+def test_magnitude_and_phase_of_a_turn() -> None:
+    model = turning()
+    made = plot_eigenfunctions(model, 0, ("angle", "rate"), SQUARE, points=20)
+    magnitude, phase = made.axes[:2]
+    y, x = (g.reshape(-1) for g in np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-1, 1, 20), indexing="ij"))
+    assert _mesh(magnitude) == pytest.approx(np.hypot(x, y) / np.sqrt(5))
+    turn = _mesh(phase) - np.sign(model.eigenvalues[0].imag) * np.arctan2(y, x)
+    assert np.ptp(np.angle(np.exp(1j * (turn - turn[0])))) < 1e-9
+    for axes in (magnitude, phase):
+        assert (axes.get_xlabel(), axes.get_ylabel()) == STATES
+        assert "λ = 0.9076 " in axes.get_title()
+    assert {"|φ₀|", "phase of φ₀ [rad]"} <= {axes.get_ylabel() for axes in made.axes}
+
+
+def test_real_eigenfunctions_are_one_picture_each_and_pairs_stand_side_by_side(tmp_path) -> None:
+    A = np.zeros((3, 3))
+    A[0, 0], A[1:, 1:] = 0.99, turning().A
+    model = LinearPredictor(A, np.zeros((3, 0)), np.eye(3), State(), 0.1, ["a [m]", "b", "c"], [])
+    made = plot_eigenfunctions(model, [0, 1], ("a", "b"), [(-1, 1), (0, 1)], points=11)
+    labels = [axes.get_ylabel() for axes in made.axes if axes.get_label() == "<colorbar>"]
+    assert labels == ["φ₀", "|φ₁|", "phase of φ₁ [rad]"]
+    a = np.tile(np.linspace(-1, 1, 11), 11)
+    drawn = _mesh(made.axes[0])
+    assert drawn * np.sign(drawn[-1]) == pytest.approx(a)
+    save(made, tmp_path / "a.pdf")
+    only = plot_eigenfunctions(model, [0], ("a", "b"), [(-1, 1), (0, 1)], points=5)
+    assert [axes.get_ylabel() for axes in only.axes] == ["b", "φ₀"]
+
+
+def test_episodes_give_the_ranges() -> None:
+    data = episodes(3)
+    X = np.concatenate([episode.X for episode in data])
+    axes = plot_eigenfunctions(turning(), 1, (1, 0), data, points=9).axes[0]
+    assert axes.get_xlim() == pytest.approx((X[:, 1].min(), X[:, 1].max()))
+    assert axes.get_ylim() == pytest.approx((X[:, 0].min(), X[:, 0].max()))
+
+
+def test_messages() -> None:
+    with pytest.raises(DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
+        plot_eigenfunctions(turning(), 2, (0, 1), SQUARE)
+    with pytest.raises(DataError, match=r"asked for state 'x'; the states are angle \[rad\]"):
+        plot_eigenfunctions(turning(), 0, ("x", 1), SQUARE)

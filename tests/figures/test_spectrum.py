@@ -1,0 +1,75 @@
+"""The unit circle, the eigenvalues where they are, and their residuals by colour, size and shape."""
+
+import numpy as np
+import pytest
+
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.figures.spectrum import plot_spectrum
+from koopmpc.lifting.state import State
+from koopmpc.predict.bilinear import BilinearPredictor
+from koopmpc.predict.linear import LinearPredictor
+from tests.figures.models import turning
+
+VALUES = np.array([1.2, -0.9, 0.5, 0.1])
+
+
+def _diagonal() -> LinearPredictor:
+    return LinearPredictor(np.diag(VALUES), np.zeros((4, 0)), np.eye(4), State(), 0.1, list("abcd"), [])
+
+
+def _named(axes, gid: str):
+    (found,) = [a for a in axes.get_children() if a.get_gid() == gid]
+    return found
+
+
+@pytest.mark.parametrize("residuals", [None, [0.0, 1e-3]])
+def test_the_circle_has_radius_one_and_the_points_are_the_eigenvalues(residuals) -> None:
+    model = turning()
+    made = plot_spectrum(model, residuals, tolerance=0.1)
+    axes = made.axes[0]
+    assert np.hypot(*_named(axes, "unit circle").get_data()) == pytest.approx(1.0)
+    points = _named(axes, "eigenvalues")
+    drawn = np.asarray(points.get_xydata() if residuals is None else points.get_offsets())
+    assert drawn[:, 0] + 1j * drawn[:, 1] == pytest.approx(model.eigenvalues)
+    assert axes.get_aspect() == 1.0
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Re λ", "Im λ")
+
+
+def test_residuals_are_shades_sizes_and_shapes() -> None:
+    residuals = np.array([1e-6, 1e-3, 0.5, 3.0])
+    made = plot_spectrum(_diagonal(), residuals, tolerance=0.1)
+    good, bad = (_named(made.axes[0], gid) for gid in ("eigenvalues", "spurious eigenvalues"))
+    assert np.array_equal(good.get_offsets()[:, 0], VALUES[:2])
+    assert np.array_equal(bad.get_offsets()[:, 0], VALUES[2:])
+    assert np.array_equal([*good.get_array(), *bad.get_array()], residuals)
+    assert (np.diff([*good.get_sizes(), *bad.get_sizes()]) < 0).all()
+    assert any("residual" in axes.get_ylabel() for axes in made.axes)
+    assert [text.get_text() for text in made.legends[0].get_texts()] == [
+        "residual ≤ 0.1",
+        "above: may be spurious (2 of 4)",
+    ]
+
+
+def test_eigenvalues_that_crowd_are_drawn_closer() -> None:
+    crowded = plot_spectrum(turning(0.999, 0.01))
+    x, y = (crowded.axes[1].get_xlim(), crowded.axes[1].get_ylim())
+    assert len(crowded.axes) == 2
+    assert x[0] < 0.999 * np.cos(0.01) < x[1] < 1.2
+    assert -0.2 < y[0] < -0.01 < 0.01 < y[1]
+    assert len(plot_spectrum(_diagonal()).axes) == 1
+
+
+def test_a_bilinear_predictor_has_a_spectrum_too() -> None:
+    model = BilinearPredictor(
+        np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), State(), 0.1, "ab", "u"
+    )
+    assert _named(plot_spectrum(model).axes[0], "eigenvalues").get_xdata() == pytest.approx([0.5, 0.5])
+
+
+def test_messages() -> None:
+    with pytest.raises(ShapeError, match=r"residuals has shape \(3,\), expected \(2,\)"):
+        plot_spectrum(turning(), [0, 0, 0])
+    with pytest.raises(DataError, match="residuals holds -1; they are norms, from 0 on"):
+        plot_spectrum(turning(), [0, -1])
+    with pytest.raises(DataError, match="tolerance is 0; it must be above zero"):
+        plot_spectrum(turning(), tolerance=0.0)
