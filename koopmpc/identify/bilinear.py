@@ -2,16 +2,18 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning, ObservableError
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
 from koopmpc.identify.fit import rule
-from koopmpc.identify.moments import Moments, moments, product_names
+from koopmpc.identify.moments import How, Moments, moments, product_names
 from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.ridge import Ridge, ridge_of
 from koopmpc.identify.solve import Rows, solve
@@ -22,13 +24,14 @@ from koopmpc.predict.report import FitReport
 
 
 def bilinear_edmd(
-    episodes: Episodes,
+    episodes: Episodes | Source,
     lifting: Lifting,
     *,
     ridge: Ridge = 0.0,
     rank: Rank = None,
     products: Sequence[str] | None = None,
     difference: bool = False,
+    **how: Unpack[How],
 ) -> BilinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
 
@@ -37,7 +40,7 @@ def bilinear_edmd(
     Parameters
     ----------
     episodes
-        With inputs; no pair spans two of them.
+        With inputs, or a Source of such; no pair spans two of them.
     lifting
         ψ: R^nx → R^nz. C picks the states where it holds them, by name, else it is fitted.
     ridge
@@ -52,6 +55,8 @@ def bilinear_edmd(
         Regress ψ(x⁺) − ψ(x), and A = I + what is found. Without a ridge and on independent columns it is the same
         model; a ridge, or a cut, then draws z⁺ towards z ("nothing changes") instead of towards zero, which is
         nearer the truth for a short dt.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
 
     Raises
     ------
@@ -71,19 +76,20 @@ def bilinear_edmd(
     Bruder, Fu & Vasudevan, "Advantages of bilinear Koopman realizations for the modeling and control of systems
     with unknown dynamics", IEEE Robot. Autom. Lett. 6, 2021.
     """
-    if episodes_of(episodes).nu == 0:
+    source = source_of(episodes)
+    if source.nu == 0:
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
-    if episodes.nw:
+    if source.nw:
         raise DataError("the episodes hold measured disturbances, which a bilinear fit leaves out; use edmd")
     ridge = ridge_of(ridge)
     if rank is not None and products is not None:
         raise DataError(
             "a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two"
         )
-    total = moments(episodes, lifting, bilinear=True)
+    total = moments(source, lifting, bilinear=True, **how)
     task = regression(total, "bilinear_edmd")
     assert task.C is not None, "an extended regression has its C"
-    bound, nz, nu = task.lifting, total.nz, episodes.nu
+    bound, nz, nu = task.lifting, total.nz, source.nu
     which = total.products if products is None else _named(total, products)
     given = _with_products(task.rows, total, which)
     names = product_names(bound, total.inputs, which)

@@ -1,16 +1,18 @@
 """Dynamic mode decomposition on the states themselves, without and with inputs."""
 
 from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
 from koopmpc.identify.fit import Method, Regression, fit
-from koopmpc.identify.moments import moments
+from koopmpc.identify.moments import How, moments
 from koopmpc.identify.rank import Rank
 from koopmpc.identify.solve import Rows
 from koopmpc.identify.total import complete
@@ -18,7 +20,9 @@ from koopmpc.lifting.state import State
 from koopmpc.predict.linear import LinearPredictor
 
 
-def dmd(episodes: Episodes, *, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
+def dmd(
+    episodes: Episodes | Source, *, rank: Rank = None, method: Method = "ls", **how: Unpack[How]
+) -> LinearPredictor:
     """Fit x⁺ = A x, A = X′X⁺ by truncated SVD of the unscaled snapshots; inputs in the data are left out.
 
     With fewer snapshots than states it works on the small side, and with `rank` it forms no (nx, nx) array.
@@ -26,7 +30,7 @@ def dmd(episodes: Episodes, *, rank: Rank = None, method: Method = "ls") -> Line
     Parameters
     ----------
     episodes
-        Snapshots; no pair spans two episodes.
+        Snapshots, or a Source of them; no pair spans two episodes.
     rank
         Keep r singular vectors: z = U_rᵀ x, A = Ã (r, r), C = U_r, exact modes X′ V Σ⁻¹ W. By default
         singular values below eps · max(M, nx) of the largest are cut, and A is (nx, nx). A share in (0, 1)
@@ -36,6 +40,8 @@ def dmd(episodes: Episodes, *, rank: Rank = None, method: Method = "ls") -> Line
         "ls", least squares: noise in x shrinks A, so that modes seem to decay faster. "tls", total least
         squares, takes x and x⁺ as noisy alike; "fb" fits forward and backward, A = (A_f A_b⁻¹)^½, which needs
         no noise of one size, but a motion that can be run backward.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
 
     Raises
     ------
@@ -53,24 +59,32 @@ def dmd(episodes: Episodes, *, rank: Rank = None, method: Method = "ls") -> Line
     Hemati, Williams & Rowley, "Characterizing and correcting for the effect of sensor noise in the dynamic mode
     decomposition", Exp. Fluids 57, 2016.
     """
-    return fit(_regression(episodes, "dmd", inputs=(), noisy=method != "ls"), rank=rank, method=method)
+    task = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", how=how)
+    return fit(task, rank=rank, method=method)
 
 
 def dmdc(
-    episodes: Episodes, *, rank: Rank = None, B: ArrayLike | None = None, method: Method = "ls"
+    episodes: Episodes | Source,
+    *,
+    rank: Rank = None,
+    B: ArrayLike | None = None,
+    method: Method = "ls",
+    **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit x⁺ = A x + B u by truncated SVD of the unscaled snapshots [X; U], or of X alone where B is known.
 
     Parameters
     ----------
     episodes
-        Snapshots with inputs.
+        Snapshots with inputs, or a Source of them.
     rank
         Keep r singular vectors of X, as in `dmd`; the cut without it is also that of `dmd`.
     B
         (nx, nu), known; identified by default.
     method
         As in `dmd`; inputs are exact in "tls" and "fb".
+    **how
+        As in `dmd`.
 
     Raises
     ------
@@ -86,35 +100,38 @@ def dmdc(
     ----------
     Proctor, Brunton & Kutz, "Dynamic mode decomposition with control", SIAM J. Appl. Dyn. Syst. 15, 2016.
     """
-    if episodes_of(episodes).nu == 0:
+    source = source_of(episodes)
+    if source.nu == 0:
         raise DataError("the episodes have no inputs; pass them to dmd, or give each Episode its U")
-    if episodes.nw:
+    if source.nw:
         raise DataError(
             "the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()"
         )
-    known = None if B is None else checks.array(B, "B", (episodes.nx, episodes.nu))
-    task = _regression(episodes, "dmdc", inputs=episodes.inputs, B=known, noisy=method != "ls")
+    known = None if B is None else checks.array(B, "B", (source.nx, source.nu))
+    task = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", how=how)
     return fit(task, rank=rank, method=method)
 
 
 def _regression(
-    episodes: Episodes,
+    source: Source,
     method: str,
     *,
     inputs: tuple[str, ...],
     B: Float[np.ndarray, "nx nu"] | None = None,
     noisy: bool,
+    how: How,
 ) -> Regression:
     """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
-    lifting = State().bind(episodes_of(episodes).states)
-    nx, nu = episodes.nx, len(inputs)
+    lifting = State().bind(source.states)
+    nx, nu = source.nx, len(inputs)
+    episodes = source.episodes if isinstance(source, Held) and how.get("weights") is None else ()
     pairs = sum(len(e) for e in episodes)
-    if pairs < nx + nu:  # the snapshots themselves are the few rows
+    if 0 < pairs < nx + nu:  # the snapshots themselves are the few rows
         X, X_next = _stacked([e.X[:-1] for e in episodes]), _stacked([e.X[1:] for e in episodes])
         P = np.hstack([X, _stacked([e.U for e in episodes])]) if nu else X
         rows = Rows(P, X_next, np.zeros(nx), pairs)
     else:
-        total = moments(episodes, lifting, route="qr")
+        total = moments(source, lifting, route="qr", **how)
         columns = total.regressors[: nx + nu]
         rows = complete(total, columns) if noisy else total.rows(columns, total.targets)
     return Regression(
@@ -123,9 +140,9 @@ def _regression(
         rows=rows,
         x_next=np.arange(nx),
         lifting=lifting,
-        states=episodes.states,
+        states=source.states,
         inputs=inputs,
-        dt=episodes.dt,
+        dt=source.dt,
         C=None,
         state_residual=np.zeros(nx),
         B=B,

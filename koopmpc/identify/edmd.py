@@ -1,11 +1,14 @@
 """Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x)."""
 
+from typing import Unpack
+
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
 from koopmpc.identify.fit import Method, Regression, fit
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.moments import How, Moments, moments
 from koopmpc.identify.rank import Rank
 from koopmpc.identify.ridge import Ridge
 from koopmpc.identify.solve import solve
@@ -15,7 +18,13 @@ from koopmpc.predict.linear import LinearPredictor
 
 
 def edmd(
-    episodes: Episodes, lifting: Lifting, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls"
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    ridge: Ridge = 0.0,
+    rank: Rank = None,
+    method: Method = "ls",
+    **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
 
@@ -25,7 +34,7 @@ def edmd(
     Parameters
     ----------
     episodes
-        No pair spans two of them.
+        No pair spans two of them. A Source, ``Files("logs")`` say, is read in parts that memory need not hold.
     lifting
         ψ: R^nx → R^nz.
     ridge
@@ -41,6 +50,8 @@ def edmd(
         "ls", least squares: noise in ψ(x) shrinks A. "tls", total least squares, takes ψ(x) and ψ(x⁺) as noisy
         alike, relative to each observable's size; inputs and a Constant as exact. "fb", forward and backward,
         supposes no sizes, but that the motion can be run backward. Both suppose that noise in x adds to ψ(x).
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
 
     Raises
     ------
@@ -58,12 +69,12 @@ def edmd(
     Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
     25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
     """
-    episodes = episodes_of(episodes)
-    task = regression(moments(episodes.driven(), lifting), "edmd", noisy=method != "ls")
+    source = source_of(episodes)
+    task = regression(moments(source.driven(), lifting, **how), "edmd", noisy=method != "ls")
     fitted = fit(task, ridge=ridge, rank=rank, method=method)
-    if not episodes.nw:
+    if not source.nw:
         return fitted
-    B, E = np.split(fitted.B, [episodes.nu], axis=1)
+    B, E = np.split(fitted.B, [source.nu], axis=1)
     return LinearPredictor(
         fitted.A,
         B,
@@ -71,11 +82,11 @@ def edmd(
         fitted.lifting,
         fitted.dt,
         fitted.states,
-        episodes.inputs,
+        source.inputs,
         fitted.report,
         fitted.exact_modes,
         E,
-        episodes.disturbances,
+        source.disturbances,
     )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sized
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import islice
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -146,6 +147,15 @@ class Moments(Value):
 
     def _gram(self) -> Float[np.ndarray, "nd nd"]:
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
+
+
+class How(TypedDict, total=False):
+    """How the moments are read; the fits take these keywords, too, and `moments` says what they mean."""
+
+    weights: Weights | None
+    workers: int | None
+    scheduler: str | None
+    progress: Progress | None
 
 
 def moments(
