@@ -18,7 +18,10 @@ from koopmpc.control.riccati import Gain, dlqr, lqr
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes, Snapshots
 from koopmpc.data.excitation import PRBS, Chirp, Feedback, Multisine, Noise
+from koopmpc.data.folder import Files
+from koopmpc.data.source import Source
 from koopmpc.data.storage import load_episodes
+from koopmpc.data.stream import Stream
 from koopmpc.errors import (
     DataError,
     DefinitenessError,
@@ -106,6 +109,7 @@ __all__ = [
     "Fallback",
     "Fault",
     "Feedback",
+    "Files",
     "FitReport",
     "FitWarning",
     "Fourier",
@@ -146,10 +150,12 @@ __all__ = [
     "SimulatedPlant",
     "Snapshots",
     "SolverFailure",
+    "Source",
     "State",
     "Status",
     "Step",
     "StepMap",
+    "Stream",
     "ThinPlate",
     "Training",
     "Uniform",
