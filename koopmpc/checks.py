@@ -138,6 +138,14 @@ def members(value: object, name: str, needed: Sequence[str], advice: str) -> Non
         raise DataError(f"{name} is a {type(value).__name__} and has no {', '.join(missing)}; {advice}")
 
 
+def kind(value: object, name: str, wanted: type | tuple[type, ...], advice: str) -> None:
+    """Raise where `value` is of another class than `wanted`."""
+    if not isinstance(value, wanted):
+        classes = wanted if isinstance(wanted, tuple) else (wanted,)
+        names = " or a ".join(each.__name__ for each in classes)
+        raise DataError(f"{name} is a {type(value).__name__}, expected a {names}; {advice}")
+
+
 def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:
     """Raise where a lower limit stands above its upper one."""
     bad = np.flatnonzero(low > high)

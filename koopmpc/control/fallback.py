@@ -19,6 +19,14 @@ def admitted(
     return np.clip(u, *inputs)
 
 
+def hard(rates: Box | None, linear: Float[np.ndarray, " nu"]) -> Box | None:
+    """Return the rate limits that are hard, whose `linear` slack weight is inf, ±inf in place of the others."""
+    if rates is None or not np.isinf(linear).any():
+        return None
+    ends = zip(rates, (-np.inf, np.inf), strict=True)
+    return Box(*(np.where(np.isinf(linear), end, free) for end, free in ends))
+
+
 class PlanMemory:
     """Remembers the last good plan and the last input; whatever it returns is inside the limits of the inputs.
 

@@ -12,22 +12,24 @@ from koopmpc import checks
 from koopmpc.control.condense import Coordinates
 from koopmpc.control.constrained import Constrained
 from koopmpc.control.cost import Cost
-from koopmpc.control.fallback import PlanMemory, admitted
+from koopmpc.control.fallback import PlanMemory, admitted, hard
 from koopmpc.control.horizon import blocked
 from koopmpc.control.lifted import reference_rows
 from koopmpc.control.limits import Box, Limits
-from koopmpc.control.move import Fallback, Move, Plan, Status
-from koopmpc.control.origin import Origin
+from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.origin import Lifted, Origin, Sizes, numbers
 from koopmpc.control.plan_map import PlanMap
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.control.receding import Receding
+from koopmpc.errors import DataError
+from koopmpc.estimate.measured import Measured
 from koopmpc.estimate.observer import Estimator, Observer
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.linear import LinearPredictor
 
-_VIEWS = ("_z", "_u_prev", "_W", "_d", "_drive", "_met", "_met_low", "_met_high")
+_VIEWS = ("_met", "_met_low", "_met_high")
 
 
-class KoopmanMPC:
+class KoopmanMPC(Receding):
     """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
 
     The backward Riccati recursion gives the unconstrained plan as one matrix–vector product of [z, 1], or of
@@ -55,8 +57,6 @@ class KoopmanMPC:
         Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts
         from the state predicted for then, under the inputs that are still to act; zero moved inside the limits
         acts before the first. `horizon` grows by it: more of the reference is read.
-    disturbed
-        True makes room for a constant disturbance d of every lifted coordinate, which `disturb` sets.
     coordinates
         Variables of the QP: "plain", the inputs; "riccati", those in which the Hessian is the identity however
         unstable the plant; "auto" takes the plain ones where their Hessian is well conditioned.
@@ -83,8 +83,6 @@ class KoopmanMPC:
     control", Automatica 93, 2018.
     """
 
-    solver_fails = False  # set by fault injection alone, see control.move.Fallible
-
     def __init__(
         self,
         predictor: LinearPredictor,
@@ -95,7 +93,6 @@ class KoopmanMPC:
         estimator: Estimator | None = None,
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
-        disturbed: bool = False,
         coordinates: Coordinates = "auto",
         solver: Literal["osqp", "daqp"] = "osqp",
         settings: Mapping[str, Any] | None = None,
@@ -103,30 +100,38 @@ class KoopmanMPC:
     ) -> None:
         if coordinates not in ("auto", "riccati", "plain"):
             raise DataError(f'coordinates is {coordinates!r}; pass "auto", "riccati" or "plain"')
-        self._N, self._nu = checks.count(horizon, "horizon"), predictor.nu
+        checks.kind(
+            predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap"
+        )
+        super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, time_limit)
         self._blocks = blocked(moves, self._N)
-        self.predictor, self.cost, self.limits = predictor, cost, Limits() if limits is None else limits
-        self._latency = checks.count(latency, "latency", 0)
-        self._disturbed = disturbed or estimator is not None
+        self.predictor = predictor
+        self._disturbed = estimator is not None
         self._map = PlanMap(
-            predictor, cost, self.limits, self._blocks, disturbed=self._disturbed, coordinates=coordinates
+            predictor,
+            self.cost,
+            self.limits,
+            self._blocks,
+            disturbed=self._disturbed,
+            coordinates="riccati" if (coordinates, solver) == ("auto", "daqp") else coordinates,
         )
         track = self._map.track
         self._constrained = Constrained(self._map.hard, self._map.soft, solver, settings)
-        self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
-        self._planned = False
         self._rated = self._map.horizon.rated
-        self._signals = self._rated or predictor.nw > 0
-        self._hard_rates = _hard(track.rates, track.rate_softness.linear)
+        self._hard_rates = hard(track.rates, track.rate_softness.linear)
         self._move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
         self._memory = PlanMemory(track.inputs, self._N, track.rates, self._move_of)
 
-        self._origin = Origin(predictor, estimator, self._latency)
-        self._ahead = np.zeros((self._latency + 1, predictor.nw))
-        self._estimated = estimator is not None
-        rows, columns = self._map.matrix.shape
-        self._known = np.zeros(columns)
-        self._known[-1] = 1.0
+        observer = Measured(predictor) if estimator is None else estimator.start(predictor)
+        self._origin = Origin(
+            Lifted(predictor),
+            observer,
+            Sizes(predictor.nz, self._nu, predictor.nw, self._N),
+            self._latency,
+            rated=self._rated,
+            estimated=self._disturbed,
+        )
+        rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.C)))
         self._reference_key: bytes | None = None
@@ -134,13 +139,7 @@ class KoopmanMPC:
         self.reset()
 
     def _see(self) -> None:
-        """Make the views of the arrays that a step fills; a copy of the controller makes its own."""
-        predictor, nw = self.predictor, self._N * self.predictor.nw
-        self._z = self._known[: predictor.nz]
-        first = predictor.nz + self._nu * self._rated
-        self._u_prev = self._known[predictor.nz : first]
-        self._drive = self._known[first:-1]
-        self._W, self._d = self._drive[:nw].reshape(self._N, predictor.nw), self._drive[nw:]
+        """Make the views of the bytes that say which limits are met; a copy makes its own."""
         rows = len(self._plan)
         self._met = bytearray(2 * rows)
         met = np.frombuffer(self._met, dtype=np.bool_)
@@ -152,21 +151,6 @@ class KoopmanMPC:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._see()
-
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]."""
-        return self.predictor.dt
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self._nu
-
-    @property
-    def horizon(self) -> int:
-        """Steps of preview: N of the plan, after those of the latency."""
-        return self._N + self._latency
 
     @property
     def observer(self) -> Observer:
@@ -182,12 +166,11 @@ class KoopmanMPC:
         """Forget all earlier steps, so that a run repeats to the bit.
 
         `u_prev`, zero moved inside the limits by default, is where rates count from, and is held if the first step
-        fails. A disturbance that `disturb` set is forgotten too. A filter starts at x0, by default at zero.
+        fails. A filter starts at x0, by default at zero.
         """
         self._memory.reset(u_prev)
         self._constrained.reset()
         self._planned = False
-        self._drive[:] = 0.0
         self._origin.reset(x0, self._memory.last())
 
     def update(self, predictor: LinearPredictor) -> None:
@@ -215,26 +198,8 @@ class KoopmanMPC:
         self.predictor = predictor
         self._constrained.adopt(self._map.hard, self._map.soft)
         self._reference_key = None
-        self._origin.adopt(predictor)
-
-    def disturb(self, d: ArrayLike) -> None:
-        """Set the disturbance d (nz,) of z⁺ = A z + B u + E w + d from the next step on.
-
-        Raises
-        ------
-        DataError
-            The controller was not made with ``disturbed=True``, or its estimator finds d.
-        ShapeError
-            d has another length than z.
-        """
-        if self._estimated:
-            raise DataError("the estimator finds the disturbance; make the controller without one to set it")
-        if not self._disturbed:
-            raise DataError("the controller has no room for a disturbance; make it with disturbed=True")
-        values = np.asarray(d, dtype=np.float64)
-        if values.shape != self._d.shape:
-            raise ShapeError(f"d has shape {values.shape}, expected {self._d.shape}, one value an observable")
-        self.observer.d[:] = values
+        self._origin.adopt(Lifted(predictor))
+        self.observer.adopt(predictor)
 
     def __call__(
         self,
@@ -258,17 +223,16 @@ class KoopmanMPC:
             w_{k+N+latency−1} with latency; by default zero.
         """
         start = perf_counter()
-        if self._signals or w is not None:
-            self._take(applied, w)
-        self._begin(np.asarray(y, dtype=np.float64), applied)
-        target = np.asarray(reference, dtype=np.float64)
+        origin = self._origin
+        origin.take(y, self._memory.last(), applied, w)
+        target = numbers(reference, "reference")
         key = target.tobytes()
         if key != self._reference_key:
             self._aim(target)
             self._reference_key = key
 
         t = self._spare
-        np.dot(self._map.matrix, self._known, out=t)
+        self._map.matrix.dot(origin.known, t)
         np.greater_equal(t, self._map.low, out=self._met_low)
         np.less_equal(t, self._map.high, out=self._met_high)
         if 0 not in self._met:  # every limit is met, and nothing is NaN
@@ -282,60 +246,24 @@ class KoopmanMPC:
         A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
         moves = self._plan[: len(self._blocks) * self._nu].reshape(-1, self._nu)
         U = moves[self._move_of]
-        push = self._W @ E.T
+        push = self._origin.W @ E.T
         if self._disturbed:
-            push = push + self._d
+            push = push + self._origin.d
         Z = np.empty((self._N + 1, self.predictor.nz))
-        Z[0] = self._z
+        Z[0] = self._origin.z
         for k in range(self._N):
             Z[k + 1] = A @ Z[k] + B @ U[k] + push[k]
         return Plan(Z @ C.T, U)
 
-    def _begin(self, y: Float[np.ndarray, "..."], applied: ArrayLike | None) -> None:
-        """Write down where the plan starts."""
-        origin = self._origin
-        origin.take(y, self._memory.last(), applied, self._ahead)
-        self._z[:] = origin.z
-        if self._disturbed:
-            self._d[:] = origin.d
-
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the last column."""
-        if reference.ndim == 2:
-            reference = reference[min(self._latency, len(reference) - 1) :]
-        self._reference = reference_rows(reference, self._N, self._reference.shape[1])
+        self._reference = reference_rows(self._previewed(reference), self._N, self._reference.shape[1])
         self._map.aim(self._reference)
-
-    def _take(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
-        """Write down the last input and the preview of disturbances."""
-        if self._rated:
-            computed = applied is None or self._latency  # what acted before the plan's first input
-            last = self._memory.last() if computed else np.asarray(applied, dtype=np.float64)
-            if last.shape != self._u_prev.shape:
-                raise ShapeError(f"applied has shape {last.shape}, expected {self._u_prev.shape}")
-            self._u_prev[:] = last
-        if w is None:
-            self._W[:] = self._ahead[:] = 0.0
-            return
-        rows, nw = np.asarray(w, dtype=np.float64), self.predictor.nw
-        if nw == 0:
-            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
-        steps = self._N + self._latency
-        if rows.shape != (nw,) and (rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0):
-            raise ShapeError(
-                f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{steps - 1}"
-            )
-        if rows.ndim == 2 and len(rows) != steps:
-            rows = rows[np.minimum(np.arange(steps), len(rows) - 1)]
-        self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
-        self._W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._constrained.cool()
         self._keep(t)
-        taken = perf_counter() - start
-        status = Status.UNCONSTRAINED if taken <= self._allowed else Status.TIME_LIMIT
-        return Move(t[: self._nu].copy(), status, Fallback.NONE, taken, 0)
+        return self._move(t[: self._nu].copy(), Status.UNCONSTRAINED, 0, start)
 
     def _keep(self, t: Float[np.ndarray, " nt"]) -> None:
         """Make t the plan; the array of the plan before it is free for the next step."""
@@ -345,37 +273,39 @@ class KoopmanMPC:
 
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Go on where the plan breaks a limit, its target does, or something is not finite."""
-        plan = self._map
-        if self._rated and not (np.abs(self._u_prev) < HUGE).all():  # what was applied is not known
-            self._u_prev[:] = self._memory.last()
-            np.dot(plan.matrix, self._known, out=t)
-        if not np.abs(t).max() < HUGE:
+        plan, origin = self._map, self._origin
+        u_prev = origin.u_prev
+        changed = self._rated and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
+        if changed:
+            u_prev[:] = self._memory.last()
+            np.dot(plan.matrix, origin.known, out=t)
+        if not t.dot(t) < HUGE * HUGE:
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
         n = plan.planned
         v = t[:n]
-        if not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
-            v += plan.correction(self._reference, self._drive)
-        if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
+        if n < len(t) and not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
+            v += plan.correction(self._reference, origin.drive)
+            changed = True
+        if changed and (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
             return self._unconstrained(t, start)
-        nw, inputs = len(self._blocks) * self._nu, plan.track.inputs
-        room = None
+        inputs, room = plan.track.inputs, None
         if self._hard_rates is not None:
-            room = Box(inputs.low - self._u_prev, inputs.high - self._u_prev)
+            room = Box(inputs.low - u_prev, inputs.high - u_prev)
         deadline = None if np.isinf(self._allowed) else start + self._allowed
-        found = self._constrained.solve(v, room, nw, deadline)
+        found, gave_way = self._constrained.solve(v, room, deadline)
         status = Status.FAILED if self.solver_fails else found.status
         if status is not Status.OPTIMAL:
             return self._fail(v[: self._nu], applied, status, found.iterations, start)
-        v += plan.maps.deviation @ found.w
-        u = np.clip(v[:nw].reshape(-1, self._nu), *inputs)
+        U, (low, high) = t[: plan.moves], plan.box
+        U += plan.deviation.dot(found.v)
+        np.maximum(U, low, out=U)
+        np.minimum(U, high, out=U)
+        u = U[: self._nu]
         if self._hard_rates is not None:
-            u[0] = admitted(u[0], inputs, self._hard_rates, self._u_prev)
-        v[:nw] = u.ravel()
+            u[:] = admitted(u, inputs, self._hard_rates, u_prev)
         self._keep(t)
-        taken = perf_counter() - start
-        status = Status.SOFTENED if found.gave_way else Status.OPTIMAL
-        status = status if taken <= self._allowed else Status.TIME_LIMIT
-        return Move(u[0].copy(), status, Fallback.NONE, taken, found.iterations)
+        status = Status.SOFTENED if gave_way else Status.OPTIMAL
+        return self._move(u.copy(), status, found.iterations, start)
 
     def _fail(
         self,
@@ -385,17 +315,6 @@ class KoopmanMPC:
         iterations: int,
         start: float,
     ) -> Move:
-        """Return what stands in for a failed step, with the status that says why."""
+        """Return what stands in for a failed step, with the status that says why; the next one starts cold."""
         self._constrained.cool()
-        self._planned = False
-        u, fallback = self._memory.instead(free, applied)
-        return Move(u, status, fallback, perf_counter() - start, iterations)
-
-
-def _hard(rates: Box | None, linear: Float[np.ndarray, " nu"]) -> Box | None:
-    """Return the hard rate limits, ±inf where they are soft."""
-    if rates is None or not np.isinf(linear).any():
-        return None
-    return Box(
-        *(np.where(np.isinf(linear), end, free) for end, free in zip(rates, (-np.inf, np.inf), strict=True))
-    )
+        return super()._fail(free, applied, status, iterations, start)

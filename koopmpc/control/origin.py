@@ -1,63 +1,132 @@
 """Origin: where a plan starts, from what is measured and through the inputs that are still to act."""
 
 from collections import deque
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.errors import ShapeError
-from koopmpc.estimate.measured import Measured
-from koopmpc.estimate.observer import Estimator, Observer
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.estimate.observer import Observer
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.linear import LinearPredictor
 
+_VIEWS = ("z", "u_prev", "drive", "W", "d")
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What an origin asks of a model."""
+
+    def advance(
+        self,
+        z: Float[np.ndarray, " nz"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+        d: Float[np.ndarray, " nz"],
+    ) -> Float[np.ndarray, " nz"]:
+        """Return z⁺."""
+        ...
+
+
+class Lifted(NamedTuple):
+    """z⁺ = A z + B u + E w + d of a predictor."""
+
+    predictor: LinearPredictor
+
+    def advance(
+        self,
+        z: Float[np.ndarray, " nz"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+        d: Float[np.ndarray, " nz"],
+    ) -> Float[np.ndarray, " nz"]:
+        """Return z⁺."""
+        model = self.predictor
+        return model.A @ z + model.B @ u + model.E @ w + d
+
+
+class Sizes(NamedTuple):
+    """Entries of z, u and w, and steps N of the plan."""
+
+    nz: int
+    nu: int
+    nw: int
+    N: int
+
 
 class Origin:
-    """z_{k+L} and d, for an input computed at k that acts L steps later: z ← A z + B u + E w + d, L times.
+    """known = [z; u_{−1}; w_0 … w_{N−1}; d; 1] of the step at which an input computed now acts, L steps from now.
+
+    z is predicted over these L steps, z ← A z + B u + E w + d with the inputs that are still to act. u_{−1} is there
+    where the change of inputs counts, d where it is estimated. The parts are views: `z`, `u_prev`, `W`, `d`, and
+    `drive`, which is W and d.
 
     Parameters
     ----------
-    predictor
-        The model.
-    estimator
-        Gives z_k and d; None lifts y.
+    model
+        What predicts.
+    observer
+        Gives z and d of the step of y.
+    sizes
+        Of z, u, w and the plan.
     latency
         L ≥ 0.
+    rated
+        Whether u_{−1} is needed.
+    estimated
+        Whether the observer finds d; without it, and without latency, u and w do not reach the observer.
     """
 
-    def __init__(self, predictor: LinearPredictor, estimator: Estimator | None, latency: int) -> None:
-        self._predictor, self._latency = predictor, latency
-        self.observer: Observer = Measured(predictor) if estimator is None else estimator.start(predictor)
-        self.z = self.observer.z
-        self._plain = estimator is None and not latency
+    def __init__(
+        self, model: Model, observer: Observer, sizes: Sizes, latency: int, *, rated: bool, estimated: bool
+    ) -> None:
+        self._model, self.observer, self._sizes, self._latency = model, observer, sizes, latency
+        self._rated, self._estimated = rated, estimated
+        self._signals = rated or sizes.nw > 0
+        self._plain = not (estimated or latency)
+        self._shape = (observer.ny,)
+        nz, nu, nw, N = sizes
+        self.known = np.zeros(nz + nu * rated + N * nw + nz * estimated + 1)
+        self.known[-1] = 1.0
+        self._ahead = np.zeros((latency + 1, nw))
         self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
-        self.reset(None, np.zeros(predictor.nu))
+        self._see()
+        self.reset(None, np.zeros(nu))
 
-    @property
-    def d(self) -> Float[np.ndarray, " nz"]:
-        """The disturbance of every lifted coordinate."""
-        return self.observer.d
+    def _see(self) -> None:
+        """Make the views; a copy makes its own."""
+        nz, nu, nw, N = self._sizes
+        first = nz + nu * self._rated
+        self.z = self.known[:nz]
+        self.u_prev = self.known[nz:first]
+        self.drive = self.known[first:-1]
+        self.W, self.d = self.drive[: N * nw].reshape(N, nw), self.drive[N * nw :]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
         self.observer.reset(x0)
+        self.drive[:] = 0.0
         self._sent.extend([last.copy()] * (self._latency + 1))
-        self._w = np.zeros(self._predictor.nw)
+        self._w = np.zeros(self._sizes.nw)
 
-    def adopt(self, predictor: LinearPredictor) -> None:
-        """Go on with another model."""
-        self._predictor = predictor
-        self.observer.adopt(predictor)
+    def adopt(self, model: Model) -> None:
+        """Go on with another model of the same sizes; the observer is told by itself."""
+        self._model = model
 
     def take(
-        self,
-        y: Float[np.ndarray, "..."],
-        last: Float[np.ndarray, " nu"],
-        applied: ArrayLike | None,
-        W: Float[np.ndarray, "L nw"],
+        self, y: ArrayLike, last: Float[np.ndarray, " nu"], applied: ArrayLike | None, w: ArrayLike | None
     ) -> None:
-        """Take y_k; z is NaN where it cannot be used.
+        """Take y_k and write down where the plan starts; z is NaN where y cannot be used.
 
         Parameters
         ----------
@@ -65,27 +134,77 @@ class Origin:
             The input that was computed last.
         applied
             What acted since the last call; by default the input that was computed L + 1 calls ago.
-        W
-            w_k … w_{k+L}: what is measured of the disturbances.
+        w
+            Measured disturbances (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
+        if self._signals or w is not None:
+            self._note(last, applied, w)
+        measured = numbers(y, "y")
         observer = self.observer
-        if y.shape != (observer.ny,):
-            what = "a state" if isinstance(observer, Measured) else "a measurement of the estimator"
-            raise ShapeError(f"y has shape {y.shape}, expected ({observer.ny},), one value {what}")
+        if measured.shape != self._shape:
+            raise ShapeError(
+                f"y has shape {measured.shape}, expected {self._shape}, one value a {_measured(self._estimated)}"
+            )
         if self._plain:
-            observer.update(y, last, self._w)
-            self.z = observer.z
+            observer.update(measured, last, self._w)
+            self.z[:] = observer.z
             return
         self._sent.append(last.copy())
         acted = self._sent[0]
         if applied is not None:
-            got = np.asarray(applied, dtype=np.float64)
+            got = numbers(applied, "applied")
             if got.shape != acted.shape:
                 raise ShapeError(f"applied has shape {got.shape}, expected {acted.shape}")
             acted = got if (np.abs(got) < HUGE).all() else acted
-        good = observer.update(y, acted, self._w)
-        self._w = np.where(np.abs(W[0]) < HUGE, W[0], self._w)  # not known: as it was
-        z, model = observer.z if good else np.full_like(observer.z, np.nan), self._predictor
+        good = observer.update(measured, acted, self._w)
+        now = self._ahead[0]
+        self._w = np.where(np.abs(now) < HUGE, now, self._w)  # not known: as it was
+        z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         for i in range(self._latency):
-            z = model.A @ z + model.B @ self._sent[i + 1] + model.E @ W[i] + observer.d
-        self.z = z
+            z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d)
+        self.z[:] = z
+        if self._estimated:
+            self.d[:] = d
+
+    def _note(self, last: Float[np.ndarray, " nu"], applied: ArrayLike | None, w: ArrayLike | None) -> None:
+        """Write down the last input and the preview of disturbances."""
+        if self._rated:
+            before = last  # what acted before the plan's first input
+            if applied is not None and not self._latency:
+                before = numbers(applied, "applied")
+            if before.shape != self.u_prev.shape:
+                raise ShapeError(f"applied has shape {before.shape}, expected {self.u_prev.shape}")
+            self.u_prev[:] = before
+        if w is None:
+            self.W[:] = self._ahead[:] = 0.0
+            return
+        rows, nw = numbers(w, "w"), self._sizes.nw
+        if nw == 0:
+            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
+        steps = self._sizes.N + self._latency
+        if rows.shape != (nw,) and (rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0):
+            raise ShapeError(
+                f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{steps - 1}"
+            )
+        if rows.ndim == 2 and len(rows) != steps:
+            rows = rows[np.minimum(np.arange(steps), len(rows) - 1)]
+        self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
+        self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
+
+
+def numbers(value: ArrayLike, name: str) -> Float[np.ndarray, "..."]:
+    """Return `value` as float64, itself where it is one already, for this is the control path.
+
+    Raises
+    ------
+    DataError
+        It is no array of numbers.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return checks.array(value, name, finite=False)
+
+
+def _measured(estimated: bool) -> str:
+    return "measurement of the estimator" if estimated else "state"

@@ -10,6 +10,33 @@ from koopmpc.control.riccati import stationary
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
 
 
+class Told:
+    """An estimator of a user's own: y is the state, and d what it was told."""
+
+    def __init__(self, d):
+        self.given = np.asarray(d, dtype=float)
+
+    def start(self, predictor):
+        return Telling(self.given, predictor)
+
+
+class Telling:
+    def __init__(self, d, predictor):
+        self.d, self.ny, self.predictor = d, predictor.nx, predictor
+        self.z = np.zeros(predictor.nz)
+
+    def reset(self, x0=None):
+        """d stays what it is."""
+
+    def adopt(self, predictor):
+        self.predictor = predictor
+
+    def update(self, y, u, w):
+        if np.isfinite(y).all():
+            self.z = self.predictor.lift(y)
+        return bool(np.isfinite(y).all())
+
+
 def random_pair(rng, nx, nu, radius=1.05):
     A = rng.normal(size=(nx, nx))
     return A * radius / np.abs(np.linalg.eigvals(A)).max(), rng.normal(size=(nx, nu))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control.riccati import stationary
-from tests.control.models import PRECISE, linear, random_pair
+from tests.control.models import PRECISE, Told, linear, random_pair
 from tests.control.oracle import oracle, targets_of
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -91,8 +91,10 @@ def equals_cvxpy(seed, coordinates):
     rng = np.random.default_rng(seed)
     A, B, model, cost, limits, blocks, disturbed = draw(rng)
     N, nx, nu, nw, nz = sum(blocks), model.nx, model.nu, model.nw, model.nz
+    d = np.zeros(nz)
+    told = Told(d) if disturbed else None
     mpc = km.KoopmanMPC(
-        model, cost, limits, N, moves=blocks, disturbed=disturbed, coordinates=coordinates, settings=PRECISE
+        model, cost, limits, N, moves=blocks, estimator=told, coordinates=coordinates, settings=PRECISE
     )
     P = terminal(model, cost, N)
     x = rng.normal(size=nx)
@@ -100,10 +102,8 @@ def equals_cvxpy(seed, coordinates):
     mpc.reset(u_prev=u_prev)
     for _ in range(2):
         rows, W = 0.5 * rng.normal(size=(N + 1, nx)), 0.2 * rng.normal(size=(N, nw))
-        d = np.zeros(nz)
         if disturbed:
             d[:nx] = 0.1 * rng.normal(size=nx)
-            mpc.disturb(d)
         move = mpc(x, rows, u_prev if rng.random() < 0.5 else None, W if nw else None)
         e = model.E @ W[-1] + d if nw or disturbed else None
         targets = targets_of(mpc, rows, e)
@@ -153,7 +153,7 @@ def test_rates_that_cost_and_limit_nothing_change_nothing():
         km.KoopmanMPC(model, cost, loose, 12, settings=PRECISE),
         km.KoopmanMPC(model, cost, limits, 12, moves=(1,) * 12, settings=PRECISE),
         km.KoopmanMPC(model, cost, limits, 12, moves=12, settings=PRECISE),
-        km.KoopmanMPC(model, cost, limits, 12, disturbed=True, settings=PRECISE),
+        km.KoopmanMPC(model, cost, limits, 12, estimator=Told([0, 0]), settings=PRECISE),
         km.KoopmanMPC(
             with_disturbances(model, np.ones((2, 1))),
             cost,
@@ -292,17 +292,14 @@ def test_a_disturbance_is_a_constant_of_the_model():
     for reference in ([0.3, 0.0], [2.5, 0.0]):
         limits = km.Limits(-0.6, 0.6, x_max=[0.7, 1.0], du_max=0.5)
         one = km.KoopmanMPC(linear(A, B, constant=c), cost, limits, 12, settings=PRECISE)
-        other = km.KoopmanMPC(linear(A, B), cost, limits, 12, disturbed=True, settings=PRECISE)
+        other = km.KoopmanMPC(linear(A, B), cost, limits, 12, estimator=Told(c), settings=PRECISE)
         third = km.KoopmanMPC(with_disturbances(linear(A, B), c[:, None]), cost, limits, 12, settings=PRECISE)
         x = np.array([0.5, -0.5])
-        other.disturb(c)
         for _ in range(8):
             u = one(x, reference).u
             np.testing.assert_allclose(other(x, reference).u, u, atol=1e-5)
             np.testing.assert_allclose(third(x, reference, w=[1.0]).u, u, atol=1e-5)
             x = A @ x + B @ u + c
-    other.reset()
-    assert not other._d.any()
 
 
 def test_the_preview_of_a_disturbance():
@@ -376,9 +373,7 @@ def whole(seed=0):
     model = with_disturbances(linear(A, B, constant=[0.01, -0.02]), np.array([[0.05], [0.1], [0.0]]))
     limits = km.Limits(-0.6, 0.6, du_max=0.2, x_max=[0.7, 0.4], slack=([10.0, np.inf], 1.0))
     cost = km.Cost([2, 0.5], 0.1, R_delta=0.05)
-    mpc = km.KoopmanMPC(model, cost, limits, 10, moves=6, disturbed=True)
-    mpc.disturb([0.01, 0.0, 0.0])
-    return mpc
+    return km.KoopmanMPC(model, cost, limits, 10, moves=6, estimator=Told([0.01, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
@@ -430,16 +425,6 @@ def test_messages():
         (km.DataError, r"moves is 0; it must be at least 1", lambda: make(moves=0)),
         (km.DataError, r"\(2, 2\) sum to 4, the horizon is 5", lambda: make(horizon=5, moves=(2, 2))),
         (km.DataError, r"a block of moves is 0; it must be", lambda: make(horizon=5, moves=(5, 0))),
-        (
-            km.DataError,
-            r"has no room for a disturbance; make it with disturbed=True",
-            lambda: make().disturb([0, 0]),
-        ),
-        (
-            km.ShapeError,
-            r"d has shape \(1,\), expected \(2,\), one value an observable",
-            lambda: make(disturbed=True).disturb([0]),
-        ),
         (km.DataError, r"w was passed, but the predictor has no E", lambda: make()([0, 0], [0, 0], w=[0])),
         (
             km.ShapeError,

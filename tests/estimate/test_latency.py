@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.control.models import PRECISE, random_pair
+from tests.control.models import PRECISE, Told, random_pair
 from tests.estimate.plants import linear
 
 LATE = [km.ActuatorDelay(1)]
@@ -69,12 +69,13 @@ def _cost(run):
     return (run.X**2 * [1.0, 0.1]).sum() + 0.1 * (run.U**2).sum()
 
 
-def test_a_disturbance_that_is_set_by_hand_is_predicted_through_too():
+def test_a_disturbance_that_is_known_is_predicted_through_too():
     A, B, d = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]]), np.array([0.05, 0.1])
     exact = {"latency": 1, "settings": PRECISE}
     cost = km.Cost([1, 0], 0.1)
-    told = km.KoopmanMPC(linear(A, B, [0.0, 0.0]), cost, horizon=15, disturbed=True, **exact)
-    told.disturb(np.append(d, 0.0))
+    told = km.KoopmanMPC(
+        linear(A, B, [0.0, 0.0]), cost, horizon=15, estimator=Told(np.append(d, 0.0)), **exact
+    )
     knowing = km.KoopmanMPC(linear(A, B, d), cost, horizon=15, **exact)
     for x in ([0.0, 0.0], [1.0, -1.0]):
         np.testing.assert_allclose(told(x, [0.7, 0]).u, knowing(x, [0.7, 0]).u, atol=1e-9)

@@ -191,12 +191,6 @@ def test_late_measurements_leave_no_offset():
     assert abs(run.X[-1, 0] - 0.7) < 1e-6
 
 
-def test_a_disturbance_is_estimated_or_set_by_hand():
-    mpc = km.KoopmanMPC(KNOWN, POSITION, horizon=15, estimator=km.LiftedDisturbance())
-    with pytest.raises(km.DataError, match="the estimator finds the disturbance"):
-        mpc.disturb(np.zeros(3))
-
-
 def test_a_new_model_between_two_steps_keeps_the_state_of_a_filter():
     """A model that becomes true: what was a disturbance is forgotten at the filter's own pace, without a jump."""
     true = linear(A, 0.7 * B, [0.1, 0.1])
