@@ -4,6 +4,10 @@ import os
 import signal
 from pathlib import Path
 
+import numpy as np
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.storage import load_episodes
 from koopmpc.errors import DataError
 
 
@@ -33,3 +37,31 @@ def fail(i: int) -> int:
     if i == 1:
         raise DataError("the second task is wrong")
     return i
+
+
+class OddError(Exception):
+    """An exception that does not pickle."""
+
+    def __init__(self, one: int, two: int) -> None:
+        super().__init__(f"{one} and {two}")
+
+
+def odd(_: int) -> None:
+    raise OddError(1, 2)
+
+
+def unsendable(_: int) -> object:
+    return lambda: 0
+
+
+def dying_reader(path: Path) -> Episodes:
+    """Read the file; kill the worker that reads 1.npz the first time."""
+    mark = path.with_suffix(".died")
+    if path.name == "1.npz" and not mark.exists():
+        mark.touch()
+        die(path)
+    return load_episodes(path)
+
+
+def by_first_state(episode: Episode) -> float:
+    return float(np.abs(episode.X[0, 0]))

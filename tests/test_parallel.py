@@ -1,0 +1,137 @@
+"""Tasks come back in order wherever they are done, a lost worker costs nothing, and errors name their task."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+
+from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.parallel import map_tasks
+from tests import tasks
+
+HERE = {"workers": 1}
+PROCESSES = {"workers": 2}
+DASK = {"workers": 2, "scheduler": "local"}
+EVERYWHERE = pytest.mark.parametrize("where", [HERE, PROCESSES, DASK], ids=["here", "processes", "dask"])
+AWAY = pytest.mark.parametrize("where", [PROCESSES, DASK], ids=["processes", "dask"])
+
+
+@EVERYWHERE
+def test_results_come_in_the_order_of_the_tasks(where: dict) -> None:
+    told: list[tuple[int, int | None]] = []
+    results = map_tasks(tasks.square, range(7), **where, progress=lambda *now: told.append(now))
+    assert list(results) == [i * i for i in range(7)]
+    assert told == [(i, 7) for i in range(8)]
+
+
+@EVERYWHERE
+def test_tasks_are_taken_a_few_ahead_and_no_more(where: dict) -> None:
+    taken: list[int] = []
+
+    def endless() -> Iterator[int]:
+        while True:
+            taken.append(len(taken))
+            yield taken[-1]
+
+    results = map_tasks(tasks.square, endless(), **where)
+    assert [next(results) for _ in range(5)] == [0, 1, 4, 9, 16]
+    assert len(taken) <= 5 + 2 * 2
+    results.close() if where is not HERE else None
+
+
+@AWAY
+def test_a_lost_worker_costs_its_task_nothing(where: dict, tmp_path: Path) -> None:
+    assert list(map_tasks(tasks.die_once, [(str(tmp_path), i) for i in range(5)], **where)) == list(range(5))
+    assert (tmp_path / "died").exists()
+
+
+@AWAY
+def test_a_task_that_kills_each_worker_is_named(where: dict) -> None:
+    with pytest.raises(
+        KoopmpcError, match=r"task 0, the first: each worker that did it died .*workers=1 to see"
+    ):
+        list(map_tasks(tasks.die, ["the first"], **where))
+
+
+@EVERYWHERE
+def test_what_a_task_raises_is_raised_after_the_results_before_it(where: dict) -> None:
+    results = map_tasks(tasks.fail, range(5), **where)
+    assert next(results) == 0
+    with pytest.raises(DataError, match="the second task is wrong"):
+        next(results)
+
+
+def test_a_worker_tells_where_it_failed_even_if_the_exception_does_not_pickle() -> None:
+    with pytest.raises(KoopmpcError, match="OddError: 1 and 2") as caught:
+        list(map_tasks(tasks.odd, [0], **PROCESSES))
+    assert "in odd" in caught.value.__notes__[0]
+
+
+def test_what_does_not_pickle_is_told() -> None:
+    with pytest.raises(DataError, match=r"task 0, <function .*cannot be sent to a worker.*in a module"):
+        list(map_tasks(tasks.square, [lambda: 0], **PROCESSES))
+    with pytest.raises(DataError, match="the result of 3 cannot be sent back"):
+        list(map_tasks(tasks.unsendable, [3], **PROCESSES))
+
+
+def test_workers_have_one_blas_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    assert set(map_tasks(tasks.threads, range(2), **PROCESSES)) == {"1"}
+    assert set(map_tasks(tasks.threads, range(2))) == {"2"}
+
+
+def test_no_task_is_no_result() -> None:
+    assert list(map_tasks(tasks.square, [], **PROCESSES)) == []
+
+
+def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        dedent("""
+        from koopmpc.parallel import map_tasks
+        print(list(map_tasks(abs, [1, 2], workers=2)))
+        """)
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode != 0
+    assert 'put what the script runs under `if __name__ == "__main__":`' in ended.stderr
+
+
+def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
+    with pytest.raises(DataError, match="workers is 0; it must be at least 1"):
+        map_tasks(tasks.square, [1], workers=0)
+    with pytest.raises(DataError, match=r"""scheduler is 'here'; pass "local", or the address "tcp://"""):
+        map_tasks(tasks.square, [1], scheduler="here")
+    with pytest.raises(DataError, match="has its own workers; leave out workers=2"):
+        map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:8786", workers=2)
+
+
+def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("koopmpc.parallel._ANSWER", 0.5)
+    with pytest.raises(KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9; start one"):
+        list(map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:9"))
+
+
+def test_a_cluster_is_reached_by_its_address_and_one_without_workers_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from distributed import LocalCluster
+
+    local = {"processes": False, "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
+    with LocalCluster(n_workers=1, protocol="tcp", **local) as cluster:
+        address = cluster.scheduler_address
+        assert list(map_tasks(tasks.square, range(3), scheduler=address)) == [0, 1, 4]
+        cluster.scale(0)
+        monkeypatch.setattr("koopmpc.parallel._PATIENCE", 1.0)
+        with pytest.raises(KoopmpcError, match="task 0, 5: the cluster has had no worker for 1 s"):
+            list(map_tasks(tasks.square, [5], scheduler=address))
+
+
+def test_without_dask_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(KoopmpcError, match=r"install it with: pip install 'koopmpc\[dask\]'"):
+        list(map_tasks(tasks.square, [1], scheduler="local"))
