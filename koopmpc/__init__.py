@@ -41,15 +41,22 @@ from koopmpc.figures.series import plot_rollout, plot_run
 from koopmpc.figures.spectrum import plot_spectrum
 from koopmpc.figures.style import save as save_figure
 from koopmpc.identify.bilinear import bilinear_edmd
+from koopmpc.identify.constrained import constrained_edmd
 from koopmpc.identify.dmd import dmd, dmdc
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.online import OnlineEDMD
+from koopmpc.identify.prior import Combination, Prior, Storage
+from koopmpc.identify.sparse import sparse_edmd
+from koopmpc.identify.stable import stable_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.random_fourier import RandomFourier
+from koopmpc.lifting.standardized import Standardized
 from koopmpc.lifting.state import State
 from koopmpc.lifting.thin_plate import ThinPlate
 from koopmpc.loop.faults import (
@@ -93,6 +100,7 @@ __all__ = [
     "Case",
     "Chirp",
     "Collocation",
+    "Combination",
     "Constant",
     "Controller",
     "Cost",
@@ -137,11 +145,14 @@ __all__ = [
     "Noise",
     "NonlinearMPC",
     "ObservableError",
+    "OnlineEDMD",
     "Plan",
     "Plans",
     "Plant",
+    "Prior",
     "Problem",
     "ProblemError",
+    "RandomFourier",
     "Recorder",
     "Run",
     "Score",
@@ -151,10 +162,12 @@ __all__ = [
     "Snapshots",
     "SolverFailure",
     "Source",
+    "Standardized",
     "State",
     "Status",
     "Step",
     "StepMap",
+    "Storage",
     "Stream",
     "ThinPlate",
     "Training",
@@ -162,6 +175,7 @@ __all__ = [
     "amplitudes",
     "bilinear_edmd",
     "collect",
+    "constrained_edmd",
     "continuous_eigenvalues",
     "discretize",
     "dlqr",
@@ -188,6 +202,8 @@ __all__ = [
     "save_figure",
     "score",
     "simulate",
+    "sparse_edmd",
+    "stable_edmd",
     "sweep",
     "view",
 ]

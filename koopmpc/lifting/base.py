@@ -122,12 +122,18 @@ class Lifting(Value, ABC):
         parts = [
             part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))
         ]
-        bound = self.bound if other.bound is None else other.bound
+        bound = self._common(other)
         if bound is None:
             return Sum(tuple(parts))
-        if self.bound is not None and self.bound != bound:
-            raise DataError(f"the liftings are bound to other states: {self.bound} and {other.bound}")
         return Sum(tuple(parts)).bind(bound)
+
+    def __mul__(self, other: "Lifting") -> "Lifting":
+        """Return all products of this lifting's observables with the other's."""
+        from koopmpc.lifting.product import Product  # which is a Lifting itself
+
+        product = Product(self, lifting_of(other))
+        bound = self._common(other)
+        return product if bound is None else product.bind(bound)
 
     def as_saved(self) -> Value:
         """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
@@ -157,6 +163,12 @@ class Lifting(Value, ABC):
             if repeated:
                 raise DataError(f"{type(self).__name__}: two {what} are named {repeated[0]!r}; rename one")
         return self.observables(self._states)
+
+    def _common(self, other: "Lifting") -> tuple[str, ...] | None:
+        """Return the states that one of the two is bound to, None where neither is."""
+        if None not in (self.bound, other.bound) and self.bound != other.bound:
+            raise DataError(f"the liftings are bound to other states: {self.bound} and {other.bound}")
+        return self.bound if other.bound is None else other.bound
 
     def _misfit(self, got: object) -> str:
         what = f"has {got} states" if isinstance(got, int) else f"has shape {got}"

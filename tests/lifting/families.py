@@ -1,5 +1,7 @@
 """Random liftings and states for the property tests."""
 
+from collections.abc import Callable
+
 import casadi as ca
 import numpy as np
 from hypothesis import strategies as st
@@ -11,6 +13,8 @@ from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.random_fourier import RandomFourier
+from koopmpc.lifting.standardized import Standardized
 from koopmpc.lifting.state import State
 from koopmpc.lifting.thin_plate import ThinPlate
 
@@ -21,7 +25,9 @@ def swing(x: ca.SX) -> list[ca.SX]:
     return [x[0] * ca.cos(x[0]), ca.fmax(x[0], 0.3), ca.sqrt(1 + x[0] ** 2)]
 
 
-Recipe = tuple[type[Lifting], tuple[object, ...]]  # a class and what it is called with
+Recipe = tuple[
+    Callable[..., Lifting], tuple[object, ...]
+]  # a class, or a function, and what it is called with
 Case = tuple[list[Recipe], np.ndarray]
 
 
@@ -33,11 +39,32 @@ def states(nx: int) -> st.SearchStrategy[np.ndarray]:
     return arrays(np.float64, st.tuples(st.integers(1, 6), st.just(nx)), elements=numbers())
 
 
+def product(first: Recipe, second: Recipe) -> Lifting:
+    return first[0](*first[1]) * second[0](*second[1])
+
+
+def standardized(inner: Recipe, mean: np.ndarray, scale: np.ndarray) -> Lifting:
+    return Standardized(inner[0](*inner[1]), mean, scale)
+
+
 def family(nx: int) -> st.SearchStrategy[Recipe]:
+    simple = basic(nx)
+    mean = arrays(np.float64, nx, elements=numbers(1.0))
+    scale = arrays(np.float64, nx, elements=st.floats(0.5, 4))
+    return st.one_of(
+        simple,
+        st.tuples(st.just(product), st.tuples(simple, simple)),
+        st.tuples(st.just(standardized), st.tuples(simple, mean, scale)),
+    )
+
+
+def basic(nx: int) -> st.SearchStrategy[Recipe]:
     centers = arrays(np.float64, st.tuples(st.integers(1, 3), st.just(nx)), elements=numbers(), unique=True)
     return st.one_of(
         st.just((State, ())),
+        st.just((State, (0,))),
         st.just((Constant, ())),
+        st.tuples(st.just(RandomFourier), st.tuples(st.integers(1, 4), st.floats(0.3, 3), st.integers(0, 9))),
         st.tuples(st.just(Monomials), st.tuples(st.integers(2, 4))),
         st.tuples(
             st.just(Fourier), st.tuples(st.integers(1, 3), st.sampled_from([None, 0, NAMES[0], "theta"]))

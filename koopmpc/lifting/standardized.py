@@ -1,0 +1,94 @@
+"""Another lifting on states that are centred and scaled."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from zlib import crc32
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.lifting.constant import Constant
+
+_ONE = Constant().bind(()).names[0]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Standardized(Lifting):
+    """ψ(x) = inner((x − mean) / scale): the inner lifting sees states of mean 0 and spread 1.
+
+    What has a width or a distance in it (Gaussian, ThinPlate, RandomFourier) then weighs every state alike, whatever
+    its unit, and centres and widths are in standard deviations. `Standardized.of(episodes, lifting)` takes both
+    from data.
+
+    Parameters
+    ----------
+    lifting
+        The inner one.
+    mean, scale
+        (nx,) in the states' units; scale above zero.
+
+    Raises
+    ------
+    ShapeError
+        Mean and scale have not one entry for each state.
+    DataError
+        A scale is not above zero.
+    """
+
+    lifting: Lifting
+    mean: Float[np.ndarray, " nx"]
+    scale: Float[np.ndarray, " nx"]
+
+    def __init__(
+        self, lifting: Lifting, mean: ArrayLike, scale: ArrayLike, *, bound: tuple[str, ...] | None = None
+    ) -> None:
+        center = checks.array(mean, "mean", (None,))
+        spread = checks.array(scale, "scale", center.shape)
+        if (spread <= 0).any():
+            raise DataError(f"scale holds {spread.min():g}; it must be above zero for every state")
+        object.__setattr__(self, "lifting", lifting_of(lifting))
+        object.__setattr__(self, "mean", center)
+        object.__setattr__(self, "scale", spread)
+        object.__setattr__(self, "bound", bound)
+
+    @classmethod
+    def of(cls, episodes: Episodes, lifting: Lifting) -> "Standardized":
+        """Return the lifting standardized by the mean and the standard deviation of these episodes' states.
+
+        A state that does not move keeps its unit: its scale is 1.
+        """
+        rows = sum(len(episode.X) for episode in episodes)
+        mean = np.sum([episode.X.sum(axis=0) for episode in episodes], axis=0) / rows
+        squares = np.sum([((episode.X - mean) ** 2).sum(axis=0) for episode in episodes], axis=0)
+        scale = np.sqrt(squares / rows)
+        still = scale <= 1e-12 * np.abs(mean)
+        return cls(lifting, mean, np.where(still, 1.0, scale))
+
+    def bind(self, states: Sequence[str]) -> "Standardized":
+        """Return the copy on the bound inner lifting."""
+        if len(states) != len(self.mean):
+            raise ShapeError(
+                f"mean and scale have {len(self.mean)} entries and there are {len(states)} states "
+                f"({', '.join(states)}); standardize by data of these states"
+            )
+        bound = Standardized(self.lifting.bind(states), self.mean, self.scale, bound=tuple(states))
+        _ = bound.names
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the inner names with ``~`` and a sum over mean and scale: other numbers are other observables."""
+        tag = f"~{crc32(self.mean.tobytes() + self.scale.tobytes()):08x}"
+        return tuple(name if name == _ONE else name + tag for name in self.lifting.bind(states).names)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the inner formula of the standardized states."""
+        return self.lifting.formula((x - ca.DM(self.mean)) / ca.DM(self.scale))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        self.lifting._fill((x - self.mean[:, None]) / self.scale[:, None], Z)

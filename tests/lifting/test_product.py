@@ -1,0 +1,84 @@
+"""Products of liftings: every pair once, in one order of factors."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from koopmpc.errors import DataError
+from koopmpc.lifting.base import rows
+from koopmpc.lifting.buffered import buffered
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.product import Product
+from koopmpc.lifting.state import State
+from koopmpc.values import from_data, to_data
+from tests.lifting.families import NAMES, Case, cases, made
+
+SWING = Fourier(2, "theta") * State("omega")
+
+
+def test_a_rotating_frame_s_observables() -> None:
+    X = np.random.default_rng(0).normal(size=(30, 2))
+    lifting = SWING.bind(NAMES[:2])
+    theta, omega = X.T
+    expected = [omega * f(k * theta) for k in (1, 2) for f in (np.sin, np.cos)]
+    assert lifting.names == (
+        "omega*sin(theta)",
+        "omega*cos(theta)",
+        "omega*sin(2 theta)",
+        "omega*cos(2 theta)",
+    )
+    assert np.array_equal(lifting(X), np.column_stack(expected))
+    assert buffered(lifting)(X[3])[0] == pytest.approx(lifting(X[3]), rel=1e-14)
+
+
+def test_products_of_states_are_the_monomials() -> None:
+    squares, monomials = (State() * State()).bind(NAMES), Monomials(2).bind(NAMES)
+    X = np.random.default_rng(1).normal(size=(9, 3))
+    assert set(squares.names) == set(monomials.names)
+    assert squares(X)[:, rows(squares, monomials)] == pytest.approx(monomials(X), rel=1e-15)
+    assert (squares + monomials).nz == 6
+
+
+@settings(max_examples=40, deadline=None)
+@given(cases(), cases())
+def test_it_holds_each_pair_of_factors_and_does_not_mind_their_order(first: Case, second: Case) -> None:
+    (a, X), (b, _) = made(first), made(second)
+    if a.bound != b.bound:
+        with pytest.raises(DataError, match="bound to other states"):
+            _ = a * b
+        return
+    ab, ba = a * b, b * a
+    assert set(ab.names) == set(ba.names)
+    np.testing.assert_allclose(ab(X), ba(X)[:, rows(ba, ab)], rtol=1e-13, atol=1e-300)
+    assert isinstance(ab, Product)
+    for z, (i, j) in zip(ab(X).T, ab._pairs.values(), strict=True):
+        assert np.array_equal(z, a(X)[:, i] * b(X)[:, j], equal_nan=True)
+    assert ab.nz <= len({tuple(sorted((i, j))) for i in a.names for j in b.names})
+
+
+def test_one_is_neutral_and_sums_distribute() -> None:
+    assert (Constant() * State()).bind(NAMES).names == NAMES
+    assert ((Constant() + State()) * Fourier(1, 0)).bind(NAMES[:1]).names == (
+        "sin(theta)",
+        "cos(theta)",
+        "theta*sin(theta)",
+        "theta*cos(theta)",
+    )
+    assert (Monomials(2) * Monomials(2)).bind(NAMES[:1]).names == ("(theta^2)^2",)
+
+
+def test_saved_bound_or_not_and_with_a_traced_factor() -> None:
+    X = np.array([[0.3, -2.0]])
+    assert from_data(to_data(SWING)) == SWING
+    lifting = (Expressions(lambda x: [ca.fabs(x[0])], ["size"]) * State()).bind(NAMES[:2])
+    again = from_data(to_data(lifting))
+    assert again.names == lifting.names == ("theta*size", "omega*size")
+    assert np.array_equal(again(X), lifting(X))
+
+
+def test_states_that_differ_in_the_unit_alone_keep_it() -> None:
+    assert (State() * State(2)).bind(("a [m]", "a [s]", "b")).names == ("a [m]*b", "a [s]*b", "b^2")
