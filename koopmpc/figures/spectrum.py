@@ -4,28 +4,21 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError
 from koopmpc.figures.style import SEQUENTIAL, figure, styled
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.identify.eigenpairs import Residuals, eigenpairs
+from koopmpc.identify.residual_dmd import ResidualDMD
+from koopmpc.predict.score import Predictor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LEAST = 1e-12  # residuals below it are rounding
+_LEAST, _MOST = 1e-12, 1e3  # residuals below are rounding, those above are shown as this
 _CROWDED = 0.35  # share of the picture below which the eigenvalues get one of their own
 
 
 @styled
-def plot_spectrum(
-    predictor: LinearPredictor | BilinearPredictor,
-    residuals: ArrayLike | None = None,
-    *,
-    tolerance: float = 0.1,
-) -> "Figure":
+def plot_spectrum(predictor: Predictor, residuals: Residuals | None = None) -> "Figure":
     """Draw the eigenvalues λ of A in the complex plane with |λ| = 1, and the residual of each eigenpair.
 
     The darker and larger a point the smaller its residual; an eigenvalue with a residual above the tolerance is a
@@ -36,9 +29,8 @@ def plot_spectrum(
     predictor
         Its `eigenvalues` are drawn.
     residuals
-        (nz,) in the order of ``predictor.eigenvalues``; without them all points look alike.
-    tolerance
-        The largest residual of an eigenvalue that is not marked.
+        A `ResidualDMD`, as `trust` and `residual_dmd` return, with its tolerance; or (nz,) in the order of
+        ``predictor.eigenvalues``, with a tolerance of 0.05. Without them all points look alike.
 
     Raises
     ------
@@ -49,9 +41,8 @@ def plot_spectrum(
     """
     from matplotlib.lines import Line2D
 
-    values: Any = predictor.eigenvalues
-    known = None if residuals is None else checked_residuals(residuals, len(values))
-    limit = checks.positive(tolerance, "tolerance")
+    known = None if residuals is None else eigenpairs(predictor, residuals)
+    values: Any = predictor.eigenvalues if known is None else known.eigenvalues
     whole = 1.12 * max(1.0, float(np.abs(values).max(initial=0.0)))
     views = [(0.0, 0.0, whole)]
     middle, half = _box(values)
@@ -67,16 +58,16 @@ def plot_spectrum(
                 values.real, values.imag, "o", color="#0072b2", markeredgecolor="black", gid="eigenvalues"
             )
         else:
-            points = _with_residuals(axes, values, known, limit)
+            points = _with_residuals(axes, values, known)
         axes.set(xlim=(x - size, x + size), ylim=(y - size, y + size), aspect="equal")
         axes.set(xlabel="Re λ", ylabel="Im λ", title="closer" if size < whole else "")
     if known is not None:
         made.colorbar(points, ax=grid[0, -1], label="residual of the eigenpair", shrink=0.85)
-        fine: dict[str, Any] = {"marker": "o", "color": "#404040", "label": f"residual ≤ {limit:g}"}
+        fine: dict[str, Any] = {"marker": "o", "color": "#404040", "label": f"residual ≤ {known.tolerance:g}"}
         bad: dict[str, Any] = {
             "marker": "x",
             "color": "black",
-            "label": f"above: may be spurious ({np.sum(known > limit)} of {len(known)})",
+            "label": f"above: may be spurious ({np.sum(known.spurious)} of {len(values)})",
         }
         handles = [Line2D([], [], linestyle="none", **look) for look in (fine, bad)]
         made.legend(handles=handles, loc="outside lower center", ncols=2, handlelength=1.0)
@@ -89,28 +80,20 @@ def _box(values: Any) -> tuple[complex, float]:
     return (low + high) / 2, max((high - low).real, (high - low).imag) / 2
 
 
-def checked_residuals(residuals: ArrayLike, nz: int) -> np.ndarray:
-    """Return the residuals as (nz,) numbers from 0 on."""
-    known = checks.array(residuals, "residuals", (nz,))
-    if (known < 0).any():
-        raise DataError(f"residuals holds {known.min():g}; they are norms, from 0 on")
-    return known
-
-
-def _with_residuals(axes: Any, values: Any, residuals: np.ndarray, limit: float) -> Any:
+def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
     """Draw the points and return them: the smaller the residual the darker and larger."""
     import matplotlib as mpl
     from matplotlib.colors import ListedColormap, LogNorm
 
-    shown = np.maximum(residuals, _LEAST)
-    low, high = min(float(shown.min()), limit / 10), max(float(shown.max()), limit * 10)
+    shown = np.clip(known.residuals, _LEAST, _MOST)
+    low, high = min(float(shown.min()), known.tolerance / 10), max(float(shown.max()), known.tolerance * 10)
     norm = LogNorm(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
     sizes = 12.0 + 40.0 * (1.0 - np.asarray(norm(shown)))
     shades = ListedColormap(
         mpl.colormaps[SEQUENTIAL](np.linspace(0, 0.85, 256))
     )  # its end is too light for points
     points = None
-    for chosen, marker in ((residuals <= limit, "o"), (residuals > limit, "x")):
+    for chosen, marker in ((~known.spurious, "o"), (known.spurious, "x")):
         look: dict[str, Any] = {"edgecolors": "black"} if marker == "o" else {}
         points = axes.scatter(
             values.real[chosen],

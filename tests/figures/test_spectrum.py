@@ -5,10 +5,12 @@ import pytest
 
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.figures.spectrum import plot_spectrum
+from koopmpc.identify.moments import moments
+from koopmpc.identify.residual_dmd import residual_dmd
 from koopmpc.lifting.state import State
 from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
-from tests.figures.models import turning
+from tests.figures.models import episodes, turning
 
 VALUES = np.array([1.2, -0.9, 0.5, 0.1])
 
@@ -25,7 +27,7 @@ def _named(axes, gid: str):
 @pytest.mark.parametrize("residuals", [None, [0.0, 1e-3]])
 def test_the_circle_has_radius_one_and_the_points_are_the_eigenvalues(residuals) -> None:
     model = turning()
-    made = plot_spectrum(model, residuals, tolerance=0.1)
+    made = plot_spectrum(model, residuals)
     axes = made.axes[0]
     assert np.hypot(*_named(axes, "unit circle").get_data()) == pytest.approx(1.0)
     points = _named(axes, "eigenvalues")
@@ -36,16 +38,16 @@ def test_the_circle_has_radius_one_and_the_points_are_the_eigenvalues(residuals)
 
 
 def test_residuals_are_shades_sizes_and_shapes() -> None:
-    residuals = np.array([1e-6, 1e-3, 0.5, 3.0])
-    made = plot_spectrum(_diagonal(), residuals, tolerance=0.1)
+    residuals = np.array([1e-6, 1e-3, 0.5, np.inf])
+    made = plot_spectrum(_diagonal(), residuals)
     good, bad = (_named(made.axes[0], gid) for gid in ("eigenvalues", "spurious eigenvalues"))
     assert np.array_equal(good.get_offsets()[:, 0], VALUES[:2])
     assert np.array_equal(bad.get_offsets()[:, 0], VALUES[2:])
-    assert np.array_equal([*good.get_array(), *bad.get_array()], residuals)
+    assert np.array_equal([*good.get_array(), *bad.get_array()], np.minimum(residuals, 1e3))
     assert (np.diff([*good.get_sizes(), *bad.get_sizes()]) < 0).all()
     assert any("residual" in axes.get_ylabel() for axes in made.axes)
     assert [text.get_text() for text in made.legends[0].get_texts()] == [
-        "residual ≤ 0.1",
+        "residual ≤ 0.05",
         "above: may be spurious (2 of 4)",
     ]
 
@@ -71,5 +73,20 @@ def test_messages() -> None:
         plot_spectrum(turning(), [0, 0, 0])
     with pytest.raises(DataError, match="residuals holds -1; they are norms, from 0 on"):
         plot_spectrum(turning(), [0, -1])
-    with pytest.raises(DataError, match="tolerance is 0; it must be above zero"):
-        plot_spectrum(turning(), tolerance=0.0)
+    data = episodes(3)
+    with pytest.raises(
+        ShapeError, match="there are 2 residuals and 4 eigenvalues; pass the residuals of this"
+    ):
+        plot_spectrum(_diagonal(), residual_dmd(turning(), moments(data, State())))
+    with pytest.raises(DataError, match="the residuals are those of another predictor"):
+        plot_spectrum(turning(0.5), residual_dmd(turning(), moments(data, State())))
+
+
+def test_residuals_of_the_trust_report_are_taken_with_their_tolerance() -> None:
+    data, model = episodes(3), turning()
+    made = plot_spectrum(model, residual_dmd(model, moments(data, State()), tolerance=0.2))
+    assert made.legends[0].get_texts()[0].get_text() == "residual ≤ 0.2"
+    points = _named(made.axes[0], "eigenvalues")
+    drawn = np.asarray(points.get_offsets())
+    assert sorted(drawn[:, 0]) == pytest.approx(sorted(model.eigenvalues.real))
+    assert (np.asarray(points.get_array()) < 1e-6).all()
