@@ -9,7 +9,7 @@ Kerrigan & Maciejowski, "Soft constraints and exact penalty functions in model p
 
 from collections.abc import Mapping
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,14 +21,9 @@ from koopmpc.control.solvers.base import QPSolution
 from koopmpc.control.solvers.choose import SOFT_SETTINGS
 from koopmpc.control.solvers.choose import solver as named
 
-
-class Answer(NamedTuple):
-    """w of the deviation D w, how it was found, and whether a limit gave way."""
-
-    w: Float[np.ndarray, " nw"]
-    status: Status
-    iterations: int
-    gave_way: bool
+# What a solve is given less from now on after it was late, and more after it was not [s]: one of ten will be late.
+_LONGER, _SHORTER = 18e-6, 2e-6
+_AFTER = 5e-5  # what a step does after its solve [s]
 
 
 class Constrained:
@@ -72,42 +67,49 @@ class Constrained:
             if solve is not None:
                 solve.reset()
 
-    def solve(self, v: Float[np.ndarray, " nv"], room: Box | None, nw: int, deadline: float | None) -> Answer:
-        """Return the least deviation from the plan v.
+    def solve(
+        self, v: Float[np.ndarray, " nv"], room: Box | None, deadline: float | None
+    ) -> tuple[QPSolution, bool]:
+        """Return the least deviation from the plan v, w of D w, and whether a limit gave way.
 
         Parameters
         ----------
         room
             How far each input is from its limits, lower and upper, where a hard rate limits it: where the two
             exclude each other the input limit wins.
-        nw
-            Entries of w.
         deadline
             The time by `perf_counter` at which the answer is due.
         """
         found, conflict = self._hard.solve(v, room, deadline)
+        if self._soft is None or found.status is Status.TIME_LIMIT:
+            return found, conflict
         iterations = found.iterations
-        if self._soft is None:
-            return Answer(found.v[:nw], found.status, iterations, conflict)
-        solved = found.status is Status.OPTIMAL
-        if solved and (np.abs(found.y) <= self._hard.program.most).all():
+        if found.status is Status.OPTIMAL and (np.abs(found.y) <= self._hard.program.most).all():
             self._soft.warm = False
-            return Answer(found.v[:nw], Status.OPTIMAL, iterations, conflict)
-        if not solved:
-            self._hard.warm = False
+            return found, conflict
         found, conflict = self._soft.solve(v, room, deadline)
+        nw = self._hard.size
         gave_way = conflict or bool((found.v[nw:] > self._soft.program.allowance).any())
-        return Answer(found.v[:nw], found.status, iterations + found.iterations, gave_way)
+        found.v, found.iterations = found.v[:nw], iterations + found.iterations
+        return found, gave_way
 
 
 class Solve:
-    """One QP, its solver, and the last solution, which the next solve starts from moved on by one step."""
+    """One QP, its solver, and the last solution, which the next solve starts from moved on by one step.
+
+    A solver looks at the clock only now and then: it gets the time until the deadline less what earlier solves took
+    too long, and half of it at least.
+    """
 
     def __init__(self, program: Program, solver: str, settings: Mapping[str, Any]) -> None:
         self.program, self.warm = program, False
         self._solver = named(solver)(program.qp, settings)
-        self._primal = np.zeros(len(program.qp.q) + 1)  # one more, always zero, for the shift
-        self._dual = np.zeros(len(program.low) + 1)
+        self.size = n = len(program.qp.q)
+        m = len(program.low)
+        self._primal, self._dual = np.zeros(n + 1), np.zeros(m + 1)  # one more, always zero, for the shift
+        self._cold = np.zeros(n), np.zeros(m)
+        self._moved = np.zeros(m)  # rows of slacks stay
+        self._tail = 0.0  # by how much solves outlast the time they are given [s]
 
     def adopt(self, program: Program) -> None:
         """Go on with new matrices of the same size."""
@@ -122,24 +124,30 @@ class Solve:
         self, v: Float[np.ndarray, " nv"], room: Box | None, deadline: float | None
     ) -> tuple[QPSolution, bool]:
         """Return the solution, and whether the input limits are out of the hard rates' reach."""
-        program, conflict = self.program, False
-        low, high = program.low.copy(), program.high.copy()
-        if room is not None:
+        program, solver, conflict = self.program, self._solver, False
+        moved = self._moved
+        moved[: len(program.source)] = v[program.source]
+        if room is None:
+            solver.shift(moved)
+        else:
+            low, high = program.low.copy(), program.high.copy()
             rows, which = program.rates
             lowest, highest = np.minimum(low[rows], room.high[which]), np.maximum(high[rows], room.low[which])
             conflict = bool((lowest < low[rows] - 1e-9).any() or (highest > high[rows] + 1e-9).any())
             low[rows], high[rows] = lowest, highest
-        moved = v[program.source]
-        low[: len(moved)] -= moved
-        high[: len(moved)] -= moved
-        self._solver.update(low, high)
-        if self.warm:
+            solver.update(low - moved, high - moved)
+        start = self._cold
+        if self.warm and not solver.goes_on:
             start = self._primal[program.shift_primal], self._dual[program.shift_dual]
+        if deadline is None:
+            found = solver.solve(*start)
         else:
-            start = np.zeros(len(program.shift_primal)), np.zeros(len(program.shift_dual))
-        left = None if deadline is None else deadline - perf_counter()
-        found = self._solver.solve(*start, time_limit=left)
+            left = deadline - perf_counter()
+            found = solver.solve(*start, time_limit=left - min(self._tail, left / 2))
+            if found.status is Status.TIME_LIMIT:
+                late = perf_counter() > deadline - _AFTER
+                self._tail = max(self._tail + (_LONGER if late else -_SHORTER), 0.0)
         self.warm = found.status is Status.OPTIMAL
-        if self.warm:
+        if self.warm and not solver.goes_on:
             self._primal[:-1], self._dual[:-1] = found.v, found.y
         return found, conflict

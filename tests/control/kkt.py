@@ -20,10 +20,6 @@ class CheckedOSQP(OSQP):
         options = {**DEFAULTS, **(settings or {})}
         self.eps = options["eps_abs"], options["eps_rel"]
 
-    def update(self, low, high):
-        super().update(low, high)
-        self.qp = QP(self.qp.P, self.qp.q, self.qp.A, low.copy(), high.copy())
-
     def adopt(self, qp):
         super().adopt(qp)
         self.qp = qp
@@ -31,7 +27,8 @@ class CheckedOSQP(OSQP):
     def solve(self, v, y, time_limit=None):
         solution = super().solve(v, y, time_limit)
         if solution.status is Status.OPTIMAL:
-            meets_kkt(self.qp, solution, *self.eps)
+            now = QP(self.qp.P, self.qp.q, self.qp.A, self._bounds.low, self._bounds.high)
+            meets_kkt(now, solution, *self.eps)
             CheckedOSQP.checked += 1
         return solution
 

@@ -13,6 +13,7 @@ from koopmpc.control.move import Status
 from koopmpc.errors import DataError, ShapeError
 
 INFINITY = 1e30  # what OSQP and DAQP take for no limit
+_BELOW_ROUNDING = 1e26  # ‖by‖² up to which 1e30 less an entry of it is 1e30
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,13 @@ class QPSolution:
 class QPSolver(Protocol):
     """A QP whose limits move from solve to solve, and P, q and A now and then. Copies go on from the last limits."""
 
+    goes_on: bool
+    """Whether a solve starts from where the last one ended, whatever its (v, y)."""
+
+    def shift(self, by: Float[np.ndarray, " m"]) -> None:
+        """Set the limits to those of the QP less `by`."""
+        ...
+
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits."""
         ...
@@ -84,12 +92,31 @@ class Bounds:
 
     def __init__(self, qp: QP) -> None:
         m = len(qp.low)
+        self._qp = qp
+        self._own = np.stack([np.maximum(qp.low, -INFINITY), np.minimum(qp.high, INFINITY)])
         self._ends = np.full(m, -INFINITY), np.full(m, INFINITY)
-        self.low, self.high = np.empty(m), np.empty(m)
-        self._spare = np.empty(m), np.empty(m)
+        self._now, self._spare = np.empty((2, m)), np.empty((2, m))
+        self.low, self.high = self._now
         self._in_order = bytearray(m)  # a search in bytes is five times as fast as all()
         self._in_order_array = np.frombuffer(self._in_order, bool)
         self.set(qp.low, qp.high)
+
+    def shift(self, by: Float[np.ndarray, " m"]) -> None:
+        """Take the limits of the QP less `by`; the old ones stay where that is refused.
+
+        Raises
+        ------
+        ShapeError
+            `by` has the wrong length.
+        DataError
+            It holds NaN, or moves a limit beyond 1e30.
+        """
+        if by.shape != self.low.shape:
+            raise ShapeError(f"the limits move by shape {by.shape}, the QP has {len(self.low)} rows")
+        if by.dot(by) < _BELOW_ROUNDING:
+            np.subtract(self._own, by, out=self._now)
+        else:
+            self.set(self._qp.low - by, self._qp.high - by)
 
     def set(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Take new limits, ±inf where there is none; the old ones stay where they are refused.
@@ -111,8 +138,8 @@ class Bounds:
         np.less_equal(new_low, new_high, out=self._in_order_array)
         if 0 in self._in_order:
             raise DataError("the limits of the QP cross, hold NaN, or are beyond 1e30")
-        self._spare = self.low, self.high
-        self.low, self.high = new_low, new_high
+        self._now, self._spare = self._spare, self._now
+        self.low, self.high = self._now
 
 
 def check_start(qp: QP, v: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]) -> None:

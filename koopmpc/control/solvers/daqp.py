@@ -14,7 +14,6 @@ updates", IEEE Trans. Automatic Control 67(8), 2022.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -22,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, Bounds, QPSolution, check_start
 from koopmpc.errors import DataError
@@ -31,12 +31,13 @@ DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
 _WIDER = 1e-8  # relative widening of the limits before a problem is believed to have no solution
 _ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
 
-_OPTIMAL, _INFEASIBLE, _TIME_LIMIT = 1, -1, -7
+_MANY = 16  # iterations of a solve that tell how long one takes
+
+_OPTIMAL, _INFEASIBLE, _ITERATIONS, _TIME_LIMIT = 1, -1, -4, -7
 _DOUBTFUL = (_INFEASIBLE, -2, -3, -6)  # with: cycling; unbounded; equalities that contradict each other
 _STATUS = {
-    _OPTIMAL: Status.OPTIMAL,
     _INFEASIBLE: Status.INFEASIBLE,
-    -4: Status.MAX_ITERATIONS,
+    _ITERATIONS: Status.MAX_ITERATIONS,
     _TIME_LIMIT: Status.TIME_LIMIT,
 }
 
@@ -57,10 +58,15 @@ class DAQP:
         daqp is not installed, or it refuses the problem or a setting.
     """
 
+    goes_on = True
+
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._qp, self._settings = qp, dict(settings or {})
         self._model = _model(self._settings)
-        self._time_limit = self._allowed = self._model.settings["time_limit"]
+        known = self._model.settings
+        self._time_limit = self._allowed = known["time_limit"]
+        self._most = self._few = known["iter_limit"]
+        self._pace = 1e-9  # how long an iteration takes [s], once it is known
         self._scale()
         free = np.full(len(qp.low), INFINITY)
         flag, _ = self._model.setup(self._H, self._f, self._M, free, -free)
@@ -69,8 +75,12 @@ class DAQP:
         self._bounds = Bounds(qp)
         self._cold = True
 
-    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]]]:
-        return type(self), (replace(self._qp, low=self._bounds.low, high=self._bounds.high), self._settings)
+    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], Box]:
+        return type(self), (self._qp, self._settings), Box(self._bounds.low, self._bounds.high)
+
+    def __setstate__(self, limits: Box) -> None:
+        """Take over the limits that the original had."""
+        self.update(*limits)
 
     def adopt(self, qp: QP) -> None:
         """Go on with another QP of the same size: DAQP's setup is one factorisation."""
@@ -79,6 +89,19 @@ class DAQP:
     def reset(self) -> None:
         """Forget the active rows of the last solve."""
         self._cold = True
+
+    def shift(self, by: Float[np.ndarray, " m"]) -> None:
+        """Set the limits to those of the QP less `by`.
+
+        Raises
+        ------
+        ShapeError
+            `by` has the wrong length.
+        DataError
+            It holds NaN, or moves a limit beyond 1e30.
+        """
+        self._bounds.shift(by)
+        self._send()
 
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits; ±inf where there is none.
@@ -96,7 +119,7 @@ class DAQP:
     def solve(
         self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None = None
     ) -> QPSolution:
-        """Solve within `time_limit` seconds, looked at every 32 iterations.
+        """Solve within `time_limit` seconds: DAQP looks every 32 iterations, so that it gets as many as fit in, too.
 
         (v, y) is only checked: to start from the active rows of the last solve, whose factors DAQP still holds, is
         quicker than to start from the shifted ones.
@@ -118,10 +141,10 @@ class DAQP:
                 self._send(_WIDER)
                 x, multipliers, flag, more = self._run(left)
                 iterations += more
-        status = _STATUS.get(flag, Status.FAILED)
-        if status is Status.OPTIMAL and not self._exact and not self._accurate(x, multipliers):
-            status = Status.FAILED
-        self._cold = self._cold or status is not Status.OPTIMAL
+        if flag == _OPTIMAL and (self._exact or self._accurate(x, multipliers)):
+            status = Status.OPTIMAL
+        else:
+            status, self._cold = _STATUS.get(flag, Status.FAILED), True
         if self._scaled:
             x, multipliers = self._columns * x, self._multipliers * multipliers
         return QPSolution(x, multipliers, status, iterations)
@@ -136,7 +159,7 @@ class DAQP:
         norms = np.linalg.norm(A * columns, axis=1)
         rows = 1.0 / np.where(norms > 0, norms, 1.0)
         self._exact = bool(curved.all()) and not np.count_nonzero(P - np.diag(diagonal))
-        sizes = np.concatenate([[unit], columns, rows])
+        sizes = np.concatenate([[unit], columns, np.sqrt(rows)])
         self._scaled = bool(sizes.min() < 0.01 or sizes.max() > 100)
         if not self._scaled:
             unit, columns, rows = 1.0, np.ones_like(columns), np.ones_like(rows)
@@ -163,10 +186,16 @@ class DAQP:
         if self._refused < 0:
             return np.zeros_like(self._f), np.zeros_like(self._rows), self._refused, 0
         if limit != self._allowed:
-            self._model.settings = {"time_limit": limit}
-            self._allowed = limit
+            few = self._most if not limit else min(self._most, 1 + int(limit / self._pace))
+            self._model.settings = {"time_limit": limit, "iter_limit": few}
+            self._allowed, self._few = limit, few
         x, _, flag, info = self._model.solve()
-        return x, info["lam"], flag, info["iterations"]
+        iterations = info["iterations"]
+        if limit and iterations > _MANY:
+            self._pace += 0.5 * (info["solve_time"] / iterations - self._pace)
+        if flag == _ITERATIONS and self._few < self._most:
+            flag = _TIME_LIMIT
+        return x, info["lam"], flag, iterations
 
     def _accurate(self, x: Float[np.ndarray, " n"], multipliers: Float[np.ndarray, " m"]) -> bool:
         """Tell whether H x + f + Mᵀλ = 0 and low ≤ M x ≤ high hold."""

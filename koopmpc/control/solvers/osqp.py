@@ -10,13 +10,13 @@ Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Ma
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import osqp
 from jaxtyping import Float
 
+from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, Bounds, QPSolution, check_start
 from koopmpc.errors import DataError
@@ -61,6 +61,8 @@ class OSQP:
         OSQP refuses the problem or a setting.
     """
 
+    goes_on = False
+
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._qp, self._settings = qp, dict(settings or {})
         self._bounds = Bounds(qp)
@@ -74,15 +76,18 @@ class OSQP:
         self._solver = self._problem._solver
         self._rho = self._solver.get_settings().rho
         self._time_limit = self._solver.get_settings().time_limit
+        self._most = self._solver.get_settings().max_iter
         self._first = True
         self._moved = True
 
-    def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], float]:
-        now = replace(self._qp, low=self._bounds.low, high=self._bounds.high)
-        return type(self), (now, self._settings), self._solver.get_settings().rho
+    def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Box, float]]:
+        limits = Box(self._bounds.low, self._bounds.high)
+        return type(self), (self._qp, self._settings), (limits, self._solver.get_settings().rho)
 
-    def __setstate__(self, rho: float) -> None:
-        """Take over the step size ρ that the original had adapted: a copy then has the same iterates."""
+    def __setstate__(self, state: tuple[Box, float]) -> None:
+        """Take over the limits, and the step size ρ that the original had adapted: a copy has the same iterates."""
+        limits, rho = state
+        self.update(*limits)
         self._solver.update_rho(rho)
 
     def adopt(self, qp: QP) -> None:
@@ -101,8 +106,7 @@ class OSQP:
         if not same or qp.A.shape != self._qp.A.shape:
             self.__init__(qp, self._settings)
             return
-        self._qp, self._matrices = qp, matrices
-        self._bounds.set(qp.low, qp.high)
+        self._qp, self._matrices, self._bounds = qp, matrices, Bounds(qp)
         P, A = (np.ascontiguousarray(matrix.data) for matrix in matrices)
         self._solver.update_data_vec(q=qp.q, l=self._bounds.low, u=self._bounds.high)
         if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
@@ -112,6 +116,20 @@ class OSQP:
     def reset(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""
         self._solver.update_rho(self._rho)
+
+    def shift(self, by: Float[np.ndarray, " m"]) -> None:
+        """Set the limits to those of the QP less `by`.
+
+        Raises
+        ------
+        ShapeError
+            `by` has the wrong length.
+        DataError
+            It holds NaN, or moves a limit beyond 1e30.
+        """
+        self._bounds.shift(by)
+        self._solver.update_data_vec(q=None, l=self._bounds.low, u=self._bounds.high)
+        self._moved = True
 
     def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits; ±inf where there is none.
@@ -142,6 +160,8 @@ class OSQP:
         self._solver.solve()
         info, solution = self._solver.info, self._solver.solution
         status = _STATUS.get(int(info.status_val), Status.FAILED)
+        if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
+            status = Status.TIME_LIMIT
         return QPSolution(np.array(solution.x), np.array(solution.y), status, int(info.iter))
 
     def _allow(self, seconds: float) -> None:
