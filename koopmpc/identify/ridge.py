@@ -11,6 +11,7 @@ from koopmpc.errors import DataError
 Ridge = float | Literal["gcv"]
 
 _ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
+_NOTHING = 1e-14
 _LARGEST = 1e3  # times σ₁²: beyond it next to nothing is left of K
 _POINTS = 300  # of the first grid, about ten a decade
 _ZOOMS = 5  # each ten times finer than the one before
@@ -37,8 +38,8 @@ def cross_validated(
 ) -> float:
     """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
 
-    Each target counts relative to its own size, so that units mean nothing. A target that P holds to rounding
-    says nothing about noise and is left out; where all are, λ is 0.
+    Each target counts relative to its own size, so that units mean nothing. Where P holds all of them to
+    rounding there is no noise, and λ is 0.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def cross_validated(
     samples
         M.
     cut
-        The smallest λ tried is (cut · σ₁)².
+        Singular values below cut · σ₁ are rounding.
 
     References
     ----------
@@ -61,13 +62,12 @@ def cross_validated(
     live = s > cut * s.max(initial=0.0)
     energy = np.sum(shares**2, axis=0) + outside
     lost = outside + np.sum(shares[~live] ** 2, axis=0)
-    noisy = lost > _ROUNDING * energy
-    if samples <= live.sum():  # P reaches every target, with noise and all
-        noisy = energy > 0
-    if not noisy.any() or not live.any():
+    exact = samples > live.sum() and not (lost > _ROUNDING * energy).any()
+    if exact or not live.any():
         return 0.0
-    power = np.sum(shares[:, noisy] ** 2 / energy[noisy], axis=1)
-    rest = float(np.sum(outside[noisy] / energy[noisy]))
+    size = np.where(energy > 0, energy, 1.0)
+    power = np.sum(shares**2 / size, axis=1)
+    rest = float(np.sum(outside / size))
     squares = s**2
 
     def score(ridge: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -75,8 +75,8 @@ def cross_validated(
         free = samples - len(s) + np.sum(left, axis=1)
         return samples * (left**2 @ power + rest) / free**2
 
-    low, high = (cut * float(s[0])) ** 2, _LARGEST * float(s[0]) ** 2
-    low, high, points = np.log(low), np.log(high), _POINTS
+    smallest = float(s[live].min())  # a ridge far below its square changes nothing
+    low, high, points = np.log(_NOTHING * smallest**2), np.log(_LARGEST * float(s[0]) ** 2), _POINTS
     for _ in range(_ZOOMS):
         grid = np.linspace(low, high, points)
         best = int(np.argmin(score(np.exp(grid))))
