@@ -15,6 +15,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.projected import Projected
+from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 
 _ROWS = 4096  # states whose eigenfunctions are held at once
@@ -105,12 +106,13 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
     return np.sqrt(error / size)
 
 
-def same_names(predictor: LinearPredictor, episodes: Episodes) -> None:
+def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes) -> None:
     """Raise where data and predictor differ in states, inputs, the disturbances that it knows, or dt."""
+    known = predictor.disturbances if isinstance(predictor, LinearPredictor) else ()
     for mine, theirs, what in (
         (predictor.states, episodes.states, "states"),
         (predictor.inputs, episodes.inputs, "inputs"),
-        (predictor.disturbances, episodes.disturbances if predictor.nw else (), "disturbances"),
+        (known, episodes.disturbances if known else (), "disturbances"),
     ):
         if mine != theirs:
             raise ShapeError(

@@ -10,6 +10,7 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.state import State
+from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.score import score
 from tests.predict.models import random_predictor
@@ -52,6 +53,77 @@ def test_the_errors_are_those_of_rollouts_from_each_start(horizon: int, stride: 
     assert np.allclose(result.rmse, rmse, rtol=1e-10)
     assert np.allclose(result.relative, rmse / size, rtol=1e-10)
     assert result.total == pytest.approx(np.sqrt(np.mean((rmse / size) ** 2)))
+
+
+def brute_errors(predict, data: Episodes, horizon: int, stride: int = 1) -> np.ndarray:
+    """x − x̂, (starts, horizon, nx), where predict(x, U) returns x_1 … x_horizon, one start at a time."""
+    return np.array(
+        [
+            e.X[k + 1 : k + horizon + 1] - predict(e.X[k], e.U[k : k + horizon])
+            for e in data
+            for k in range(0, len(e) - horizon + 1, stride)
+        ]
+    )
+
+
+@given(st.integers(1, 6), st.integers(1, 3), st.integers(0, 99))
+def test_holding_the_state_scores_its_change_and_quantiles_are_those_of_all_starts(
+    horizon: int, stride: int, seed: int
+) -> None:
+    data = runs(random_predictor(seed, 2, 1), [7, 12, 6], seed, noise=0.1)
+    hold = LinearPredictor(np.eye(2), np.zeros((2, 1)), np.eye(2), State(), data.dt, data.states, data.inputs)
+    errors = brute_errors(lambda x, U: np.tile(x, (len(U), 1)), data, horizon, stride)
+    result = score(hold, data, horizon, stride=stride)
+    assert np.allclose(result.rmse, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-12)
+    expected = np.quantile(errors, [0.05, 0.5, 0.95], axis=0, method="inverted_cdf")
+    assert np.allclose([result.low, result.median, result.high], expected, rtol=1e-12, atol=1e-14)
+
+
+@given(st.integers(1, 6), st.integers(1, 2), st.integers(0, 99))
+def test_bilinear_predictors_score_as_their_rollouts(horizon: int, nu: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = runs(random_predictor(seed, 2, nu), [7, 9], seed, noise=0.1)
+    lifting = State() + Constant() + Fourier(1)
+    nz = lifting.bind(data.states).nz
+    A, B, N, C = (0.3 * rng.standard_normal(size) for size in ((nz, nz), (nz, nu), (nu, nz, nz), (2, nz)))
+    model = BilinearPredictor(A, B, N, C, lifting, data.dt, data.states, data.inputs)
+    errors = brute_errors(lambda x, U: model.rollout(x, U)[1:], data, horizon)
+    assert np.allclose(score(model, data, horizon).rmse, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-9)
+    step = model.step_map()
+    errors = brute_errors(lambda x, U: step.rollout(x, U)[1:], data, horizon)
+    relifted = score(model, data, horizon, relift=True)
+    assert np.allclose(relifted.rmse, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-9)
+
+
+def test_relifting_a_linear_predictor_scores_its_step_map() -> None:
+    model = random_predictor(1, 2, 1, State() + Constant() + Fourier(1), radius=0.5)
+    data = runs(random_predictor(1, 2, 1), [7, 9], 1, noise=0.1)
+    step = model.step_map()
+    errors = brute_errors(lambda x, U: step.rollout(x, U)[1:], data, 5)
+    result = score(model, data, 5, relift=True)
+    assert np.allclose(result.rmse, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-9)
+
+
+def test_of_many_starts_evenly_spread_ones_give_the_quantiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("koopmpc.predict.score._KEPT", 1)
+    monkeypatch.setattr("koopmpc.predict.score._LEAST", 40)
+    monkeypatch.setattr("koopmpc.predict.score._STARTS", 17)
+    model = random_predictor(3, 2, 1, State() + Fourier(1))
+    data = runs(random_predictor(3, 2, 1), [40, 55, 30], 3, noise=0.1)
+    errors = brute_errors(lambda x, U: model.rollout(x, U)[1:], data, 3)
+    assert len(errors) == 119
+    result = score(model, data, 3)
+    expected = np.quantile(errors[::3], [0.05, 0.5, 0.95], axis=0, method="inverted_cdf")
+    assert np.allclose([result.low, result.median, result.high], expected, rtol=1e-12, atol=1e-14)
+    assert np.allclose(result.rmse, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-12)
+
+
+def test_a_diverging_prediction_has_an_infinite_error() -> None:
+    away = LinearPredictor([[1e200]], np.empty((1, 0)), [[1]], State(), 0.1, ("a",), ())
+    data = Episodes([Episode(X=[[1.0], [1.0], [1.0], [1.0]])], 0.1, ("a",))
+    result = score(away, data, 3)
+    assert np.array_equal(np.isinf(result.rmse[:, 0]), [True, True, True])  # squares beyond 1e308
+    assert np.array_equal(np.isinf(result.high[:, 0]) | np.isinf(result.low[:, 0]), [False, True, True])
 
 
 def test_long_episodes_are_scored_in_blocks() -> None:
