@@ -42,13 +42,18 @@ from koopmpc.figures.spectrum import plot_spectrum
 from koopmpc.figures.style import save as save_figure
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.constrained import constrained_edmd
+from koopmpc.identify.coverage import Coverage, coverage
 from koopmpc.identify.dmd import dmd, dmdc
 from koopmpc.identify.edmd import edmd
+from koopmpc.identify.excitation import Persistency, feedback_share, persistency
+from koopmpc.identify.invariance import Invariance, invariance
 from koopmpc.identify.moments import Moments, moments
 from koopmpc.identify.online import OnlineEDMD
 from koopmpc.identify.prior import Combination, Prior, Storage
+from koopmpc.identify.residual_dmd import ResidualDMD, residual_dmd
 from koopmpc.identify.sparse import sparse_edmd
 from koopmpc.identify.stable import stable_edmd
+from koopmpc.identify.trust import TrustReport, trust
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions
@@ -77,6 +82,7 @@ from koopmpc.plant.integrators import CVODES, RK4, Collocation, Euler, ImplicitM
 from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import Affine, StepMap, discretize
 from koopmpc.predict.bilinear import BilinearPredictor, load_bilinear_predictor
+from koopmpc.predict.conformal import ConformalBand, conformal
 from koopmpc.predict.linear import LinearPredictor, load_predictor
 from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
@@ -101,9 +107,11 @@ __all__ = [
     "Chirp",
     "Collocation",
     "Combination",
+    "ConformalBand",
     "Constant",
     "Controller",
     "Cost",
+    "Coverage",
     "DataError",
     "DefinitenessError",
     "Disk",
@@ -126,6 +134,7 @@ __all__ = [
     "Gaussian",
     "ImplicitMidpoint",
     "Injection",
+    "Invariance",
     "KoopmanMPC",
     "KoopmpcError",
     "LiftedDisturbance",
@@ -146,6 +155,7 @@ __all__ = [
     "NonlinearMPC",
     "ObservableError",
     "OnlineEDMD",
+    "Persistency",
     "Plan",
     "Plans",
     "Plant",
@@ -154,6 +164,7 @@ __all__ = [
     "ProblemError",
     "RandomFourier",
     "Recorder",
+    "ResidualDMD",
     "Run",
     "Score",
     "SensorDelay",
@@ -171,17 +182,22 @@ __all__ = [
     "Stream",
     "ThinPlate",
     "Training",
+    "TrustReport",
     "Uniform",
     "amplitudes",
     "bilinear_edmd",
     "collect",
+    "conformal",
     "constrained_edmd",
     "continuous_eigenvalues",
+    "coverage",
     "discretize",
     "dlqr",
     "dmd",
     "dmdc",
     "edmd",
+    "feedback_share",
+    "invariance",
     "linearity_error",
     "list_problems",
     "load_bilinear_predictor",
@@ -192,6 +208,7 @@ __all__ = [
     "lqr",
     "metrics",
     "moments",
+    "persistency",
     "plot_eigenfunctions",
     "plot_error",
     "plot_rollout",
@@ -199,11 +216,13 @@ __all__ = [
     "plot_spectrum",
     "reconstruct",
     "record",
+    "residual_dmd",
     "save_figure",
     "score",
     "simulate",
     "sparse_edmd",
     "stable_edmd",
     "sweep",
+    "trust",
     "view",
 ]
