@@ -28,6 +28,7 @@ _SHOWN = 200  # characters of a task that a message shows
 _GRACE = 5.0  # [s] for a process to end
 _PATIENCE = 30.0  # [s] without any Dask worker
 _ANSWER = 10.0  # [s] for a Dask scheduler to answer
+_ANY_PORT = "127.0.0.1:0"
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 _GUARD = (
     'put what the script runs under `if __name__ == "__main__":`, for each worker imports the script first'
@@ -317,7 +318,7 @@ def _awaited(job: _Job[Any], future: Any, client: Any) -> Any:
 
 @contextmanager
 def _client(scheduler: str, workers: int | None) -> Generator[Any]:
-    """Return a client of the cluster; a local one is made for it, without a dashboard, and taken down after."""
+    """Return a client of the cluster; a local one, which only this machine sees, is taken down after."""
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:
@@ -330,7 +331,8 @@ def _client(scheduler: str, workers: int | None) -> Generator[Any]:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
-                dashboard_address=None,  # pyright: ignore[reportArgumentType]  # None is "no dashboard"
+                dashboard_address=_ANY_PORT,
+                worker_dashboard_address=_ANY_PORT,
             )
             address = open_now.enter_context(cluster)
         try:

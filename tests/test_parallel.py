@@ -11,12 +11,26 @@ import pytest
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.parallel import map_tasks
 from tests import tasks
+from tests.cluster import two_workers
 
 HERE = {"workers": 1}
 PROCESSES = {"workers": 2}
-DASK = {"workers": 2, "scheduler": "local"}
-EVERYWHERE = pytest.mark.parametrize("where", [HERE, PROCESSES, DASK], ids=["here", "processes", "dask"])
-AWAY = pytest.mark.parametrize("where", [PROCESSES, DASK], ids=["processes", "dask"])
+EVERYWHERE = pytest.mark.parametrize("where", ["here", "processes", "dask"], indirect=True)
+AWAY = pytest.mark.parametrize("where", ["processes", "dask"], indirect=True)
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    with two_workers() as address:
+        yield address
+
+
+@pytest.fixture
+def where(request: pytest.FixtureRequest) -> dict:
+    """Return how map_tasks is told where to run."""
+    if request.param == "dask":
+        return {"scheduler": request.getfixturevalue("scheduler")}
+    return HERE if request.param == "here" else PROCESSES
 
 
 @EVERYWHERE
@@ -84,6 +98,10 @@ def test_workers_have_one_blas_thread_each(monkeypatch: pytest.MonkeyPatch) -> N
     assert set(map_tasks(tasks.threads, range(2))) == {"2"}
 
 
+def test_a_local_cluster_is_made_and_taken_down() -> None:
+    assert list(map_tasks(tasks.threads, range(3), workers=2, scheduler="local")) == ["1", "1", "1"]
+
+
 def test_no_task_is_no_result() -> None:
     assert list(map_tasks(tasks.square, [], **PROCESSES)) == []
 
@@ -121,7 +139,12 @@ def test_a_cluster_is_reached_by_its_address_and_one_without_workers_is_told(
 ) -> None:
     from distributed import LocalCluster
 
-    local = {"processes": False, "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
+    local = {
+        "processes": False,
+        "threads_per_worker": 1,
+        "host": "127.0.0.1",
+        "dashboard_address": "127.0.0.1:0",
+    }
     with LocalCluster(n_workers=1, protocol="tcp", **local) as cluster:
         address = cluster.scheduler_address
         assert list(map_tasks(tasks.square, range(3), scheduler=address)) == [0, 1, 4]

@@ -1,0 +1,248 @@
+"""Moments of files, streams, processes and a cluster are the same to the bit; weights count pairs twice."""
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.folder import Files
+from koopmpc.data.stream import Stream
+from koopmpc.errors import DataError, KoopmpcError, ShapeError
+from koopmpc.identify.bilinear import bilinear_edmd
+from koopmpc.identify.dmd import dmdc
+from koopmpc.identify.edmd import edmd
+from koopmpc.identify.moments import Moments, moments
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.expressions import Expressions
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from tests.cluster import two_workers
+from tests.identify.plants import brute_force, random_episodes
+from tests.tasks import by_first_state, dying_reader
+
+LIFTING = Constant() + State() + Monomials(2)
+USERS = State() + Expressions(lambda x: [x[0] * x[1]], ["x0 x1"])  # a lambda, which does not pickle
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    with two_workers() as address:
+        yield address
+
+
+@pytest.fixture
+def sets() -> list[Episodes]:
+    return [random_episodes(seed, [700, 40, 900], 2, 1) for seed in range(3)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, sets: list[Episodes], monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr("koopmpc.data.folder._PART", 10)
+    monkeypatch.setattr("koopmpc.data.stream._PART", 10)
+    for i, one in enumerate(sets):
+        one.save(tmp_path / f"{i}.npz")
+    return tmp_path
+
+
+def gram(m: Moments) -> np.ndarray:
+    return m.sums if m.route == "gram" else m.sums.T @ m.sums
+
+
+def close(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.abs(a - b).max() <= 1e-12 * max(np.abs(b).max(), 1))
+
+
+@pytest.mark.parametrize(("lifting", "route"), [(LIFTING, "gram"), (USERS, "qr")], ids=["ours", "users"])
+def test_here_on_processes_and_on_dask_the_moments_are_the_same_to_the_bit(
+    folder: Path, sets: list[Episodes], route: str, lifting: State, scheduler: str
+) -> None:
+    source = Files(folder)
+    here = moments(source, lifting, route=route)
+    told: list[tuple[int, int | None]] = []
+    processes = moments(source, lifting, route=route, workers=2, progress=lambda *now: told.append(now))
+    assert processes == here
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert moments(source, lifting, route=route, scheduler=scheduler) == here
+    assert moments(Stream(iter(sets)), lifting, route=route, scheduler=scheduler) == here
+    assert here.samples == sum(len(e) for one in sets for e in one)
+    assert close(gram(here), gram(moments(sets[0] + sets[1] + sets[2], lifting, route=route)))
+
+
+def test_parts_are_merged_in_the_order_of_the_source(folder: Path, sets: list[Episodes]) -> None:
+    one, two, three = (moments(part, LIFTING, route="qr") for part in sets)
+    assert moments(Files(folder), LIFTING, route="qr") == one + two + three
+
+
+def test_a_worker_that_dies_while_it_reads_changes_nothing(folder: Path, scheduler: str) -> None:
+    here = moments(Files(folder), LIFTING, route="gram")
+    source = Files(folder, reader=dying_reader)
+    assert moments(source, LIFTING, route="gram", workers=2) == here
+    (folder / "1.died").unlink()
+    assert moments(source, LIFTING, route="gram", scheduler=scheduler) == here
+    assert (folder / "1.died").exists()
+
+
+def always_dying(path: Path) -> Episodes:
+    import os
+
+    if path.name == "1.npz":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return dying_reader(path)
+
+
+def test_a_file_that_kills_each_worker_is_named(folder: Path) -> None:
+    with pytest.raises(KoopmpcError, match=rf"task 1, {folder}/1\.npz: each worker that did it died"):
+        moments(Files(folder, reader=always_dying), LIFTING, route="gram", workers=2)
+
+
+@pytest.mark.parametrize(
+    ("where", "route"), [({}, "gram"), ({"workers": 2}, "qr")], ids=["here", "processes"]
+)
+def test_an_observable_that_is_not_finite_is_named_with_its_file(
+    where: dict, route: str, folder: Path
+) -> None:
+    X = np.ones((4, 2))
+    X[2, 0] = 0.0
+    Episodes([Episode(X=X, U=np.zeros((3, 1)))], 0.1).save(folder / "1.npz")
+    inverse = State() + Expressions(lambda x: [1 / x[0]], ["1/x"])
+    with pytest.raises(DataError, match=rf"'1/x' is NaN, infinite or above 1e154 in {folder}/1\.npz; drop"):
+        moments(Files(folder), inverse, route=route, **where)
+
+
+def test_a_stream_that_is_read_once_is_summed_in_qr_unless_told(sets: list[Episodes]) -> None:
+    assert moments(Stream(iter(sets)), LIFTING).route == "qr"
+    assert moments(Stream(iter(sets)), LIFTING, route="gram").route == "gram"
+    assert moments(Stream(sets), LIFTING).route == "gram"
+    spent = Stream(iter(sets))
+    moments(spent, LIFTING)
+    with pytest.raises(DataError, match="the stream was read already"):
+        moments(spent, LIFTING)
+
+
+def test_a_folder_that_turns_out_worse_than_its_pilot_is_read_again_in_qr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("koopmpc.data.folder._PART", 10)
+    for i in range(8):  # the pilot reads 0, 2, 5 and 7
+        data = random_episodes(i, [200], 2, 0)
+        X = np.array(data[0].X)
+        X[50] = [1e9, 1e9] if i == 3 else X[50]
+        Episodes([Episode(X=X)], 0.1).save(tmp_path / f"{i}.npz")
+    passes: list[int] = []
+    total = moments(Files(tmp_path), State(), progress=lambda done, _: passes.append(done))
+    assert total.route == "qr"
+    assert passes == [*range(9), *range(9)]
+    assert total == moments(Files(tmp_path), State(), route="qr")
+
+
+class Counting:
+    """An iterable that begins anew each time, and counts how many sets it has given."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.given = count, 0
+
+    def __iter__(self) -> Iterator[Episodes]:
+        for i in range(self.count):
+            self.given += 1
+            yield random_episodes(i, [50], 2, 1)
+
+
+def test_a_replayable_stream_of_unknown_length_has_a_pilot_at_its_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("koopmpc.data.stream._PART", 10)
+    sets = Counting(20)
+    total = moments(Stream(sets), LIFTING)
+    assert total.samples == 1000
+    assert total.route == "gram"
+    assert sets.given <= 1 + 5 + 20  # the first set for the names, the pilot and one ahead, the whole
+
+
+def test_every_fit_takes_a_source(folder: Path, sets: list[Episodes]) -> None:
+    whole = sets[0] + sets[1] + sets[2]
+    for fit in (
+        lambda data, **how: edmd(data, LIFTING, **how),
+        lambda data, **how: bilinear_edmd(data, LIFTING, **how),
+        lambda data, **how: dmdc(data, **how),
+    ):
+        a, b = fit(Files(folder), workers=2), fit(whole)
+        assert np.allclose(a.A, b.A, rtol=0, atol=1e-10)
+        assert np.allclose(a.B, b.B, rtol=0, atol=1e-10)
+        assert (a.states, a.inputs, a.dt) == (b.states, b.inputs, b.dt)
+
+
+@given(
+    st.lists(st.integers(1, 9), min_size=1, max_size=6), st.integers(0, 999), st.sampled_from(["gram", "qr"])
+)
+def test_a_whole_weight_counts_a_pair_so_many_times(lengths: list[int], seed: int, route: str) -> None:
+    data = random_episodes(seed, lengths, 2, 1)
+    rng = np.random.default_rng(seed)
+    w = [rng.integers(0, 4, len(e)) for e in data]
+    w[0][0] = 2
+    m = moments(data, LIFTING, route=route, weights=w)
+    D = np.repeat(brute_force(data, LIFTING.bind(data.states)), np.concatenate(w), axis=0)
+    assert m.weight == len(D)
+    assert m.samples == np.count_nonzero(np.concatenate(w))
+    assert close(gram(m), D.T @ D)
+
+
+def test_weights_are_a_number_an_episode_one_a_step_or_a_function(sets: list[Episodes], folder: Path) -> None:
+    data = sets[0] + sets[1] + sets[2]
+    numbers = [by_first_state(e) for e in data]
+    by_number = moments(data, LIFTING, weights=numbers)
+    assert (
+        moments(data, LIFTING, weights=[np.full(len(e), w) for e, w in zip(data, numbers, strict=True)])
+        == by_number
+    )
+    assert moments(data, LIFTING, weights=by_first_state) == by_number
+    files = moments(Files(folder), LIFTING, weights=by_first_state, workers=2)
+    assert close(files.sums, by_number.sums)
+    assert files.weight == pytest.approx(by_number.weight)
+
+
+def test_a_common_factor_of_the_weights_changes_nothing_of_a_fit_but_rounding() -> None:
+    data = random_episodes(0, [200, 100], 2, 1)
+    plain = edmd(data, LIFTING, ridge=1e-3)
+    same = edmd(data, LIFTING, ridge=1e-3, weights=[7.0, 7.0])
+    assert np.allclose(plain.A, same.A, rtol=0, atol=1e-12)
+    assert np.allclose(plain.report.residual, same.report.residual, rtol=1e-12)
+
+
+def test_weighted_coefficients_and_residuals_are_those_of_weighted_least_squares() -> None:
+    data = random_episodes(1, [150, 60], 2, 1)
+    rng = np.random.default_rng(0)
+    w = [rng.uniform(0, 2, len(e)) for e in data]
+    fitted = edmd(data, State(), weights=w)
+    D, root = brute_force(data, State().bind(data.states)), np.sqrt(np.concatenate(w))[:, None]
+    K = np.linalg.lstsq(root * D[:, :3], root * D[:, 3:], rcond=None)[0]
+    assert np.allclose(np.hstack([fitted.A, fitted.B]), K.T, rtol=0, atol=1e-12)
+    error = (D[:, 3:] - D[:, :3] @ K) ** 2
+    size = np.sqrt(np.average(error, axis=0, weights=np.concatenate(w)))
+    assert np.allclose(fitted.report.residual, size)
+
+
+def test_weights_that_do_not_fit_are_refused() -> None:
+    data = random_episodes(0, [5, 4], 2, 1)
+    with pytest.raises(
+        ShapeError, match="there are 1 weights and 2 episodes; give each episode a number, or"
+    ):
+        moments(data, State(), weights=[1.0])
+    with pytest.raises(
+        ShapeError, match=r"the weight of episode 1 has shape \(5,\), expected \(4,\) or a scalar"
+    ):
+        moments(data, State(), weights=[1.0, np.ones(5)])
+    with pytest.raises(DataError, match="the weight of episode 0 is -1; weights are 0 or above"):
+        moments(data, State(), weights=[-1.0, 1.0])
+    with pytest.raises(DataError, match="the weight of episode 1 holds 1 NaN or inf"):
+        moments(data, State(), weights=[1.0, np.nan])
+    with pytest.raises(DataError, match="all weights are 0; give some pair a weight above 0"):
+        moments(data, State(), weights=[0.0, 0.0])
+    with pytest.raises(
+        DataError, match="weights are a list, which only Episodes have an order for; pass a function"
+    ):
+        moments(Stream([data]), State(), weights=[1.0, 1.0])
