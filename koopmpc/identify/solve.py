@@ -91,3 +91,10 @@ def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
     s = np.linalg.svd(unit(P), compute_uv=False)
     rank = int(np.sum(s > cutoff(rows) * s[0]))
     return rank, float(s[0] / s[-1]) if rank == P.shape[1] else np.inf
+
+
+def onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
+    """Return the columns projected on the span of the basis."""
+    U, s, _ = np.linalg.svd(unit(basis), full_matrices=False)
+    U = U[:, s > np.finfo(float).eps * max(basis.shape) * s.max(initial=0.0)]
+    return U @ (U.T @ columns)

@@ -1,0 +1,137 @@
+"""EDMD under priors: known entries by plain linear algebra, bounds and couplings by a convex program."""
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
+from koopmpc.identify.assemble import assembled, growth, read, tikhonov
+from koopmpc.identify.doubts import doubts
+from koopmpc.identify.edmd import regression
+from koopmpc.identify.prior import Entries, Prior
+from koopmpc.identify.program import optimum, violation
+from koopmpc.identify.solve import Rows, norms, solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.predict.linear import LinearPredictor
+
+_MET = 1e-10  # priors missed by less than this, in units of the data, are met
+
+
+def constrained_edmd(
+    episodes: Episodes | Source, lifting: Lifting, *, prior: Prior, ridge: float = 0.0
+) -> LinearPredictor:
+    """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares among the A, B, E that agree with what is known of them.
+
+    The misfit is Σᵢ ‖ψᵢ(x⁺) − …‖² / ‖ψᵢ(x⁺)‖², each observable in units of its own size; this matters only where
+    the prior couples the rows of A. Known entries and rows are solved by linear algebra, bounds by one QP a row,
+    symmetry, combinations and storage by one program of all rows. A prior that the plain fit agrees with changes
+    nothing.
+
+    Parameters
+    ----------
+    episodes
+        Episodes or a Source; no pair spans two of them.
+    lifting
+        ψ: R^nx → R^nz.
+    prior
+        What is known; its shapes and names are those of the lifting's observables and of the inputs.
+    ridge
+        Tikhonov weight on unit-norm columns of what is free.
+
+    Raises
+    ------
+    ShapeError, DataError
+        The prior does not fit the lifting, contradicts itself, or cannot be met (with the solver's status).
+
+    Warns
+    -----
+    FitWarning
+        The free columns are dependent or ill-conditioned, or the solver met its tolerance only roughly.
+    """
+    ridge = tikhonov(ridge)
+    total, disturbances = read(episodes, lifting)
+    task = regression(total, "constrained_edmd")
+    nz, names = task.lifting.nz, task.lifting.names
+    entries = prior.entries(names, task.inputs)
+    rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
+    sentences = _doubts(rows, entries, names, task.inputs, regular=ridge > 0)
+    plain = linear(rows, entries, ridge)
+    K, statuses = _bounded(rows, entries, plain, ridge, prior)
+    sentences += [
+        f"the solver met its tolerance only roughly (status {status!r}); check the priors and the scales of the data"
+        for status in sorted(statuses - {"optimal"})
+    ]
+    free = np.isnan(entries.known)
+    active = free & ((entries.low >= K.T) | (entries.high <= K.T))
+    changes = [f"{int((~free).sum())} of {free.size} entries of [A B] are known"] * bool((~free).any())
+    changes += [f"{int(active.sum())} entries stand at a bound"] * bool(active.any())
+    changes += [word for word, held in _COUPLINGS.items() if getattr(prior, held)]
+    changes.append(growth(rows, K, solve(rows, ridge=ridge).K))
+    return assembled(
+        task,
+        K,
+        disturbances,
+        how=f"{'Clarabel' if statuses else 'linear algebra'} under priors, ridge {ridge:g}",
+        ridge=ridge,
+        sentences=sentences,
+        changes=changes,
+    )
+
+
+_COUPLINGS = {
+    "A is symmetric": "symmetric",
+    "combinations of entries are limited": "combinations",
+    "energy that is stored is dissipated as the prior says": "storage",
+}
+
+
+def _doubts(
+    rows: Rows, entries: Entries, names: tuple[str, ...], inputs: tuple[str, ...], *, regular: bool
+) -> list[str]:
+    """Return doubts about the columns that are free in some row."""
+    free, nz = np.isnan(entries.known).any(axis=0), len(names)
+    which = np.flatnonzero(free)
+    part = Rows(rows.P[:, which], rows.T, rows.rest, rows.samples)
+    observables = [names[int(j)] for j in which if j < nz]
+    forces = [inputs[int(j) - nz] for j in which if j >= nz]
+    return doubts(part, observables, forces, regular=regular)[0] if which.size else []
+
+
+def linear(rows: Rows, entries: Entries, ridge: float) -> Float[np.ndarray, "n nz"]:
+    """Return the least squares over the free entries; rows of [A B] with the same ones are solved together."""
+    known = entries.known
+    K = np.where(np.isnan(known), 0.0, known).T
+    patterns: dict[bytes, list[int]] = {}
+    for i, row in enumerate(np.isnan(known)):
+        patterns.setdefault(row.tobytes(), []).append(i)
+    for targets in patterns.values():
+        free = np.isnan(known[targets[0]])
+        if free.any():
+            rest = rows.T[:, targets] - rows.P @ K[:, targets]
+            task = Rows(rows.P[:, free], rest, rows.rest[targets], rows.samples)
+            K[np.ix_(free, targets)] = solve(task, ridge=ridge).K
+    return K
+
+
+def _bounded(
+    rows: Rows, entries: Entries, plain: Float[np.ndarray, "n nz"], ridge: float, prior: Prior
+) -> tuple[Float[np.ndarray, "n nz"], set[str]]:
+    """Return K within bounds and couplings, and the statuses of the programs that were solved."""
+    nz = len(plain.T)
+    limits = entries.low.T, entries.high.T
+    inside = np.asarray(((plain >= limits[0]) & (plain <= limits[1])).all(axis=0))
+    size = norms(rows.P) / np.sqrt(rows.samples)
+    if prior.coupled:
+        if inside.all() and violation(prior, plain[:nz].T, plain[nz:].T, size) <= _MET:
+            return plain, set()
+        K, status = optimum(rows, entries, np.arange(nz), ridge, prior)
+        statuses = {status}
+        if prior.symmetric:
+            K[:nz] = 0.5 * (K[:nz] + K[:nz].T)
+    else:
+        K, statuses = plain.copy(), set[str]()
+        for i in np.flatnonzero(~inside):
+            K[:, i : i + 1], status = optimum(rows, entries, np.array([i]), ridge, None)
+            statuses.add(status)
+    K = np.clip(K, *limits)  # bounds hold to the last bit
+    return np.where(np.isnan(entries.known.T), K, entries.known.T), statuses

@@ -1,0 +1,135 @@
+"""Triangular factors R, RᵀR = Σ dᵀd, that take rows in and let old ones go without a subtraction."""
+
+from collections import deque
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg.lapack import dtpqrt
+
+_PANEL = 4  # columns that dtpqrt eliminates at once: fastest for few rows
+
+Triangle = Float[np.ndarray, "nd nd"]
+Table = Float[np.ndarray, "m nd"]
+
+
+def absorb(R: Triangle, rows: Table) -> None:
+    """Turn R into the triangular factor of [R; rows], in place; R is in Fortran's order."""
+    if len(rows):
+        info = dtpqrt(0, min(_PANEL, len(R)), R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
+        assert info == 0, f"dtpqrt refused argument {-info}"
+
+
+def empty(nd: int) -> Triangle:
+    """Return the factor of no rows."""
+    return np.zeros((nd, nd), order="F")
+
+
+class Forgetting:
+    """The factor of all rows, each weighted by forgetting^age.
+
+    A row of R is one equation r·k = t of the triangular system R K = T. Forgetting multiplies it by √λ. Where no
+    new row speaks about its direction it would fade to nothing, and the next bit of noise would decide (wind-up). So
+    an equation whose information r_jj² falls below `keep` times the most that it ever was is forgotten no further: it
+    is scaled back to that floor, left side and right side together, which leaves K as it is.
+
+    Parameters
+    ----------
+    nd, n
+        Columns of a row, and how many of them are regressors.
+    forgetting
+        λ in (0, 1].
+    keep
+        The floor, as a share of information.
+    """
+
+    def __init__(self, nd: int, n: int, forgetting: float, keep: float) -> None:
+        self._R, self._n = empty(nd), n
+        self._forgetting, self._keep = forgetting, keep
+        self._most = np.zeros(n)
+        self._weight = 0.0
+
+    def push(self, rows: Table) -> None:
+        """Take in rows, the newest last."""
+        R, self._weight = self._joined(self._R, rows)
+        if self._forgetting < 1.0:
+            held = np.abs(R.diagonal()[: self._n])
+            np.maximum(self._most, held, out=self._most)
+            floor = np.sqrt(self._keep) * self._most
+            low = np.flatnonzero((held < floor) & (held > 0))
+            R[low] *= (floor[low] / held[low])[:, None]
+
+    def factor(self, pending: Table) -> tuple[Triangle, float]:
+        """Return R and the sum of weights of all rows, with those that wait."""
+        return self._joined(self._R.copy(order="F"), pending)
+
+    def _joined(self, R: Triangle, rows: Table) -> tuple[Triangle, float]:
+        if self._forgetting == 1.0:
+            absorb(R, rows)
+            return R, self._weight + len(rows)
+        R *= self._forgetting ** (0.5 * len(rows))
+        weights = self._forgetting ** np.arange(len(rows) - 1.0, -1.0, -1.0)
+        absorb(R, rows * np.sqrt(weights)[:, None])
+        return R, self._weight * self._forgetting ** len(rows) + float(weights.sum())
+
+
+class Window:
+    """The factor of the last `length` rows, as of a queue made of two stacks: nothing is ever subtracted.
+
+    New blocks are absorbed at the back. For old ones the front holds one factor for each block: of it and all later
+    ones of the front, so the oldest leaves by dropping a factor. When the front is used up, the back becomes the
+    front. A row is absorbed twice in its life, errors do not add up over time, and it takes the memory of about
+    2 · length rows. Turning the back into the front takes one step that costs as much as `length` updates.
+
+    Parameters
+    ----------
+    nd
+        Columns of a row.
+    length
+        Rows in the window.
+    block
+        Rows that come at once.
+    """
+
+    def __init__(self, nd: int, length: int, block: int) -> None:
+        self._nd, self._length, self._block = nd, length, block
+        self._front: deque[tuple[Triangle, Table]] = deque()
+        self._back: list[Table] = []
+        self._R = empty(nd)
+
+    def push(self, rows: Table) -> None:
+        """Take in a block of rows, the newest last."""
+        absorb(self._R, rows)
+        self._back.append(rows.copy())
+        while (len(self._front) + len(self._back) - 1) * self._block >= self._length:
+            self._turn()
+            self._front.popleft()
+
+    def factor(self, pending: Table) -> tuple[Triangle, float]:
+        """Return R and the number of rows in the window, the last of them those that wait."""
+        held = (len(self._front) + len(self._back)) * self._block + len(pending)
+        old = max(held - self._length, 0)  # rows that have left the window
+        if old > (len(self._front) + len(self._back)) * self._block:
+            R = empty(self._nd)
+            absorb(R, pending[-self._length :])
+            return R, float(self._length)
+        if old and not self._front:
+            self._turn()
+        R = self._R.copy(order="F")
+        if self._front:
+            skipped, part = divmod(old, self._block)
+            if part:
+                absorb(R, self._front[skipped][1][part:])
+                skipped += 1
+            if skipped < len(self._front):
+                absorb(R, self._front[skipped][0])
+        absorb(R, pending)
+        return R, float(held - old)
+
+    def _turn(self) -> None:
+        """Make the back the front where that is empty."""
+        if not self._front:
+            R = empty(self._nd)
+            for rows in reversed(self._back):
+                absorb(R, rows)
+                self._front.appendleft((R.copy(order="F"), rows))
+            self._back, self._R = [], empty(self._nd)

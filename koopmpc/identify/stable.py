@@ -1,0 +1,104 @@
+"""EDMD whose A has no eigenvalue beyond a circle."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
+from koopmpc.identify.assemble import assembled, growth, read, tikhonov
+from koopmpc.identify.contraction import Misfit, clipped, inside, nearest, radius_of
+from koopmpc.identify.doubts import doubts
+from koopmpc.identify.edmd import regression
+from koopmpc.identify.lyapunov import lyapunov_fit
+from koopmpc.identify.solve import Rows, norms, onto, solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
+from koopmpc.predict.linear import LinearPredictor
+
+_SMALL = 20  # observables up to which the matrix inequality is solved too
+_ROUNDING = 1e-9  # an eigenvalue this close to the circle is on it
+
+
+def stable_edmd(
+    episodes: Episodes | Source, lifting: Lifting, *, radius: float = 1.0, ridge: float = 0.0
+) -> LinearPredictor:
+    """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares with every eigenvalue |λ(A)| ≤ radius.
+
+    The misfit is Σᵢ ‖ψᵢ(x⁺) − …‖² / ‖ψᵢ(x)‖². Where the plain fit is stable it is the answer. Else B, E and the
+    Constant's column are eliminated, so they are the best for the A that is found, and A is the best of: the plain
+    fit with its eigenvalues clipped; for up to 20 observables a linear matrix inequality in (A P, P); and descent
+    over A = S⁻¹ X S, ‖X‖₂ ≤ radius, from each of them. So it is stable, and at least as close as all of these. The
+    problem is not convex: a closer stable A may exist.
+
+    A Constant keeps its own row 1⁺ = 1 and its eigenvalue 1; the radius holds for the others.
+
+    Parameters
+    ----------
+    episodes
+        Episodes or a Source; no pair spans two of them.
+    lifting
+        ψ: R^nx → R^nz.
+    radius
+        ρ > 0; below 1 it asks for a rate of decay.
+    ridge
+        Tikhonov weight on unit-norm columns.
+
+    Raises
+    ------
+    DataError
+        radius is not above zero, ridge is negative, or an observable is not finite on the data.
+
+    Warns
+    -----
+    FitWarning
+        As `edmd`. ``report.changes`` tells the spectral radius and the misfit before and after.
+    """
+    rho, ridge = checks.positive(radius, "radius"), tikhonov(ridge)
+    total, disturbances = read(episodes, lifting)
+    task = regression(total, "stable_edmd")
+    nz, names = task.lifting.nz, task.lifting.names
+    rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
+    sentences = doubts(rows, names, task.inputs, regular=ridge > 0)[0]
+    K = solve(rows, ridge=ridge).K
+    one = Constant().bind(task.states).names[0]
+    moving = np.array([i for i, name in enumerate(names) if name != one], dtype=np.intp)
+    if one in names:
+        K[:, names.index(one)] = np.eye(len(K))[names.index(one)]
+    before = radius_of(K[np.ix_(moving, moving)].T)
+    changes = [f"spectral radius {before:.6g}, not above {rho:g}: the plain fit stays"]
+    how = f"ridge {ridge:g}"
+    if before > rho + _ROUNDING:
+        stable = _stabilised(rows, K, moving, rho, ridge)
+        after = radius_of(stable[np.ix_(moving, moving)].T)
+        how = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, ridge {ridge:g}"
+        changes = [f"spectral radius {before:.6g} before, {after:.6g} after", growth(rows, stable, K)]
+        K = stable
+    return assembled(task, K, disturbances, how=how, ridge=ridge, sentences=sentences, changes=changes)
+
+
+def _stabilised(
+    rows: Rows, K: Float[np.ndarray, "n nz"], moving: Int[np.ndarray, " m"], rho: float, ridge: float
+) -> Float[np.ndarray, "n nz"]:
+    """Return K with a stable block of the `moving` observables; what multiplies the other columns is refitted."""
+    n = len(K)
+    size = norms(rows.P)
+    size[size == 0] = 1.0
+    others = np.setdiff1d(np.arange(n), moving)
+    P = np.vstack([rows.P / size, np.sqrt(ridge) * np.eye(n)])
+    free = P[:, moving] - onto(P[:, others], P[:, moving])
+    scale = size[moving] / size[moving, None]  # A in units of the observables' sizes
+    A0 = K[np.ix_(moving, moving)].T
+    misfit = Misfit(A0 * scale, free.T @ free)
+    starts = [clipped(misfit.A0, rho)]
+    if len(moving) <= _SMALL:
+        start = lyapunov_fit(misfit.A0, misfit.G, rho)
+        starts += [] if start is None else [inside(start, rho)]
+    A = nearest(misfit, rho, starts) / scale
+    found = K.copy()
+    found[np.ix_(moving, moving)] = inside(A, rho).T
+    if len(others):
+        known = rows.P[:, moving] @ found[np.ix_(moving, moving)]
+        rest = Rows(rows.P[:, others], rows.T[:, moving] - known, rows.rest[moving], rows.samples)
+        found[np.ix_(others, moving)] = solve(rest, ridge=ridge).K
+    return found

@@ -1,0 +1,177 @@
+"""Stable fits: stable, unmoved where nothing has to move, closer than clipping, convex optimum where that is known."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError
+from koopmpc.identify.contraction import Misfit, clipped, nearest, radius_of
+from koopmpc.identify.edmd import edmd
+from koopmpc.identify.lyapunov import lyapunov_fit
+from koopmpc.identify.moments import moments
+from koopmpc.identify.stable import stable_edmd
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from tests.identify.plants import brute_force, random_episodes
+
+
+def runs(seed: int, nx: int, nu: int, *, radius: float, noise: float, offset: float = 0.0) -> Episodes:
+    """Noisy measurements of a linear plant with this spectral radius."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((nx, nx))
+    A *= radius / radius_of(A)
+    B = rng.standard_normal((nx, nu))
+    parts: list[Episode] = []
+    for _ in range(2 + nx // 10):
+        X, U = [rng.standard_normal(nx)], rng.uniform(-1, 1, (15, nu))
+        for u in U:
+            X.append(A @ X[-1] + B @ u + offset)
+        parts.append(Episode(X=np.array(X) + noise * rng.standard_normal((16, nx)), U=U))
+    return Episodes(parts, 0.1)
+
+
+def objective(data: Episodes, model) -> float:
+    """Return Σᵢ ‖ψᵢ(x⁺) − …‖² / ‖ψᵢ(x)‖² over all rows."""
+    D = brute_force(data, model.lifting)
+    nz = model.nz
+    error = D[:, -nz:] - D[:, :-nz] @ np.hstack([model.A, model.B]).T
+    return float(np.sum(np.sum(error**2, axis=0) / np.sum(D[:, :nz] ** 2, axis=0)))
+
+
+def refitted(data: Episodes, model, A: np.ndarray) -> float:
+    """Return the objective of another A with the best B."""
+    D = brute_force(data, model.lifting)
+    nz = model.nz
+    Z, U, T = D[:, :nz], D[:, nz:-nz], D[:, -nz:]
+    rest = T - Z @ A.T
+    rest = rest - U @ np.linalg.lstsq(U, rest, rcond=None)[0]
+    return float(np.sum(np.sum(rest**2, axis=0) / np.sum(Z**2, axis=0)))
+
+
+@given(st.integers(0, 999), st.integers(1, 6), st.integers(0, 2), st.floats(0.2, 1.2))
+@settings(max_examples=20)
+def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radius: float) -> None:
+    data = runs(seed, nx, nu, radius=1.0, noise=0.3)
+    plain, model = edmd(data, State()), stable_edmd(data, State(), radius=radius)
+    assert radius_of(model.A) <= radius + 1e-9
+    if radius_of(plain.A) <= radius:
+        assert np.allclose(model.A, plain.A, rtol=0, atol=1e-12)
+        assert np.allclose(model.B, plain.B, rtol=0, atol=1e-12)
+        assert "the plain fit stays" in model.report.changes[0]
+        return
+    own = objective(data, model)
+    assert own == pytest.approx(refitted(data, model, model.A), rel=1e-9)  # B is the best for this A
+    others = (clipped(plain.A, radius), plain.A * radius / radius_of(plain.A))
+    assert own <= min(refitted(data, model, A) for A in others) * (1 + 1e-9)
+    assert (
+        f"spectral radius {radius_of(plain.A):.6g} before, {radius_of(model.A):.6g} after"
+        in model.report.changes
+    )
+
+
+def test_one_observable_moves_to_the_circle() -> None:
+    x = 1.2 ** np.arange(10)[:, None]
+    model = stable_edmd(Episodes([Episode(X=x)], 0.1), State(), radius=0.9)
+    assert np.allclose(model.A, 0.9, rtol=0, atol=1e-9)
+
+
+def test_normal_A_under_white_data_has_the_closed_form() -> None:
+    # A₀ symmetric and G = I: the nearest contraction clips eigenvalues, and no stable matrix is nearer
+    rng = np.random.default_rng(0)
+    Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+    A0 = (Q * [1.5, 1.1, 0.5, -0.3, -1.2]) @ Q.T
+    best = (Q * [1.0, 1.0, 0.5, -0.3, -1.0]) @ Q.T
+    found = nearest(Misfit(A0, np.eye(5)), 1.0, [clipped(A0, 1.0)])
+    assert Misfit(A0, np.eye(5))(found) <= Misfit(A0, np.eye(5))(best) * (1 + 1e-9)
+    assert radius_of(found) <= 1 + 1e-9
+
+
+def test_the_misfit_never_exceeds_that_of_the_matrix_inequality() -> None:
+    rng = np.random.default_rng(1)
+    for n in (2, 5, 8):
+        A0 = rng.standard_normal((n, n))
+        A0 *= 1.1 / radius_of(A0)
+        Z = rng.standard_normal((40, n)) * np.logspace(0, -2, n)
+        misfit = Misfit(A0, Z.T @ Z)
+        convex = lyapunov_fit(A0, misfit.G, 1.0)
+        assert convex is not None
+        assert radius_of(convex) <= 1 + 1e-6
+        assert misfit(nearest(misfit, 1.0, [convex])) <= misfit(convex) * (1 + 1e-5)
+
+
+def test_the_matrix_inequality_is_solved_to_its_optimum() -> None:
+    # the same program, written in the observables' own coordinates with P̂ = H P H
+    A0 = np.array([[1.05, 0.3], [0.0, 0.8]])
+    G = np.array([[2.0, 0.3], [0.3, 1.0]])
+    values, V = np.linalg.eigh(G)
+    H = (V * np.sqrt(values)) @ V.T
+    Hi = np.linalg.inv(H)
+    Y, P = cp.Variable((2, 2)), cp.Variable((2, 2), PSD=True)
+    blocks = cp.bmat([[P, Y], [Y.T, P]])
+    white = Hi @ P @ Hi
+    constraints = [blocks >> 0, white - 1e-3 * np.eye(2) >> 0, cp.trace(white) == 2]
+    problem = cp.Problem(cp.Minimize(cp.norm((Y - A0 @ P) @ Hi, "fro")), constraints)
+    problem.solve(solver=cp.SCS, eps=1e-9, max_iters=200_000)
+    assert np.allclose(lyapunov_fit(A0, G, 1.0), Y.value @ np.linalg.inv(P.value), atol=1e-3)
+
+
+def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
+    data = runs(4, 3, 1, radius=1.0, noise=0.3, offset=0.5)
+    lifting = State() + Constant() + Monomials(2)
+    model = stable_edmd(data, lifting, radius=0.8)
+    row = model.lifting.names.index("1")
+    assert np.array_equal(model.A[row], np.eye(model.nz)[row])
+    assert np.array_equal(model.B[row], [0.0])
+    sizes = np.sort(np.abs(model.eigenvalues))[::-1]
+    assert sizes[0] == pytest.approx(1.0, abs=1e-9)
+    assert sizes[1] <= 0.8 + 1e-9
+
+
+def test_a_ridge_is_kept() -> None:
+    data = runs(4, 3, 1, radius=1.0, noise=0.3)
+    plain = stable_edmd(data, State(), ridge=0.1, radius=5.0)
+    assert np.allclose(plain.A, edmd(data, State(), ridge=0.1).A, atol=1e-12)
+    model = stable_edmd(data, State(), ridge=0.1, radius=0.5)
+    assert radius_of(model.A) <= 0.5 + 1e-9
+    assert model.report.ridge == 0.1
+
+
+def test_more_observables_than_the_inequality_takes() -> None:
+    data = runs(0, 40, 2, radius=1.02, noise=0.3)
+    model = stable_edmd(data, State(), radius=0.9)
+    assert radius_of(model.A) <= 0.9 + 1e-9
+    plain = edmd(data, State())
+    assert objective(data, model) <= refitted(data, model, clipped(plain.A, 0.9))
+
+
+@pytest.mark.slow
+def test_two_hundred_observables() -> None:
+    import time
+
+    data = runs(0, 200, 2, radius=1.0, noise=0.5)
+    total = moments(data, State())
+    plain = edmd(data, State())
+    start = time.perf_counter()
+    model = stable_edmd(data, State(), radius=0.95)
+    seconds = time.perf_counter() - start
+    assert radius_of(model.A) <= 0.95 + 1e-9
+    clip = refitted(data, model, clipped(plain.A, 0.95))
+    loss, worst = objective(data, model) - objective(data, plain), clip - objective(data, plain)
+    assert loss <= worst
+    said = f"nz 200, {total.samples} pairs: {seconds:.1f} s, loss / clipping's {loss / worst:.3f}"
+    print(said, *model.report.changes, sep="; ")  # noqa: T201
+
+
+def test_bad_arguments() -> None:
+    data = random_episodes(0, [30], 2, 1)
+    for radius in (0.0, -1.0):
+        with pytest.raises(DataError, match="radius is"):
+            stable_edmd(data, State(), radius=radius)
+    with pytest.raises(DataError, match="radius holds 1 NaN"):
+        stable_edmd(data, State(), radius=np.nan)
+    with pytest.raises(DataError, match="ridge is -1"):
+        stable_edmd(data, State(), ridge=-1)
