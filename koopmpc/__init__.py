@@ -87,6 +87,7 @@ from koopmpc.predict.linear import LinearPredictor, load_predictor
 from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+from koopmpc.recording.model import record_model
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.scene import Box, Disk, Line
@@ -216,6 +217,7 @@ __all__ = [
     "plot_spectrum",
     "reconstruct",
     "record",
+    "record_model",
     "residual_dmd",
     "save_figure",
     "score",

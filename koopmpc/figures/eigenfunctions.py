@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from koopmpc.data.episodes import Episodes
 from koopmpc.figures.style import SEQUENTIAL, Width, figure, styled
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.plane import Axes, Over, Plane, eigenfunctions_on, plane_through
@@ -53,7 +54,8 @@ def plot_eigenfunctions(
     DataError
         There is no such eigenfunction or state, a range is empty, A is defective, or φ_j is 0 on the plane.
     """
-    grid = plane_through(predictor.states, plane, over, at, points)
+    covered = predictor.embed(over) if isinstance(over, Episodes) else over
+    grid = plane_through(predictor.point_names, plane, covered, at, points)
     phi = eigenfunctions_on(predictor, which, grid)
     chosen = [which] if isinstance(which, int | np.integer) else list(which)
     values: Any = predictor.eigenvalues[chosen]

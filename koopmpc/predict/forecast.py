@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.predict.conformal import ConformalBand
 from koopmpc.predict.linear import LinearPredictor
@@ -74,7 +74,7 @@ def forecast(
         A conformal band, a score (its 5 and 95 % quantiles of the error), or half-widths (horizon, nx) in the
         state's unit; for the horizon or longer.
     start
-        k.
+        k; with an embedding counted from the first moment whose past is known.
     relift
         Predict by the map of `step_map`, which lifts x̂ anew at every step.
 
@@ -91,6 +91,8 @@ def forecast(
             f"{predictor.nx} and {predictor.nu}; pass an episode of the same plant"
         )
     start = checks.count(start, "start", least=0)
+    if predictor.embedding is not None:
+        episode = predictor.embed(Episodes([episode], predictor.dt, predictor.states, predictor.inputs))[0]
     left = len(episode) - start
     steps = checks.count(left if horizon is None else horizon, "horizon")
     if steps > left:
@@ -100,7 +102,7 @@ def forecast(
     U, x = episode.U[start : start + steps], episode.X[start]
     with np.errstate(over="ignore", invalid="ignore"):
         if relift:
-            predicted = predictor.step_map().rollout(x, U)
+            predicted = predictor.step_map().rollout(x, U)[:, : predictor.nx]
         elif isinstance(predictor, LinearPredictor) and predictor.nw:
             predicted = predictor.rollout(x, U, episode.W[start : start + steps])
         else:
@@ -108,11 +110,11 @@ def forecast(
     lost = ~np.logical_and.accumulate(np.isfinite(predicted).all(axis=1))
     predicted[lost] = np.nan
     below, above, words = _offsets(bands, steps, predictor.nx, relift)
-    truth = episode.X[start : start + steps + 1]
+    truth = episode.X[start : start + steps + 1, : predictor.nx]
     return Forecast(
         np.ascontiguousarray(U),
         np.ascontiguousarray(truth),
-        predicted,
+        np.ascontiguousarray(predicted),
         predicted + below,
         predicted + above,
         words,

@@ -4,7 +4,7 @@
 from typing import Any
 
 from koopmpc.recording.description import About
-from koopmpc.recording.eigenvalues import Model, reach
+from koopmpc.recording.eigenvalues import Model, eigenvalue_views
 from koopmpc.recording.scenes import BACKGROUND, Bounds
 from koopmpc.recording.styles import input_limits
 
@@ -41,7 +41,7 @@ def blueprint(about: About, *, bounds: Bounds | None, model: Model | None) -> An
         rrb.TextDocumentView(origin="description", name="Description"),
         rrb.TextLogView(origin="log", name="Log"),
     )
-    lower = texts if model is None else rrb.Horizontal(_eigenvalues(reach(model)), texts)
+    lower = texts if model is None else rrb.Horizontal(eigenvalue_views(model)[0], texts)
     right = lower if bounds is None else rrb.Vertical(_animation(bounds), lower, row_shares=[3.0, 2.0])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.0, 1.0]),
@@ -89,17 +89,6 @@ def _animation(bounds: Bounds) -> Any:
         name="Animation, with the predicted horizon",
         background=list(BACKGROUND),
         visual_bounds=fixed,
-    )
-
-
-def _eigenvalues(size: float) -> Any:
-    import rerun.blueprint as rrb
-
-    return rrb.Spatial2DView(
-        origin="model",
-        name="Eigenvalues of A and the unit circle",
-        background=list(BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[-size, size], y_range=[-size, size]),
     )
 
 

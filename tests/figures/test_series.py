@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 
-from koopmpc.data.episodes import Episode
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.figures.eigenfunctions import plot_eigenfunctions
 from koopmpc.figures.error import plot_error
 from koopmpc.figures.series import plot_rollout, plot_run
 from koopmpc.figures.style import save
+from koopmpc.identify.edmd import edmd
+from koopmpc.lifting.state import State
 from koopmpc.predict.conformal import conformal
 from koopmpc.predict.forecast import forecast
 from koopmpc.predict.score import score
@@ -131,3 +135,14 @@ def test_messages() -> None:
         plot_error({})
     with pytest.raises(DataError, match="the figure is asked for state 'x'; the states are angle"):
         plot_error(score(model, data, 3), states="x")
+
+
+def test_a_model_with_a_memory_forecasts_from_the_first_known_past() -> None:
+    data = Episodes([Episode(X=e.X[:, :1], U=e.U) for e in episodes(20)], DT, STATES[:1], INPUTS)
+    model = edmd(data, State(), embedding=Delay(1))  # two angles and an input tell the rate
+    for relift in (False, True):
+        made = plot_rollout(model, data[0], 20, start=3, relift=relift)
+        assert curve(made.axes[0], "truth")[1] == pytest.approx(data[0].X[4:25, 0])
+        assert curve(made.axes[0], "prediction")[1] == pytest.approx(data[0].X[4:25, 0], abs=1e-6)
+    axes = plot_eigenfunctions(model, 0, ("angle", 2), data, points=5).axes[0]
+    assert axes.get_ylabel() == "angle[k-1] [rad]"

@@ -1,0 +1,221 @@
+"""record_model: a predictor and how far it can be trusted, as one Rerun log."""
+# pyright: basic
+
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError
+from koopmpc.identify.trust import TrustReport
+from koopmpc.predict.forecast import Forecast, forecast
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.plane import Axes, Plane, plane_through
+from koopmpc.predict.score import Predictor, score
+from koopmpc.recording.eigenvalues import draw_eigenvalues, eigenvalue_views
+from koopmpc.recording.forecasts import error_series, forecast_series, input_series
+from koopmpc.recording.planes import draw_eigenfunctions, plane_view
+
+_FLUSH = 10.0  # longest wait for the file [s]
+_SHOWN = 6  # plots of states in one column
+_EIGENFUNCTIONS = 2  # drawn unless told
+
+
+def record_model(
+    predictor: Predictor,
+    path: str | Path,
+    episodes: Episodes,
+    *,
+    report: TrustReport | None = None,
+    horizon: int | None = None,
+    rollouts: int = 3,
+    which: Sequence[int] | None = None,
+    plane: Axes = (0, 1),
+    at: ArrayLike | None = None,
+) -> None:
+    """Write spectrum, eigenfunctions, forecasts, error by horizon and the report of a predictor to one .rrd.
+
+    Series stand over `sim_time`, the time ahead of the forecast's start. The data are in the log to the bit.
+
+    Parameters
+    ----------
+    predictor
+        Linear or bilinear; a bilinear one has no eigenfunctions.
+    path
+        The .rrd to write; its folders are made.
+    episodes
+        Held out of the fit; the first ones are forecast from their start.
+    report
+        Of `trust`: its residuals, errors and bands are shown, and its text.
+    horizon
+        Steps ahead; the report's by default, else as long as the shortest episode.
+    rollouts
+        How many episodes are forecast.
+    which
+        Eigenfunctions, in the order of ``predictor.eigenvalues``; by default the first two, those with the
+        smallest residuals where there is a report, and one of each conjugate pair.
+    plane
+        Two states, by index or name; the ranges are those of the episodes.
+    at
+        (nx,) what the other states are held at; the median of the episodes by default.
+
+    Raises
+    ------
+    DataError
+        The horizon is longer than an episode; there is no such state or eigenfunction.
+    LogError
+        The path cannot be written.
+    """
+    import rerun as rr
+
+    if horizon is None:
+        horizon = (
+            min(len(episode) for episode in predictor.embed(episodes))
+            if report is None
+            else report.score.horizon
+        )
+    errors = score(predictor, episodes, horizon) if report is None else report.score
+    bands = errors if report is None else report.band
+    count = checks.count(rollouts, "rollouts")
+    ahead = [forecast(predictor, episode, horizon, bands=bands) for episode in list(episodes)[:count]]
+    residuals = None if report is None else report.residuals
+    pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
+    with checks.writing(Path(path), "ab"):
+        pass  # Rerun makes no folders, and says nothing of what it cannot write
+    rec = rr.RecordingStream("koopmpc-model", recording_id=uuid.uuid4())
+    rec.set_sinks(
+        rr.FileSink(str(path)),
+        default_blueprint=_blueprint(predictor, ahead, pictures, surface, told=residuals is not None),
+    )
+    rec.send_recording_name(f"model of {', '.join(predictor.states)}")
+    text = rr.TextDocument(_page(predictor, report, note), media_type=rr.MediaType.MARKDOWN)
+    rec.log("report", text, static=True)
+    drawn = draw_eigenvalues(predictor, residuals)
+    for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
+        rec.log(entity, archetype, static=True)
+    for r, one in enumerate(ahead):
+        for i in range(predictor.nx):
+            forecast_series(one, i).send(rec, f"rollout/{r}/state/{i}")
+        if predictor.nu:
+            input_series(one).send(rec, f"rollout/{r}/inputs", steps=True)
+    for i in range(predictor.nx):
+        error_series(errors, i, predictor.dt).send(rec, f"error/{i}")
+    rec.flush(timeout_sec=_FLUSH)
+    rec.disconnect()
+
+
+Picture = tuple[str, str, dict[str, Any]]
+
+
+def _pictures(
+    predictor: Predictor,
+    episodes: Episodes,
+    report: TrustReport | None,
+    which: Sequence[int] | None,
+    plane: Axes,
+    at: ArrayLike | None,
+) -> tuple[list[Picture], Plane | None, str]:
+    """Return the eigenfunctions, their plane, and why there are none where nobody asked for some."""
+    if not isinstance(predictor, LinearPredictor) or (predictor.nx < 2 and which is None):
+        why = (
+            "has no eigenfunctions"
+            if predictor.nx > 1
+            else "has one state: there is no plane to draw them on"
+        )
+        if which is not None:
+            raise DataError("a bilinear predictor has no eigenfunctions; leave `which` out")
+        return [], None, f"The predictor {why}."
+    surface = plane_through(predictor.point_names, plane, predictor.embed(episodes), at, points=181)
+    chosen = _leading(predictor, report) if which is None else list(which)
+    try:
+        return draw_eigenfunctions(predictor, chosen, surface), surface, ""
+    except DataError as error:
+        if which is not None:
+            raise
+        return [], None, f"No eigenfunctions are drawn: {error}."
+
+
+def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int]:
+    """Return a few eigenpairs, one of each conjugate pair: the most trusted, or the slowest."""
+    values = predictor.eigenvalues
+    order = np.arange(len(values))
+    if report is not None:
+        near = np.abs(values[:, None] - report.residuals.eigenvalues).argmin(axis=1)
+        order = np.argsort(report.residuals.residuals[near], kind="stable")
+    moving = [
+        int(j) for j in order if values[j].imag >= 0 and abs(values[j] - 1) > 1e-9
+    ]  # λ = 1: often φ = 1
+    return moving[:_EIGENFUNCTIONS] or [0]
+
+
+def _page(predictor: Predictor, report: TrustReport | None, note: str) -> str:
+    lines = [f"# Model of {', '.join(predictor.states)}", ""]
+    if report is not None:
+        lines += ["```", str(report), "```", ""]
+    if note:
+        lines += [note, ""]
+    lines += ["| model | |", "|---|---|"]
+    rows = {
+        "kind": type(predictor).__name__,
+        "inputs": ", ".join(predictor.inputs) or "none",
+        "sampling time": f"{predictor.dt:g} s",
+        "observables": f"{predictor.nz}: {', '.join(predictor.lifting.names[:12])}"
+        + (" …" if predictor.nz > 12 else ""),
+        "largest |λ|": f"{abs(predictor.eigenvalues[0]):.6g}",
+    }
+    if predictor.report is not None:
+        fit = predictor.report
+        rows |= {
+            "fit": f"{fit.method}, {fit.route}",
+            "snapshots": f"{fit.samples}",
+            "condition": f"{fit.condition:.3g}",
+        }
+        rows |= {f"doubt {i + 1}": doubt for i, doubt in enumerate(fit.warnings)}
+    lines += [f"| {key} | {str(value).replace('|', chr(92) + '|')} |" for key, value in rows.items()]
+    return "\n".join(lines)
+
+
+def _blueprint(
+    predictor: Predictor,
+    ahead: Sequence[Forecast],
+    pictures: Sequence[Picture],
+    surface: Plane | None,
+    *,
+    told: bool,
+) -> Any:
+    import rerun.blueprint as rrb
+
+    def plot(origin: str, name: str, *, legend: bool) -> Any:
+        corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
+        return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=corner)
+
+    states = list(enumerate(predictor.states))[:_SHOWN]
+    tabs = []
+    for r in range(len(ahead)):
+        plots = [plot(f"rollout/{r}/state/{i}", name, legend=i == 0) for i, name in states]
+        if predictor.nu:
+            plots.append(plot(f"rollout/{r}/inputs", ", ".join(predictor.inputs), legend=False))
+        tabs.append(rrb.Vertical(*plots, name=f"Forecast of episode {r}"))
+    errors = [plot(f"error/{i}", f"Error of {name}, by time ahead", legend=i == 0) for i, name in states]
+    left = rrb.Tabs(*tabs, rrb.Vertical(*errors, name="Error by time ahead"))
+    text = rrb.TextDocumentView(origin="report", name="Report")
+    rows: list[Any] = [rrb.Horizontal(*eigenvalue_views(predictor, residuals=told))]
+    if surface is not None:
+        views = [plane_view(entity, title, surface) for entity, title, _ in pictures]
+        rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            left,
+            rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]),
+            column_shares=[1.0, 1.2],
+        ),
+        rrb.TimePanel(timeline="sim_time", state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )

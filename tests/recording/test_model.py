@@ -1,0 +1,165 @@
+"""A model's log: what it shows can be read back, to the bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, LogError
+from koopmpc.identify.trust import TrustReport, trust
+from koopmpc.lifting.state import State
+from koopmpc.predict.bilinear import BilinearPredictor
+from koopmpc.predict.forecast import forecast
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.plane import eigenfunctions_on, plane_through
+from koopmpc.predict.score import score
+from koopmpc.recording.columns import Columns, read_columns
+from koopmpc.recording.connect import start_viewer
+from koopmpc.recording.model import record_model
+from koopmpc.recording.shades import circle, sequence
+from koopmpc.recording.viewer import free_port, screenshot
+from tests.figures.models import DT, INPUTS, STATES, episodes, turning
+
+DATA = episodes(24, noise=0.05)
+
+
+@pytest.fixture(scope="module")
+def report() -> TrustReport:
+    return trust(turning(0.9), DATA, 12)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory, report: TrustReport) -> Path:
+    path = tmp_path_factory.mktemp("model") / "deep" / "model.rrd"
+    record_model(turning(0.9), path, DATA, report=report, which=[0], rollouts=2)
+    return path
+
+
+def _read(path: Path, *entities: str) -> Columns:
+    return read_columns(path, entities)
+
+
+def test_forecasts_are_read_back_to_the_bit(log: Path, report: TrustReport) -> None:
+    for r in range(2):
+        ahead = forecast(turning(0.9), DATA[r], 12, bands=report.band)
+        found = _read(log, f"/rollout/{r}/**")
+        for i in range(2):
+            curves = found.vectors(f"/rollout/{r}/state/{i}")
+            wanted = [ahead.truth, ahead.predicted, ahead.low, ahead.high]
+            assert np.array_equal(curves, np.column_stack([one[:, i] for one in wanted]))
+        assert np.array_equal(found.vectors(f"/rollout/{r}/inputs"), ahead.U)
+    assert not len(_read(log, "/rollout/2/**").vectors("/rollout/2/state/0"))
+
+
+def test_the_error_is_the_score(log: Path, report: TrustReport) -> None:
+    for i in range(2):
+        k, values = _read(log, f"/error/{i}").matrix(f"/error/{i}")
+        assert np.array_equal(k, np.arange(1, 13))
+        s = report.score
+        assert np.array_equal(values, np.column_stack([s.rmse[:, i], s.low[:, i], s.high[:, i]]))
+
+
+def _all(path: Path, entity: str, component: str) -> list:
+    """Return every instance of a static component."""
+    return _read(path, entity).rows(entity, component)[2].to_pylist()
+
+
+def _points(path: Path, entity: str) -> np.ndarray:
+    return np.array(_all(path, entity, "positions"), dtype=float)
+
+
+def test_eigenvalues_stand_upright_with_their_residuals(log: Path, report: TrustReport) -> None:
+    at = _points(log, "/model/eigenvalues")
+    found = report.residuals.eigenvalues
+    assert at[:, 0] - 1j * at[:, 1] == pytest.approx(found, abs=1e-6)  # y is down
+    labels = _all(log, "/model/eigenvalues", "labels")
+    assert all(
+        f"residual {r:.2g}" in text for r, text in zip(report.residuals.residuals, labels, strict=True)
+    )
+    spurious = report.residuals.spurious
+    assert spurious.all()
+    assert len(_points(log, "/model/spurious")) == spurious.sum()
+    (turn,) = (np.array(strip) for strip in _all(log, "/model/circle", "strips"))
+    assert np.hypot(*turn.T) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_pictures_are_the_eigenfunctions_with_the_second_state_upwards(log: Path) -> None:
+    plane = plane_through(STATES, (0, 1), DATA, points=181)
+    (phi,) = eigenfunctions_on(turning(0.9), 0, plane)
+    for part, shades in (("magnitude", sequence(np.abs(phi))), ("phase", circle(np.angle(phi)))):
+        entity = f"/eigenfunction/0/{part}/picture"
+        (pixels,) = [_read(log, entity).static(entity, "buffer")]
+        drawn = np.asarray(pixels, dtype=np.uint8).reshape(181, 181, 3)
+        assert np.array_equal(drawn[::-1], shades)
+        words = _all(log, f"/eigenfunction/0/{part}/axes", "labels")
+        assert set(STATES) <= set(words)
+
+
+def test_the_report_is_a_page(log: Path, report: TrustReport) -> None:
+    page = _read(log, "/report").static("/report", "text")
+    assert str(report) in page
+    assert f"| observables | 2: {', '.join(STATES)} |" in page
+
+
+def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None:
+    data = episodes(3, noise=0.05)
+    record_model(turning(), tmp_path / "a.rrd", data)
+    errors = score(turning(), data, 30)
+    ahead = forecast(turning(), data[2], 30, bands=errors)
+    curves = _read(tmp_path / "a.rrd", "/rollout/2/**").vectors("/rollout/2/state/1")
+    assert np.array_equal(curves[:, 2], ahead.low[:, 1])
+    assert len(_points(tmp_path / "a.rrd", "/model/eigenvalues")) == 2
+
+
+def test_what_has_no_eigenfunctions_says_so(tmp_path: Path) -> None:
+    data = episodes(2)
+    bilinear = BilinearPredictor(
+        turning().A, turning().B, np.zeros((1, 2, 2)), np.eye(2), State(), DT, STATES, INPUTS
+    )
+    defective = LinearPredictor(
+        [[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), State(), DT, STATES, INPUTS
+    )
+    for model, words in ((bilinear, "has no eigenfunctions"), (defective, "A is defective")):
+        record_model(model, tmp_path / "a.rrd", data, horizon=5)
+        assert words in _read(tmp_path / "a.rrd", "/report").static("/report", "text")
+    one = LinearPredictor([[0.9]], [[1.0]], [[1.0]], State(), DT, STATES[:1], INPUTS)
+    small = Episodes([type(e)(X=e.X[:, :1], U=e.U) for e in data], DT, STATES[:1], INPUTS)
+    record_model(one, tmp_path / "b.rrd", small, horizon=5)
+    assert "has one state" in _read(tmp_path / "b.rrd", "/report").static("/report", "text")
+    with pytest.raises(DataError, match="a bilinear predictor has no eigenfunctions; leave `which` out"):
+        record_model(bilinear, tmp_path / "a.rrd", data, which=[0])
+    with pytest.raises(DataError, match="A is defective"):
+        record_model(defective, tmp_path / "a.rrd", data, which=[0])
+
+
+def test_messages(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="episode 0 has 30 steps, the horizon is 31"):
+        record_model(turning(), tmp_path / "a.rrd", DATA, horizon=31)
+    with pytest.raises(DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
+        record_model(turning(), tmp_path / "a.rrd", DATA, which=[2])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match="cannot be written"):
+        record_model(turning(), tmp_path / "file" / "a.rrd", DATA)
+
+
+@pytest.mark.slow
+def test_the_viewer_draws_every_view(log: Path, tmp_path: Path) -> None:
+    from rerun.experimental import ViewerClient
+
+    port = free_port()
+    process = start_viewer("--headless", "--hide-welcome-screen", port=port)
+    if process is None:
+        pytest.skip("the viewer does not start here: no Vulkan driver (Debian's is mesa-vulkan-drivers)")
+    try:
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        client.open(str(log))
+        client.save_screenshot(str(tmp_path / "first.png"))
+        views = client.get_state().views
+    finally:
+        process.kill()
+        process.wait()
+    assert {v.name for v in views} >= {STATES[0], INPUTS[0], "Eigenvalues of A and the unit circle", "Report"}
+    assert [v for v in views if v.reports] == []
+    screenshot(log, tmp_path / "model.png", time=0.5)
+    assert (tmp_path / "model.png").stat().st_size > 20_000
