@@ -39,28 +39,34 @@ def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
 
 
 def table(
-    episodes: Episodes, lifting: Lifting, chunk: list[Piece], products: Int[np.ndarray, " np"] = _NONE
+    episodes: Episodes,
+    lifting: Lifting,
+    chunk: list[Piece],
+    products: Int[np.ndarray, " np"] = _NONE,
+    space: Float[np.ndarray, "_ nd"] | None = None,
 ) -> Float[np.ndarray, "M nd"]:
     """Return the rows [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one chunk; each state is lifted once.
 
-    `products` are the observables that u is multiplied with; without them the rows are [ψ(x) u ψ(x⁺)].
+    `products` are the observables that u is multiplied with; without them the rows are [ψ(x) u ψ(x⁺)]. They are
+    written into `space`, of one row more at least, where it is given: fresh memory costs as much as the rows.
     """
     of = episodes.episodes
     nz, nu, cuts = lifting.nz, episodes.nu, len(chunk)
     last = nz + nu + nu * len(products)
+    rows = sum(end - first for _, first, end in chunk)
+    D = np.empty((rows + 1, last + nz)) if space is None else space[: rows + 1]
     if cuts == 1:
         i, first, end = chunk[0]
-        D = np.empty((end - first + 1, last + nz))
         lifting._lift(of[i].X[first : end + 1], D[:, :nz])
         D[:-1, last:] = D[1:, :nz]
         D = D[:-1]
     else:
+        D = D[:-1]
         X = np.concatenate([of[i].X[first : end + 1] for i, first, end in chunk])
         Z = np.empty((len(X), nz))
         lifting._lift(X, Z)
         now = np.ones(len(X), dtype=bool)
         now[np.cumsum([end - first + 1 for _, first, end in chunk]) - 1] = False
-        D = np.empty((len(X) - cuts, last + nz))
         D[:, :nz], D[:, last:] = Z[now], Z[1:][now[:-1]]
     if nu:
         U = D[:, nz : nz + nu]

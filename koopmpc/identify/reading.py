@@ -9,7 +9,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from koopmpc.data.source import Part
 from koopmpc.errors import DataError
-from koopmpc.identify.chunks import chunks, table
+from koopmpc.identify.chunks import ROWS, chunks, table
 from koopmpc.identify.weights import Weights, weights_of
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Arrays, from_data, to_data
@@ -75,8 +75,9 @@ def read(task: Reading) -> Sums:
     steps = None if task.weights is None else weights_of(task.weights, episodes)
     nd = len(task.names)
     sums, samples, weight = np.zeros((nd, nd), order="C" if gram else "F"), 0, 0.0
+    space = np.empty((ROWS + 1, nd))
     for i in which:
-        D = table(episodes, full, pieces[i], task.products)
+        D = table(episodes, full, pieces[i], task.products, space)
         if steps is None:
             samples, weight = samples + len(D), weight + len(D)
         else:

@@ -34,6 +34,9 @@ class State(Lifting):
         """Return the chosen states."""
         return x if self.whole else x[self.chosen]
 
+    def _lift(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
+        Z[:] = X if self.whole else X[:, self.chosen]  # no need to turn the rows into columns
+
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         Z[:] = (x if self.whole else x[self.chosen]).T
 
