@@ -126,13 +126,15 @@ class Solve:
         """Return the solution, and whether the input limits are out of the hard rates' reach."""
         program, solver, conflict = self.program, self._solver, False
         moved = self._moved
-        moved[: len(program.source)] = v[program.source]
+        np.multiply(v[program.source], program.scale, out=moved[: len(program.source)])
         if room is None:
             solver.shift(moved)
         else:
             low, high = program.low.copy(), program.high.copy()
             rows, which = program.rates
-            lowest, highest = np.minimum(low[rows], room.high[which]), np.maximum(high[rows], room.low[which])
+            scale = program.scale[rows]
+            lowest = np.minimum(low[rows], room.high[which] * scale)
+            highest = np.maximum(high[rows], room.low[which] * scale)
             conflict = bool((lowest < low[rows] - 1e-9).any() or (highest > high[rows] + 1e-9).any())
             low[rows], high[rows] = lowest, highest
             solver.update(low - moved, high - moved)

@@ -12,6 +12,7 @@ from koopmpc.control.limits import Box, Limits, Softness
 from koopmpc.control.program import Group, Program, program
 from koopmpc.control.riccati import recursion, stationary
 from koopmpc.control.target import margin
+from koopmpc.control.units import Units, units
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
@@ -55,11 +56,13 @@ class PlanMap:
         law = recursion(stages(horizon, found), horizon.P_N, end(horizon, found))
         self.maps = condense(horizon, law, found, coordinates)
         self.moves = len(blocks) * predictor.nu
-        self.deviation = self.maps.deviation[: self.moves]
-        self.hard = _program(self.maps, track, horizon, soft_rows=False)
-        self.soft = (
-            _program(self.maps, track, horizon, soft_rows=True) if np.isfinite(self.hard.most).any() else None
+        measured = units(
+            self.maps.hessian, self.maps.deviation[: self.moves], track.inputs, len(horizon.blocks)
         )
+        self.deviation = self.maps.deviation[: self.moves] * measured.columns
+        self.hard = _program(self.maps, track, horizon, measured, soft_rows=False)
+        softens = bool(np.isfinite(self.hard.most).any())
+        self.soft = _program(self.maps, track, horizon, measured, soft_rows=True) if softens else None
         self._signals = horizon.signals(found.Z.shape[1])
 
         low, high = _bounds(track, horizon)
@@ -169,7 +172,9 @@ def _bounds(track: Tracking, horizon: Horizon) -> tuple[Float[np.ndarray, " nv"]
     return ends[0], ends[1]
 
 
-def _program(maps: Condensed, track: Tracking, horizon: Horizon, *, soft_rows: bool) -> Program:
+def _program(
+    maps: Condensed, track: Tracking, horizon: Horizon, measured: Units, *, soft_rows: bool
+) -> Program:
     """Return the QP, whose next stages are a step on: of outputs the next, of moves the one that then holds."""
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
     starts = np.cumsum([0, *horizon.blocks[:-1]])
@@ -177,12 +182,13 @@ def _program(maps: Condensed, track: Tracking, horizon: Horizon, *, soft_rows: b
     held = of_step[starts + 1]
     hard = Softness(np.full(nu, np.inf), np.zeros(nu))
     rates = None if track.rates is None else Group(track.rates, track.rate_softness, held)
+    columns = measured.columns
     return program(
-        maps.deviation,
-        maps.hessian,
+        maps.deviation * columns,
+        maps.hessian * np.outer(columns, columns) / measured.curvature,
         Group(track.inputs, hard, held),
         rates,
         Group(track.outputs, track.softness, np.arange(1, N + 1)),
-        maps.unit,
+        maps.unit * measured.curvature,
         soft_rows=soft_rows,
     )

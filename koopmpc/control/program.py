@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from koopmpc.control.limits import Box, Softness, allowance
 from koopmpc.control.solvers.base import QP
+from koopmpc.control.units import row_sizes
 
 
 class Group(NamedTuple):
@@ -35,14 +36,16 @@ class Program:
 
     It is the cost unit · wᵀH w + Σ (linear ε + quadratic ε²), divided by 2 unit.
 
-    Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v: their bounds
-    are `low` and `high` less that entry; the rest are ε ≥ 0. `shift_primal` and `shift_dual` tell where the next
-    stage's entry stands; one past the end stands for zero. A slack above its `allowance` is reported. Where soft
-    rows are held hard, their multipliers must be at most `most` for the solution to be that of the soft QP.
+    Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v times `scale`: their
+    bounds are `low` and `high` less that product; the rest are ε ≥ 0. Every row is measured by the norm of its row of
+    D. `shift_primal` and `shift_dual` tell where the next stage's entry stands; one past the end stands for zero. A
+    slack above its `allowance` is reported. Where soft rows are held hard, their multipliers must be at most `most`
+    for the solution to be that of the soft QP.
     """
 
     qp: QP
     source: Int[np.ndarray, " m1"]
+    scale: Float[np.ndarray, " m1"]
     low: Float[np.ndarray, " m"]
     high: Float[np.ndarray, " m"]
     shift_primal: Int[np.ndarray, " n"]
@@ -86,11 +89,15 @@ def program(
     blocks: list[_Block] = []
     shifts = [_next(moves.next, len(moves.box.low))]
     weights: list[tuple[Float[np.ndarray, " _"], ...]] = []
-    first, slacks = 0, 0
+    first, slacks, sizes = 0, 0, np.ones(len(deviation))
     first_rates = FirstRates(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
     for group in groups:
-        box, softness, following = group
-        width, N = len(box.low), len(following)
+        given, weight, following = group
+        width, N = len(given.low), len(following)
+        size = row_sizes(deviation[first : first + width * N], N)
+        sizes[first : first + width * N] = np.tile(size, N)
+        box = Box(given.low / size, given.high / size)
+        softness = Softness(weight.linear * size, weight.quadratic * size**2)
         limited = np.isfinite(box.low) | np.isfinite(box.high)
         gives = np.isfinite(softness.linear) & soft_rows
         soft, hard = np.flatnonzero(limited & gives), np.flatnonzero(limited & ~gives)
@@ -118,12 +125,13 @@ def program(
                 )
             )
         shifts.append(_next(following, len(soft)))
-        of_stage = softness.linear, softness.quadratic, allowance(box)
+        of_stage = softness.linear, softness.quadratic, allowance(given) / size
         weights.append(tuple(np.tile(weight[soft], N) for weight in of_stage))
         first, slacks = first + width * N, slacks + len(soft) * N
     source = np.concatenate([block.source for block in blocks])
     A = np.zeros((len(source) + slacks, nw + slacks))
-    A[: len(source), :nw] = deviation[source]
+    scale = 1 / sizes[source]
+    A[: len(source), :nw] = deviation[source] * scale[:, None]
     row = 0
     for block in blocks:
         if block.sign:
@@ -140,6 +148,7 @@ def program(
     return Program(
         QP(P, q, A, low, high),
         source,
+        scale,
         low,
         high,
         _joined(shifts),
