@@ -72,6 +72,11 @@ def trust(
     - the conformal band is infinite for want of episodes;
     - closed-loop forecasts stay in the band less often than promised, beyond chance.
 
+    Measured on a pendulum over 12 steps (docs/identification.md): a good model, fitted where it is used, has a band
+    of 4.6 % of the range at the last step and 0.13 times the error of x̂ = x_k. A bad one, fitted near rest to many
+    monomials, has 19 % and 3.5 times, 85 times its training error, 83 % of the held-out samples unseen, and
+    spurious eigenpairs that grow 21-fold; nine steps of it are trusted.
+
     Parameters
     ----------
     predictor

@@ -94,7 +94,13 @@ def _dictionary(evidence: Evidence) -> list[Finding]:
         f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "
         f"more than {percent(_INVARIANT)} of its size ({names}{', …' if bad.size > _NAMED else ''})"
     )
-    return [Finding(False, says, "drop these observables, or add what their next values depend on")]
+    return [
+        Finding(
+            False,
+            says,
+            "for a longer horizon add what their next values depend on; compare scores before dropping one",
+        )
+    ]
 
 
 def _fit(evidence: Evidence) -> list[Finding]:

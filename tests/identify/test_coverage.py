@@ -68,7 +68,7 @@ def test_no_empty_region_holds_a_sample_and_none_is_larger(seed: int) -> None:
 
 def test_the_words_say_where() -> None:
     rng = np.random.default_rng(0)
-    rows = rng.uniform([0, -5], [3, 5], (4000, 2))
+    rows = rng.uniform([0, -5], [3, 5], (1500, 2))
     rows = np.vstack([rows, [[0, -5], [3, 5]]])
     hole = (rows[:, 0] > 1.2) & (rows[:, 0] < 2.1) & (rows[:, 1] > 3)
     found = coverage(cloud(rows[~hole], NAMES))
