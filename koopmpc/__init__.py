@@ -16,6 +16,7 @@ from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.riccati import Gain, dlqr, lqr
 from koopmpc.data.collect import Uniform, collect
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes, Snapshots
 from koopmpc.data.excitation import PRBS, Chirp, Feedback, Multisine, Noise
 from koopmpc.data.folder import Files
@@ -115,6 +116,7 @@ __all__ = [
     "Coverage",
     "DataError",
     "DefinitenessError",
+    "Delay",
     "Disk",
     "DroppedSamples",
     "Dynamics",

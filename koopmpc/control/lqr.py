@@ -15,10 +15,12 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import stationary
 from koopmpc.errors import ShapeError
-from koopmpc.lifting.buffered import HUGE, buffered
+from koopmpc.estimate.measured import Measured
+from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.linear import LinearPredictor
 
 ITERATIONS = 10_000
+_NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here
 
 
 class LQR:
@@ -55,7 +57,7 @@ class LQR:
         )  # the second is of u_{k−1} − u_r
         self._targets, self._inputs, self._nr = track.targets, track.inputs, len(track.C)
         self._rates = track.rates
-        self._lift = buffered(predictor.lifting)
+        self._observer = Measured(predictor)
         self._reference_key: bytes | None = None
         self._feedforward = np.zeros(self.nu)
         self._last = np.zeros(self.nu)
@@ -81,6 +83,7 @@ class LQR:
 
         By default it is zero inside the limits.
         """
+        self._observer.reset()
         zero = np.clip(np.zeros(self.nu), *self._inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
 
@@ -107,7 +110,8 @@ class LQR:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
             if (np.abs(got) < HUGE).all():
                 self._last = got
-        free = self._feedforward - self._K @ self._lift(x)[0]
+        self._observer.update(x, self._last, _NOTHING)
+        free = self._feedforward - self._K @ self._observer.z
         if self._K_rate.size:
             free -= self._K_rate @ self._last
         if not (np.abs(free) < HUGE).all():

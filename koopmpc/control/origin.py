@@ -77,16 +77,26 @@ class Origin:
     rated
         Whether u_{−1} is needed.
     estimated
-        Whether the observer finds d; without it, and without latency, u and w do not reach the observer.
+        Whether the observer finds d.
+    remembers
+        Whether the observer keeps past inputs. Where neither holds, and without latency, it learns no u and no w.
     """
 
     def __init__(
-        self, model: Model, observer: Observer, sizes: Sizes, latency: int, *, rated: bool, estimated: bool
+        self,
+        model: Model,
+        observer: Observer,
+        sizes: Sizes,
+        latency: int,
+        *,
+        rated: bool,
+        estimated: bool,
+        remembers: bool = False,
     ) -> None:
         self._model, self.observer, self._sizes, self._latency = model, observer, sizes, latency
         self._rated, self._estimated = rated, estimated
         self._signals = rated or sizes.nw > 0
-        self._plain = not (estimated or latency)
+        self._plain = not (estimated or latency or remembers)
         self._shape = (observer.ny,)
         nz, nu, nw, N = sizes
         self.known = np.zeros(nz + nu * rated + N * nw + nz * estimated + 1)
@@ -192,7 +202,7 @@ class Origin:
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
 
-def numbers(value: ArrayLike, name: str) -> Float[np.ndarray, "..."]:
+def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
     """Return `value` as float64, itself where it is one already, for this is the control path.
 
     Raises
@@ -201,9 +211,11 @@ def numbers(value: ArrayLike, name: str) -> Float[np.ndarray, "..."]:
         It is no array of numbers.
     """
     try:
-        return np.asarray(value, dtype=np.float64)
+        if value is not None:
+            return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        return checks.array(value, name, finite=False)
+        pass
+    return checks.array(value, name, finite=False)  # pyright: ignore[reportArgumentType]
 
 
 def _measured(estimated: bool) -> str:

@@ -8,7 +8,9 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.estimate.history import history_of
 from koopmpc.estimate.observer import constant_index
+from koopmpc.estimate.state import FilteredState, Map
 from koopmpc.lifting.buffered import buffered
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.values import Value
@@ -20,7 +22,8 @@ class LiftedDisturbance(Value):
 
     At rest d is exactly what the model lacks at that state and input, in every lifted coordinate, so the equilibria
     z = A z + B u + d of the controller hold the plant's own. A disturbance of fewer coordinates leaves an offset
-    when z is lifted afresh from x. The Constant is known: its d is zero.
+    when z is lifted afresh from x. The Constant is known: its d is zero. Of a controller on x⁺ = F(x, u) + d it is
+    the states that have the disturbances.
 
     Parameters
     ----------
@@ -44,6 +47,10 @@ class LiftedDisturbance(Value):
         """Return the observer of one controller."""
         return Relifted(self, predictor)
 
+    def watch(self, model: Map, nx: int) -> FilteredState:
+        """Return the observer of one controller on x⁺ = F(x, u) + d, whose states have the disturbances."""
+        return FilteredState(self.gain, model, nx)
+
 
 class Relifted:
     """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is."""
@@ -52,6 +59,7 @@ class Relifted:
         self._gain, self._predictor = rule.gain, predictor
         self._constant = constant_index(predictor)
         self._lift = buffered(predictor.lifting)
+        self._history = history_of(predictor.embedding)
         self.ny = predictor.nx
         self.z: Float[np.ndarray, " nz"] = np.zeros(predictor.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(predictor.nz)
@@ -61,6 +69,8 @@ class Relifted:
         """Forget the last state and d; x0 will come as the first measurement."""
         self.d[:] = 0.0
         self._measured = False
+        if self._history is not None:
+            self._history.reset()
 
     def adopt(self, predictor: LinearPredictor) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
@@ -71,7 +81,7 @@ class Relifted:
     ) -> bool:
         """Lift y, and move d towards the misfit of the step that led here."""
         (x,), (lifted,), lift, _ = self._lift.slot()
-        x[:] = y
+        x[:] = y if self._history is None else self._history.take(y, u)
         lift()
         if not np.isfinite(lifted).all():
             self._measured = False

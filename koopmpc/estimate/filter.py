@@ -84,7 +84,7 @@ class Kalman:
         nx = system.predictor.nx
         start = np.zeros(nx) if x0 is None else checks.array(x0, "x0", (nx,))
         self._s = np.zeros(len(system.F))
-        self._s[: len(system.kept)] = system.predictor.lift(start)[system.kept]
+        self._s[: len(system.kept)] = system.predictor.lift(system.predictor.held(start))[system.kept]
         self._inputs.clear()
         self._started = False
         self._missed = 0

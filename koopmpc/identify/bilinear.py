@@ -7,6 +7,7 @@ from typing import Unpack
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning, ObservableError
@@ -27,6 +28,7 @@ def bilinear_edmd(
     episodes: Episodes | Source,
     lifting: Lifting,
     *,
+    embedding: Delay | None = None,
     ridge: Ridge = 0.0,
     rank: Rank = None,
     products: Sequence[str] | None = None,
@@ -43,6 +45,8 @@ def bilinear_edmd(
         With inputs, or a Source of such; no pair spans two of them.
     lifting
         ψ: R^nx → R^nz. C picks the states where it holds them, by name, else it is fitted.
+    embedding
+        ψ acts on the state and its past, as in `edmd`.
     ridge
         Tikhonov weight on unit-norm columns of [ψ(x) u u⊗ψ(x)]. With 0, singular values below eps · max(M, n) of
         the largest are cut. "gcv" chooses it by generalised cross-validation.
@@ -86,7 +90,7 @@ def bilinear_edmd(
         raise DataError(
             "a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two"
         )
-    total = moments(source, lifting, bilinear=True, **how)
+    total = moments(source, lifting, bilinear=True, embedding=embedding, **how)
     task = regression(total, "bilinear_edmd")
     assert task.C is not None, "an extended regression has its C"
     bound, nz, nu = task.lifting, total.nz, source.nu
@@ -124,7 +128,8 @@ def bilinear_edmd(
     )
     for sentence in sentences:
         warnings.warn(sentence, FitWarning, stacklevel=2)
-    return BilinearPredictor(K[:r].T, K[r : r + nu].T, N, C, bound, task.dt, task.states, task.inputs, report)
+    A, B = K[:r].T, K[r : r + nu].T
+    return BilinearPredictor(A, B, N, C, bound, task.dt, task.states, task.inputs, report, task.embedding)
 
 
 def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:

@@ -5,6 +5,7 @@ from typing import Unpack
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.identify.fit import Method, Regression, fit
@@ -21,6 +22,7 @@ def edmd(
     episodes: Episodes | Source,
     lifting: Lifting,
     *,
+    embedding: Delay | None = None,
     ridge: Ridge = 0.0,
     rank: Rank = None,
     method: Method = "ls",
@@ -37,6 +39,8 @@ def edmd(
         No pair spans two of them. A Source, ``Files("logs")`` say, is read in parts that memory need not hold.
     lifting
         ψ: R^nx → R^nz.
+    embedding
+        ψ acts on the state and its past, ``Delay(2)`` say; C still returns x alone.
     ridge
         Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz + nu) of the
         largest, on unit-norm columns, are cut; the report's route says so. "gcv" chooses by generalised
@@ -70,7 +74,9 @@ def edmd(
     25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
     """
     source = source_of(episodes)
-    task = regression(moments(source.driven(), lifting, **how), "edmd", noisy=method != "ls")
+    sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
+    total = moments(source.driven(), lifting, embedding=sized, **how)
+    task = regression(total, "edmd", noisy=method != "ls")
     fitted = fit(task, ridge=ridge, rank=rank, method=method)
     if not source.nw:
         return fitted
@@ -87,12 +93,13 @@ def edmd(
         fitted.exact_modes,
         E,
         source.disturbances,
+        fitted.embedding,
     )
 
 
 def regression(total: Moments, method: str, *, noisy: bool = False) -> Regression:
     """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included; `noisy` keeps all of T."""
-    states = total.lifting._states
+    states = total.states
     place = {name: i for i, name in enumerate(total.full.names)}
     where = np.array([place[name] for name in states])
     C, residual = _decoder(total, where)
@@ -108,6 +115,7 @@ def regression(total: Moments, method: str, *, noisy: bool = False) -> Regressio
         dt=total.dt,
         C=C,
         state_residual=residual,
+        embedding=total.embedding,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.forward_backward import forward_backward
@@ -44,6 +45,8 @@ class Regression:
         (nz, nu) where it is known.
     scaled
         Solve on columns of unit norm.
+    embedding
+        As in the predictor.
     """
 
     method: str
@@ -58,6 +61,7 @@ class Regression:
     state_residual: Float[np.ndarray, " nx"]
     B: Float[np.ndarray, "nz nu"] | None = None
     scaled: bool = True
+    embedding: Delay | None = None
 
 
 def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
@@ -107,7 +111,16 @@ def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Meth
     for sentence in sentences:
         warnings.warn(sentence, FitWarning, stacklevel=3)
     return LinearPredictor(
-        found.A, found.B, found.C, found.lifting, task.dt, task.states, task.inputs, report, found.modes
+        found.A,
+        found.B,
+        found.C,
+        found.lifting,
+        task.dt,
+        task.states,
+        task.inputs,
+        report,
+        found.modes,
+        embedding=task.embedding,
     )
 
 

@@ -10,6 +10,7 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Part, Source, source_of
 from koopmpc.errors import DataError, FitWarning
@@ -37,7 +38,7 @@ class Moments(Value):
     Attributes
     ----------
     lifting
-        ψ, bound to the states.
+        ψ, bound to the states, or to ζ of the embedding.
     inputs
         Names with units; none for an autonomous system.
     dt
@@ -52,6 +53,8 @@ class Moments(Value):
         G or R, (nd, nd).
     bilinear
         The rows are [ψ(x) u u⊗ψ(x) ψ(x⁺)]; a Constant is left out of the products, for u times it is u.
+    embedding
+        Where ψ acts on ζ, what makes it.
     """
 
     lifting: Lifting
@@ -62,6 +65,7 @@ class Moments(Value):
     route: str
     sums: Float[np.ndarray, "nd nd"]
     bilinear: bool = False
+    embedding: Delay | None = None
 
     @cached_property
     def full(self) -> Lifting:
@@ -72,6 +76,11 @@ class Moments(Value):
     def nz(self) -> int:
         """Number of observables in ψ."""
         return self.lifting.nz
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states x, without their past."""
+        return self.lifting._states if self.embedding is None else self.embedding.states
 
     @property
     def products(self) -> Int[np.ndarray, " np"]:
@@ -104,8 +113,8 @@ class Moments(Value):
 
     def __add__(self, other: "Moments") -> "Moments":
         """Return the moments of both data sets; R + G becomes G and warns, for it loses R's digits."""
-        mine = (self.lifting, self.inputs, self.dt, self.bilinear)
-        if mine != (other.lifting, other.inputs, other.dt, other.bilinear):
+        mine = (self.lifting, self.inputs, self.dt, self.bilinear, self.embedding)
+        if mine != (other.lifting, other.inputs, other.dt, other.bilinear, other.embedding):
             raise DataError(
                 "the moments differ in lifting, inputs or dt, or one is bilinear; "
                 "add moments of one plant in one lifting only"
@@ -162,6 +171,7 @@ def moments(
     episodes: Episodes | Source,
     lifting: Lifting,
     *,
+    embedding: Delay | None = None,
     route: Route | None = None,
     bilinear: bool = False,
     weights: Weights | None = None,
@@ -180,7 +190,9 @@ def moments(
     episodes
         Episodes, or a Source: ``Files("logs")``, ``Stream(iterator)``.
     lifting
-        ψ; it is bound to the states.
+        ψ; it is bound to the states, or to ζ of the embedding.
+    embedding
+        ψ acts on ζ, the state and its past, as `Delay` makes it.
     route
         "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a
         pilot, chunks sampled from up to 4 parts, chooses: Gram up to 1e6, else QR; if the whole turns out worse,
@@ -207,12 +219,15 @@ def moments(
         A worker died on the same part each time, or no scheduler answers.
     """
     source = source_of(episodes)
+    if embedding is not None:
+        embedding = embedding.fitted(source.states, source.inputs)
+        source = embedding.source(source)
     bound = lifting_of(lifting).bind(source.states)
     if not (weights is None or callable(weights) or isinstance(source, Held)):
         raise DataError(
             "weights are a list, which only Episodes have an order for; pass a function of an Episode"
         )
-    task = _Task(source, bound, _products(bound, bilinear), bilinear, weights)
+    task = _Task(source, bound, _products(bound, bilinear), bilinear, weights, embedding)
 
     def whole(route: Route) -> Moments:
         parts = source.parts()
@@ -243,6 +258,7 @@ class _Task:
     products: Int[np.ndarray, " np"]
     bilinear: bool
     weights: Weights | None
+    embedding: Delay | None
 
     @cached_property
     def full(self) -> Lifting:
@@ -270,7 +286,17 @@ class _Task:
         """Return the sums of the parts, added in their order."""
         source = self.source
         every = (
-            Moments(self.lifting, source.inputs, source.dt, s.samples, s.weight, route, s.sums, self.bilinear)
+            Moments(
+                lifting=self.lifting,
+                inputs=source.inputs,
+                dt=source.dt,
+                samples=s.samples,
+                weight=s.weight,
+                route=route,
+                sums=s.sums,
+                bilinear=self.bilinear,
+                embedding=self.embedding,
+            )
             for s in parts
         )
         result = reduce(Moments.__add__, every)

@@ -11,21 +11,23 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.projected import Projected
 from koopmpc.lifting.state import State
 from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.files import load_value, save_value
+from koopmpc.predict.base import Predictor
+from koopmpc.predict.files import load_value
 from koopmpc.predict.report import FitReport
-from koopmpc.values import Value
 
 _DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class LinearPredictor(Value):
+class LinearPredictor(Predictor):
     """A lifted linear predictor z⁺ = A z + B u + E w, x ≈ C z, z₀ = ψ(x₀), w disturbances that are measured.
 
     Attributes
@@ -51,6 +53,8 @@ class LinearPredictor(Value):
         (nz, nw); (nz, 0) without measured disturbances.
     disturbances
         Names of w with units; ``w0, w1, …`` by default.
+    embedding
+        Makes ζ of x and its past; the lifting is then bound to the names of ζ, and z₀ = ψ(ζ₀).
 
     Raises
     ------
@@ -63,14 +67,6 @@ class LinearPredictor(Value):
     control", Automatica 93, 2018.
     """
 
-    A: Float[np.ndarray, "nz nz"]
-    B: Float[np.ndarray, "nz nu"]
-    C: Float[np.ndarray, "nx nz"]
-    lifting: Lifting
-    dt: float
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    report: FitReport | None
     exact_modes: Complex[np.ndarray, "nl nz"] | None
     E: Float[np.ndarray, "nz nw"]
     disturbances: tuple[str, ...]
@@ -88,84 +84,48 @@ class LinearPredictor(Value):
         exact_modes: Complex[np.ndarray, "nl nz"] | None = None,
         E: ArrayLike | None = None,
         disturbances: Sequence[str] | None = None,
+        embedding: Delay | None = None,
     ) -> None:
-        bound = lifting.bind(tuple(states))
-        nz, nx, nu = bound.nz, len(states), len(inputs)
-        transition = checks.array(A, "A")
-        if transition.shape != (nz, nz):
-            raise ShapeError(
-                f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
-                "pass the lifting used in the fit"
-            )
+        super().__init__(A, B, C, lifting, dt, states, inputs, report, embedding)
         modes = exact_modes
         if modes is not None:
-            if not isinstance(bound, Projected) or modes.shape != bound.basis.shape:
+            if not isinstance(self.lifting, Projected) or modes.shape != self.lifting.basis.shape:
                 raise ShapeError(
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
             modes = np.array(modes, dtype=np.complex128, order="C")
-        drift = np.zeros((nz, 0)) if E is None else checks.array(E, "E", (nz, None))
+        drift = np.zeros((self.nz, 0)) if E is None else checks.array(E, "E", (self.nz, None))
         nw = drift.shape[1]
         names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
         if len(names) != nw:
             raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
-        for name, value in {
-            "A": transition,
-            "B": checks.array(B, "B", (nz, nu)),
-            "C": checks.array(C, "C", (nx, nz)),
-            "lifting": bound,
-            "dt": checks.positive(dt, "dt", "s"),
-            "states": tuple(states),
-            "inputs": tuple(inputs),
-            "report": report,
-            "exact_modes": modes,
-            "E": drift,
-            "disturbances": names,
-        }.items():
-            object.__setattr__(self, name, value)
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return self.C.shape[0]
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self.B.shape[1]
-
-    @property
-    def nz(self) -> int:
-        """Number of lifted coordinates."""
-        return self.A.shape[0]
+        self._set(exact_modes=modes, E=drift, disturbances=names)
 
     @property
     def nw(self) -> int:
         """Number of measured disturbances."""
         return self.E.shape[1]
 
-    def lift(self, x: ArrayLike) -> Float[np.ndarray, "*batch nz"]:
-        """Return z = ψ(x) for one state (nx,) or rows of states (M, nx)."""
-        return self.lifting(checks.array(x, "x"))
-
     def rollout(
-        self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None
+        self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
     ) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = A z_k + B u_k + E w_k, z_0 = ψ(x0), lifted once at the start.
 
         Parameters
         ----------
         x0
-            (nx,) initial state.
+            (nx,) initial state; with an embedding and no history the point ζ_0.
         U
             (T, nu) inputs; (T, 0) for an autonomous predictor.
         W
             (T, nw) measured disturbances; zero by default.
+        history
+            The steps that led to x0, its last row x0 itself; only with an embedding.
         """
         inputs = checks.array(U, "U", (None, self.nu))
-        start = checks.array(x0, "x0", (self.nx,))
+        start = self.start(x0, history)
         Z = np.empty((len(inputs) + 1, self.nz))
-        Z[0] = self.lift(start)
+        Z[0] = self.lifting(start)
         forced = inputs @ self.B.T
         if W is not None:
             forced += checks.array(W, "W", (len(inputs), self.nw)) @ self.E.T
@@ -173,16 +133,17 @@ class LinearPredictor(Value):
             np.dot(self.A, Z[k], out=Z[k + 1])
             Z[k + 1] += forced[k]
         X = Z @ self.C.T
-        X[0] = start
+        X[0] = start[: self.nx]
         return X
 
     def step_map(self) -> StepMap:
-        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC; w is 0."""
-        x, u = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu)
-        CA, CB = ca.DM(self.C @ self.A), ca.DM(self.C @ self.B)
-        x_next = CA @ self.lifting.symbolic(x) + CB @ u
-        F = ca.Function("F", [x, u], [ca.densify(x_next)], ["x", "u"], ["x_next"])
-        return StepMap(F, self.dt, states=self.states, inputs=self.inputs)
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC; w is 0.
+
+        With an embedding it is a map of ζ: ζ⁺ = [C (A ψ(ζ) + B u), u, ζ without its oldest step].
+        """
+        x, u = ca.SX.sym("x", len(self.point_names)), ca.SX.sym("u", self.nu)
+        x_next = ca.DM(self.C @ self.A) @ self.lifting.symbolic(x) + ca.DM(self.C @ self.B) @ u
+        return self.as_step_map(x, u, x_next)
 
     @cached_property
     def eigenvalues(self) -> Complex[np.ndarray, " nz"]:
@@ -222,23 +183,19 @@ class LinearPredictor(Value):
         return np.linalg.inv(self.eigenvectors)
 
     def eigenfunctions(self, X: ArrayLike) -> Complex[np.ndarray, "M nz"]:
-        """Return φ_j(x) = ξ_jᴴ ψ(x) at rows of states (M, nx): φ_j(x⁺) = λ_j φ_j(x) without input.
+        """Return φ_j(x) = ξ_jᴴ ψ(x) at rows of states (M, nx), or of ζ: φ_j(x⁺) = λ_j φ_j(x) without input.
 
         Raises
         ------
         DataError
             A is defective.
         """
-        Z = self.lifting(checks.array(X, "X", (None, self.nx)))
+        Z = self.lifting(checks.array(X, "X", (None, len(self.point_names))))
         return Z @ self.left_eigenvectors.T
 
     @cached_property
     def _eigen(self) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
         return eigen(self.A)
-
-    def save(self, path: str | Path) -> None:
-        """Write the predictor as data (.npz: arrays and one JSON text); `load_predictor` reads it."""
-        save_value(self, path)
 
     @classmethod
     def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike) -> "LinearPredictor":

@@ -1,0 +1,186 @@
+"""Delay: a state that holds its own past, ζ_k = [x_k, u_{k−1}, x_{k−1}, …, u_{k−d}, x_{k−d}]."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Changed, Source
+from koopmpc.errors import DataError, FitWarning, ShapeError
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False)
+class Delay(Value):
+    """The embedding ζ_k = [x_k, u_{k−1}, x_{k−1}, …, u_{k−d}, x_{k−d}]: what is not measured shows in the past.
+
+    A lifting then acts on ζ. No ζ reaches across episodes: each episode gives d points less. Past values have the
+    names ``"theta[k-1] [rad]"``.
+
+    Parameters
+    ----------
+    steps
+        d ≥ 1.
+    inputs
+        Keep the past inputs too; without them ζ_k = [x_k, x_{k−1}, …, x_{k−d}].
+
+    Raises
+    ------
+    DataError
+        steps is below 1.
+
+    References
+    ----------
+    Takens, "Detecting strange attractors in turbulence", 1981; with inputs, as here: Korda & Mezić, Automatica 93,
+    2018.
+    """
+
+    steps: int
+    inputs: bool = True
+    bound: tuple[tuple[str, ...], tuple[str, ...]] | None = field(default=None, kw_only=True)  # x, u
+
+    def __post_init__(self) -> None:
+        checks.count(self.steps, "steps")
+
+    def bind(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
+        """Return the sized copy, for a plant with these names."""
+        return replace(self, bound=(tuple(states), tuple(inputs)))
+
+    def fitted(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
+        """Return the copy for data with these names: a bound one keeps the past of its own inputs alone.
+
+        Raises
+        ------
+        DataError
+            It is bound to another plant.
+        """
+        if self.bound is None:
+            return self.bind(states, inputs)
+        if self.bound != (tuple(states), tuple(inputs)[: len(self.bound[1])]):
+            raise DataError(
+                f"the embedding is of {', '.join(self.bound[0] + self.bound[1])}; the data hold "
+                f"{', '.join((*states, *inputs))}"
+            )
+        return self
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of x."""
+        return self._bound[0]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of ζ."""
+        states, inputs = self._bound
+        past = (inputs if self.inputs else ()) + states
+        return states + tuple(_delayed(name, i) for i in range(1, self.steps + 1) for name in past)
+
+    @property
+    def _bound(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        if self.bound is None:
+            raise DataError(
+                "Delay does not know its plant yet; call .bind(states, inputs) or pass it to edmd"
+            )
+        return self.bound
+
+    @property
+    def _block(self) -> int:
+        """Values of one past step."""
+        states, inputs = self._bound
+        return len(states) + len(inputs) * self.inputs
+
+    def __call__(self, episodes: Episodes) -> Episodes:
+        """Return the episodes of ζ; those of at most d steps are left out, with a warning that counts them.
+
+        Raises
+        ------
+        DataError
+            No episode is long enough.
+        """
+        d, sized = self.steps, self.fitted(episodes.states, episodes.inputs)
+        long = [episode for episode in episodes if len(episode) > d]
+        lost = len(episodes) - len(long)
+        if not long:
+            raise DataError(
+                f"no episode is longer than the {d} steps of the embedding; pass longer ones, or a shorter Delay"
+            )
+        if lost:
+            warnings.warn(
+                f"{lost} of {len(episodes)} episodes have {d} steps or less and are left out: Delay({d}) finds no "
+                "pair in them",
+                FitWarning,
+                stacklevel=2,
+            )
+        parts = [Episode(X=sized._points(e.X, e.U), U=e.U[d:], W=e.W[d:]) for e in long]
+        return Episodes(parts, episodes.dt, sized.names, episodes.inputs, episodes.disturbances)
+
+    def source(self, source: Source) -> Source:
+        """Return a source of ζ."""
+        sized = self.fitted(source.states, source.inputs)
+        return Changed(source, sized, sized.names, source.inputs, source.disturbances, history=self.steps)
+
+    def point(self, x: Float[np.ndarray, " nx"], history: Episode) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ of x, whose last d steps are those of `history`, which ends at x.
+
+        Raises
+        ------
+        DataError
+            The history is shorter than d, or does not end at x.
+        ShapeError
+            It has other states or inputs.
+        """
+        states, inputs = self._bound
+        if history.X.shape[1:] != (len(states),) or history.U.shape[1:] != (len(inputs),):
+            raise ShapeError(
+                f"history has {history.X.shape[1]} states and {history.U.shape[1]} inputs, expected {len(states)} and "
+                f"{len(inputs)}"
+            )
+        if len(history) < self.steps:
+            raise DataError(
+                f"history has {len(history)} steps, Delay({self.steps}) needs the last {self.steps}"
+            )
+        if not np.array_equal(history.X[-1], x):
+            raise DataError("history does not end at x; its last row of X is x itself")
+        first = len(history) - self.steps
+        return self._points(history.X[first:], history.U[first:])[0]
+
+    def held(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ of a plant that has been in x, under u, for d steps."""
+        past = np.concatenate([u, x]) if self.inputs else x
+        return np.concatenate([x, *[past] * self.steps])
+
+    def shifted(
+        self,
+        zeta: Float[np.ndarray, " nzeta"],
+        u: Float[np.ndarray, " nu"],
+        x_next: Float[np.ndarray, " nx"],
+    ) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ⁺ = [x⁺, u, ζ without its oldest step]."""
+        kept = zeta[: len(zeta) - self._block]
+        return np.concatenate([x_next, u, kept] if self.inputs else [x_next, kept])
+
+    def symbolic(self, zeta: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.SX:
+        """Return ζ⁺ on symbols."""
+        kept = zeta[: zeta.shape[0] - self._block]
+        return ca.vertcat(x_next, u, kept) if self.inputs else ca.vertcat(x_next, kept)
+
+    def _points(
+        self, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "steps nu"]
+    ) -> Float[np.ndarray, "points nzeta"]:
+        """Return the rows ζ_d … ζ_T."""
+        d = self.steps
+        past = np.hstack([U[:, : len(self._bound[1])], X[:-1]]) if self.inputs else X[:-1]
+        windows = sliding_window_view(past, d, axis=0)[:, :, ::-1]  # (T − d + 1, block, d), the newest first
+        return np.hstack([X[d:], windows.transpose(0, 2, 1).reshape(len(windows), -1)])
+
+
+def _delayed(name: str, steps: int) -> str:
+    """Return ``"theta[k-1] [rad]"`` for ``"theta [rad]"``."""
+    stem, bracket, unit = name.partition(" [")
+    return f"{stem}[k-{steps}]{bracket}{unit}"
