@@ -1,0 +1,95 @@
+"""Random QPs through whole controllers: an answer is the optimum or says it is not; inputs stay inside."""
+
+import collections
+import sys
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from tests.control.random_mpcs import KINDS, feasible, optimality, random_case
+
+GOOD = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
+# How far from the optimum, relative, in the norm of the Hessian. OSQP stops at 1e-5 of the largest force, where rows
+# are soft at 1e-4 of it, and prices are forces of up to 1e4; every QP of it is also held to just that, see conftest.
+EXACT = {"osqp": 1e-2, "daqp": 1e-6}
+SOFT = {"osqp": 1e-1, "daqp": 1e-6}
+STEPS = 20
+
+
+def inside(case, u, u_prev):
+    """Assert that u is in its limits to the last bit, and that its change is, as far as they allow."""
+    low, high = case.box
+    assert np.isfinite(u).all()
+    assert ((low <= u) & (u <= high)).all()
+    if case.rates is not None:
+        assert (u <= np.maximum(u_prev + case.rates, low)).all()
+        assert (u >= np.minimum(u_prev - case.rates, high)).all()
+
+
+def conflict(case, u_prev):
+    """Whether the last input is so far outside that its rates do not reach the limits."""
+    low, high = case.box
+    return case.rates is not None and bool(((u_prev + case.rates < low) | (u_prev - case.rates > high)).any())
+
+
+def steps(case, rng):
+    """Yield x, r, the last input, its move and the plan, of a closed loop that is torn away now and then."""
+    nx, mpc = len(case.A), case.mpc
+    x, u_prev = np.zeros(nx), np.clip(np.zeros(case.B.shape[1]), *case.box)
+    mpc.reset()
+    r = np.zeros((case.N, nx))
+    for k in range(STEPS):
+        if k % 5 == 0:
+            x = case.scale * rng.normal(size=nx) * 10.0 ** rng.uniform(-2, 1)
+            r = np.tile(case.scale * rng.normal(size=nx) * 10.0 ** rng.uniform(-2, 0.5), (case.N, 1))
+        applied = None
+        if rng.random() < 0.1:  # the plant got something else
+            applied = u_prev * rng.uniform(-1, 1) if case.box[0].max() <= 0 <= case.box[1].min() else None
+            u_prev = u_prev if applied is None else applied
+        move = mpc(x, np.vstack([x, r]), applied)
+        yield x, r, u_prev, move, mpc.plan()
+        u_prev = move.u
+        x = case.A @ x + case.B @ move.u
+
+
+def through_controllers(rng, count, share):
+    """Return how often each kind ended in each status, of `count` steps, of which a share is checked by brute force."""
+    seen, worst = collections.Counter(), collections.Counter()
+    for i in range(count // STEPS):
+        solver = ("osqp", "daqp")[i % 2]
+        case = random_case(rng, KINDS[i // 2 % len(KINDS)], solver)
+        for x, r, u_prev, move, plan in steps(case, rng):
+            inside(case, move.u, u_prev)
+            status, U = move.status, None if plan is None else plan.U.ravel()
+            assert (status in GOOD) == (move.fallback is km.Fallback.NONE) == (plan is not None)
+            seen[solver, case.kind, status.name] += 1
+            if rng.random() > share or conflict(case, u_prev):
+                continue
+            if status is km.Status.INFEASIBLE:
+                seen[solver, case.kind, "false INFEASIBLE"] += feasible(case, x, u_prev)
+            if status in GOOD:
+                violation, distance = optimality(case, x, r, u_prev, U, EXACT[solver])
+                seen[solver, "checked"] += 1
+                worst[solver, "violation"] = max(worst[solver, "violation"], violation)
+                worst[solver, "distance"] = max(worst[solver, "distance"], distance)
+                enough = (EXACT if np.isinf(case.rows.linear).all() else SOFT)[solver]
+                assert violation < EXACT[solver], (i, case.kind, status, violation)
+                assert distance < enough, (i, case.kind, status, distance)
+    return seen, worst
+
+
+def test_a_sample_of_random_qps_through_whole_controllers():
+    pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
+    seen, _ = through_controllers(np.random.default_rng(1), 720, 1.0)
+    assert sum(n for key, n in seen.items() if key[-1] in {status.name for status in GOOD}) > 500
+    assert sum(n for key, n in seen.items() if key[-1] == "INFEASIBLE") > 5
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_random_qps_through_whole_controllers():
+    pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
+    seen, worst = through_controllers(np.random.default_rng(2), 100_000, 0.3)
+    lines = [f"{' '.join(key):40s} {n}" for key, n in sorted(seen.items())]
+    lines += [f"worst {' '.join(key):20s} {value:.2g}" for key, value in worst.items()]
+    sys.stdout.write("\n" + "\n".join(lines) + "\n")
