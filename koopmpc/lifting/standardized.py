@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.constant import Constant
@@ -58,15 +59,33 @@ class Standardized(Lifting):
         object.__setattr__(self, "bound", bound)
 
     @classmethod
-    def of(cls, episodes: Episodes, lifting: Lifting) -> "Standardized":
-        """Return the lifting standardized by the mean and the standard deviation of these episodes' states.
+    def of(cls, episodes: Episodes | Source, lifting: Lifting) -> "Standardized":
+        """Return the lifting standardized by the mean and the standard deviation of the states in these data.
 
-        A state that does not move keeps its unit: its scale is 1.
+        The states are those that a fit takes steps from, x_0 … x_{T−1} of each episode, read part by part. One
+        that does not move keeps its unit: its scale is 1.
+
+        Raises
+        ------
+        DataError
+            The source can be read once only, and the fit needs it too.
         """
-        rows = sum(len(episode.X) for episode in episodes)
-        mean = np.sum([episode.X.sum(axis=0) for episode in episodes], axis=0) / rows
-        squares = np.sum([((episode.X - mean) ** 2).sum(axis=0) for episode in episodes], axis=0)
-        scale = np.sqrt(squares / rows)
+        source = source_of(episodes)
+        if not source.replayable:
+            raise DataError(
+                "a stream is read once, by the fit; take Standardized.of from some episodes of it"
+            )
+        rows, mean, squares = 0, np.zeros(source.nx), np.zeros(source.nx)
+        for part in source.parts():
+            for (
+                episode
+            ) in part.load():  # Chan, Golub & LeVeque 1983: two means and sums of squares become one
+                X = episode.X[:-1]
+                own, rows = X.mean(axis=0), rows + len(X)
+                step = (own - mean) * len(X) / rows
+                squares += ((X - own) ** 2).sum(axis=0) + (own - mean) * step * (rows - len(X))
+                mean = mean + step
+        scale = np.sqrt(squares / max(rows, 1))
         still = scale <= 1e-12 * np.abs(mean)
         return cls(lifting, mean, np.where(still, 1.0, scale))
 

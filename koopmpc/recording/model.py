@@ -1,6 +1,7 @@
 """record_model: a predictor and how far it can be trusted, as one Rerun log."""
 # pyright: basic
 
+import re
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from koopmpc.recording.eigenvalues import draw_eigenvalues, eigenvalue_views
 from koopmpc.recording.forecasts import error_series, forecast_series, input_series
 from koopmpc.recording.planes import draw_eigenfunctions, plane_view
 
+_ESCAPED, _BEFORE = re.compile(r"([|*_`])"), r"\\\1"  # what Markdown would not take as it stands
 _FLUSH = 10.0  # longest wait for the file [s]
 _SHOWN = 6  # plots of states in one column
 _EIGENFUNCTIONS = 2  # drawn unless told
@@ -166,7 +168,7 @@ def _page(predictor: Predictor, report: TrustReport | None, note: str) -> str:
         "sampling time": f"{predictor.dt:g} s",
         "observables": f"{predictor.nz}: {', '.join(predictor.lifting.names[:12])}"
         + (" …" if predictor.nz > 12 else ""),
-        "largest |λ|": f"{abs(predictor.eigenvalues[0]):.6g}",
+        "spectral radius": f"{abs(predictor.eigenvalues[0]):.6g}",
     }
     if predictor.report is not None:
         fit = predictor.report
@@ -176,7 +178,7 @@ def _page(predictor: Predictor, report: TrustReport | None, note: str) -> str:
             "condition": f"{fit.condition:.3g}",
         }
         rows |= {f"doubt {i + 1}": doubt for i, doubt in enumerate(fit.warnings)}
-    lines += [f"| {key} | {str(value).replace('|', chr(92) + '|')} |" for key, value in rows.items()]
+    lines += [f"| {key} | {_ESCAPED.sub(_BEFORE, value)} |" for key, value in rows.items()]
     return "\n".join(lines)
 
 

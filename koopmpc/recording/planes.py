@@ -21,7 +21,7 @@ def draw_eigenfunctions(
     pictures: list[tuple[str, str, dict[str, Any]]] = []
     for j, phi in zip(which, eigenfunctions_on(predictor, which, plane), strict=True):
         value = predictor.eigenvalues[j]
-        name, entity = f"φ{j}, λ = {value:.4g}", f"eigenfunction/{j}"
+        entity = f"eigenfunction/{j}"
         if value.imag == 0:
             low, high = float(phi.real.min()), float(phi.real.max())
             level = (phi.real - low) / ((high - low) or 1.0)
@@ -29,8 +29,11 @@ def draw_eigenfunctions(
             pictures.append((f"{entity}/value", title, _picture(f"{entity}/value", sequence(level), plane)))
             continue
         shades = {"magnitude": sequence(np.abs(phi)), "phase": circle(np.angle(phi))}
-        titles = {"magnitude": f"|{name[: len(f'φ{j}')]}|, 0 (dark) to 1 (light), λ = {value:.4g}"}
-        titles["phase"] = f"phase of φ{j}: 0 dark, ±π light, + red, − blue"
+        sign = "+" if value.imag > 0 else "−"
+        titles = {
+            "magnitude": f"|φ{j}|, 0 (dark) to 1 (light), λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i",
+            "phase": f"phase of φ{j}: 0 dark, ±π light, + red, − blue",
+        }
         pictures += [
             (f"{entity}/{k}", titles[k], _picture(f"{entity}/{k}", shades[k], plane)) for k in shades
         ]

@@ -7,6 +7,7 @@ import pytest
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, LogError
+from koopmpc.identify.edmd import edmd
 from koopmpc.identify.trust import TrustReport, trust
 from koopmpc.lifting.state import State
 from koopmpc.predict.bilinear import BilinearPredictor
@@ -163,3 +164,24 @@ def test_the_viewer_draws_every_view(log: Path, tmp_path: Path) -> None:
     assert [v for v in views if v.reports] == []
     screenshot(log, tmp_path / "model.png", time=0.5)
     assert (tmp_path / "model.png").stat().st_size > 20_000
+
+
+def test_names_that_markdown_would_change_stand_as_they_are(tmp_path: Path) -> None:
+    data = episodes(2)
+    model = edmd(data, State() + State() * State())
+    record_model(model, tmp_path / "a.rrd", data, horizon=5)
+    page = _read(tmp_path / "a.rrd", "/report").static("/report", "text")
+    assert r"angle^2, angle\*rate, rate^2" in page
+
+
+def test_a_model_that_runs_away_is_recorded_too(tmp_path: Path) -> None:
+    data = episodes(3)
+    wild = turning(1e12)
+    record_model(wild, tmp_path / "a.rrd", data, rollouts=1)
+    curves = _read(tmp_path / "a.rrd", "/rollout/0/**").vectors("/rollout/0/state/0")
+    assert np.array_equal(curves[:, :2], _two(forecast(wild, data[0], 30)), equal_nan=True)
+    assert np.isnan(curves[-1, 1])
+
+
+def _two(ahead) -> np.ndarray:
+    return np.column_stack([ahead.truth[:, 0], ahead.predicted[:, 0]])
