@@ -157,13 +157,13 @@ class Delay(Value):
 
     def shifted(
         self,
-        zeta: Float[np.ndarray, " nzeta"],
-        u: Float[np.ndarray, " nu"],
-        x_next: Float[np.ndarray, " nx"],
-    ) -> Float[np.ndarray, " nzeta"]:
-        """Return ζ⁺ = [x⁺, u, ζ without its oldest step]."""
-        kept = zeta[: len(zeta) - self._block]
-        return np.concatenate([x_next, u, kept] if self.inputs else [x_next, kept])
+        zeta: Float[np.ndarray, "*batch nzeta"],
+        u: Float[np.ndarray, "*batch nu"],
+        x_next: Float[np.ndarray, "*batch nx"],
+    ) -> Float[np.ndarray, "*batch nzeta"]:
+        """Return ζ⁺ = [x⁺, u, ζ without its oldest step], of one ζ or of rows."""
+        kept = zeta[..., : zeta.shape[-1] - self._block]
+        return np.concatenate([x_next, u, kept] if self.inputs else [x_next, kept], axis=-1)
 
     def symbolic(self, zeta: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.SX:
         """Return ζ⁺ on symbols."""

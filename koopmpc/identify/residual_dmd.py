@@ -85,10 +85,13 @@ def residual_dmd(predictor: Predictor, total: Moments, *, tolerance: float = TOL
             f"the moments have inputs ({', '.join(total.inputs)}), the predictor has ({', '.join(driving)}); "
             "pass moments of data of the same plant, episodes.driven() where it knows disturbances"
         )
-    if (total.lifting, total.dt, total.bilinear) != (predictor.lifting, predictor.dt, bilinear):
+    mine = (predictor.lifting, predictor.embedding, predictor.dt, bilinear)
+    if (total.lifting, total.embedding, total.dt, total.bilinear) != mine:
+        how = ", embedding=predictor.embedding" if predictor.embedding else ""
+        how += ", bilinear=True" if bilinear else ""
         raise DataError(
-            "the moments and the predictor differ in lifting or dt, or one is bilinear; "
-            f"pass moments(episodes, predictor.lifting{', bilinear=True' if bilinear else ''})"
+            "the moments and the predictor differ in lifting, embedding or dt, or one is bilinear; "
+            f"pass moments(episodes, predictor.lifting{how})"
         )
     values, V = eigen(np.ascontiguousarray(predictor.A.T))
     P, T, _ = both_sides(total)

@@ -137,8 +137,9 @@ def trust(
 def _moments(predictor: Predictor, episodes: Episodes) -> Moments:
     """Return the moments of these episodes in the predictor's lifting, by QR: residuals down to rounding."""
     if isinstance(predictor, BilinearPredictor):
-        return moments(episodes, predictor.lifting, route="qr", bilinear=True)
-    return moments(episodes.driven() if predictor.nw else episodes, predictor.lifting, route="qr")
+        return moments(episodes, predictor.lifting, embedding=predictor.embedding, route="qr", bilinear=True)
+    driven = episodes.driven() if predictor.nw else episodes
+    return moments(driven, predictor.lifting, embedding=predictor.embedding, route="qr")
 
 
 def _hold(predictor: Predictor) -> LinearPredictor:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.predict.score import Predictor, forecast_errors, last_starts, score
+from koopmpc.predict.score import Predictor, comparable, forecast_errors, score
 from koopmpc.values import Value
 
 _SCALED = 0.25  # share of the episodes that the scale is taken from
@@ -101,9 +101,9 @@ class ConformalBand(Value):
     ) -> Float[np.ndarray, " n"]:
         """Return max over h and states of |x − x̂| / s, one forecast an episode."""
         horizon, source = len(self.scale), checks.generator(rng)
-        last = np.array(last_starts(predictor, episodes, horizon))
-        starts = list(source.integers(0, last + 1)[:, None])
-        blocks = forecast_errors(predictor, episodes, starts, horizon, relift=self.relift)
+        points = comparable(predictor, episodes, horizon)
+        starts = list(source.integers(0, [len(episode) - horizon + 1 for episode in points])[:, None])
+        blocks = forecast_errors(predictor, points, starts, horizon, relift=self.relift)
         with np.errstate(over="ignore"):  # an error far beyond a tiny scale
             return np.concatenate(
                 [np.max(np.abs(gap) / self.scale[:, None], axis=(0, 2)) for gap, _ in blocks]

@@ -75,7 +75,8 @@ def score(
     predictor
         Linear or bilinear, of the same states, inputs and dt.
     episodes
-        Held out of the fit; each at least `horizon` steps long.
+        Held out of the fit; each at least `horizon` steps long, and those of the embedding where there is one, which
+        come before the first start.
     horizon
         Steps ahead; that of the controller is the one to choose a lifting by.
     stride
@@ -91,15 +92,15 @@ def score(
         The episodes have other states or inputs.
     """
     horizon, stride = checks.count(horizon, "horizon"), checks.count(stride, "stride")
-    last = last_starts(predictor, episodes, horizon)
-    every = [np.arange(0, k + 1, stride) for k in last]
+    points = comparable(predictor, episodes, horizon)
+    every = [np.arange(0, len(episode) - horizon + 1, stride) for episode in points]
     starts = sum(map(len, every))
     nx = predictor.nx
     apart = -(-starts // max(_LEAST, _KEPT // (horizon * nx)))  # each apart-th start counts for the quantiles
     kept = np.empty((horizon, nx, -(-starts // apart)))
     error, size = np.zeros((horizon, nx)), np.zeros((horizon, nx))
     done = 0
-    for gap, truth in forecast_errors(predictor, episodes, every, horizon, relift=relift):
+    for gap, truth in forecast_errors(predictor, points, every, horizon, relift=relift):
         with np.errstate(over="ignore"):  # an infinite sum is what a diverging prediction has
             error += np.einsum("hmx,hmx->hx", gap, gap)
         size += np.einsum("hmx,hmx->hx", truth, truth)
@@ -118,32 +119,42 @@ def score(
     return Score(rmse, relative, starts, predictor.states, low, median, high)
 
 
-def last_starts(predictor: Predictor, episodes: Episodes, horizon: int) -> list[int]:
-    """Return for each episode the last k from which `horizon` steps can be compared; raise where there is none."""
+def comparable(predictor: Predictor, episodes: Episodes, horizon: int) -> Episodes:
+    """Return the episodes of what ψ acts on; raise where one is too short for `horizon` steps from any start."""
     same_names(predictor, episodes)
-    for i, episode in enumerate(episodes):
+    points = predictor.embed(episodes)
+    for i, episode in enumerate(points):
         if len(episode) < horizon:
+            past = (
+                ""
+                if predictor.embedding is None
+                else f" behind the {predictor.embedding.steps} of the embedding"
+            )
             raise DataError(
-                f"episode {i} has {len(episode)} steps, the horizon is {horizon}; "
+                f"episode {i} has {len(episode)} steps{past}, the horizon is {horizon}; "
                 "shorten the horizon or drop the episode"
             )
-    return [len(episode) - horizon for episode in episodes]
+    return points
 
 
 def forecast_errors(
     predictor: Predictor,
-    episodes: Episodes,
+    points: Episodes,
     starts: Sequence[Int[np.ndarray, "_"]],
     horizon: int,
     *,
     relift: bool = False,
 ) -> Iterator[tuple[Float[np.ndarray, "horizon m nx"], Float[np.ndarray, "horizon m nx"]]]:
-    """Yield x_{k+h} − x̂_{k+h} and x_{k+h} for the sorted starts k of each episode in order, block by block."""
+    """Yield x_{k+h} − x̂_{k+h} and x_{k+h} for the sorted starts k of each episode in order, block by block.
+
+    The episodes are those that `comparable` returns.
+    """
     A, C = predictor.A.T, predictor.C.T
     bilinear = isinstance(predictor, BilinearPredictor)
     G = predictor.B.T if bilinear else np.hstack([predictor.B, predictor.E]).T
-    for X, V, rows in _blocks(episodes, starts, horizon, 0 if bilinear else predictor.nw):
-        z = predictor.lift(X[rows])
+    for X, V, rows in _blocks(points, starts, horizon, 0 if bilinear else predictor.nw):
+        point = X[rows]
+        z = predictor.lifting(point)
         truth = np.empty((horizon, len(rows), predictor.nx))
         gap = np.empty_like(truth)
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging prediction is an infinite error
@@ -153,10 +164,14 @@ def forecast_errors(
                 if bilinear:
                     for i, N in enumerate(predictor.N):
                         z_next += v[:, i : i + 1] * (z @ N.T)
-                truth[h] = X[rows + h + 1]
+                truth[h] = X[rows + h + 1, : predictor.nx]
                 x = z_next @ C
                 np.subtract(truth[h], x, out=gap[h])
-                z = predictor.lifting(x) if relift else z_next
+                if relift:
+                    past = predictor.embedding
+                    point = x if past is None else past.shifted(point, v[:, : predictor.nu], x)
+                    z_next = predictor.lifting(point)
+                z = z_next
         gap[np.isnan(gap)] = np.inf
         yield gap, truth
 

@@ -123,7 +123,7 @@ def test_a_defective_matrix_has_residuals_all_the_same() -> None:
 def test_moments_of_something_else_are_refused() -> None:
     data = one_step_pairs(pendulum, 2, 1, 60)
     model = edmd(data, State())
-    with pytest.raises(DataError, match="differ in lifting or dt"):
+    with pytest.raises(DataError, match="differ in lifting, embedding or dt"):
         residual_dmd(model, moments(data, State() + Constant()))
     with pytest.raises(ShapeError, match=r"the moments have inputs \(\), the predictor has \(u0\)"):
         residual_dmd(model, moments(one_step_pairs(pendulum, 2, 0, 60), State()))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from koopmpc.data.collect import Uniform, collect
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
 from koopmpc.errors import DataError, FitWarning, ShapeError
@@ -129,6 +130,27 @@ def test_bilinear_and_autonomous_models(data) -> None:
     assert report.persistency is None
     assert report.feedback is None
     assert "exciting" not in str(report)
+
+
+def test_a_model_that_remembers_sees_what_is_not_measured() -> None:
+    whole = swings(120, 6)
+    angles = Episodes(
+        [Episode(X=e.X[:, :1], U=e.U) for e in whole], 0.05, ("theta [rad]",), ("torque [N m]",)
+    )
+    train, held_out = angles.split(0.5)
+    blind = trust(edmd(train, State()), held_out, HORIZON, train=train)
+    past = trust(edmd(train, State() + Constant(), embedding=Delay(2)), held_out, HORIZON, train=train)
+    assert not blind.trusted
+    assert past.trusted
+    assert past.invariance.names == (
+        "theta [rad]",
+        "torque[k-1] [N m]",
+        "theta[k-1] [rad]",
+        *past.invariance.names[3:],
+    )
+    assert str(past).startswith("TRUST")
+    bilinear = bilinear_edmd(train, State() + Constant(), embedding=Delay(2))
+    assert trust(bilinear, held_out, HORIZON).trusted
 
 
 def test_feedback_and_weak_inputs_ask_for_care(data) -> None:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.constant import Constant
@@ -102,6 +103,35 @@ def test_relifting_a_linear_predictor_scores_its_step_map() -> None:
     errors = brute_errors(lambda x, U: step.rollout(x, U)[1:], data, 5)
     result = score(model, data, 5, relift=True)
     assert np.allclose(result.rmse, np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("inputs", [True, False])
+def test_an_embedding_is_scored_from_the_first_start_with_a_past(inputs: bool) -> None:
+    rng = np.random.default_rng(5)
+    data = runs(random_predictor(5, 2, 1), [9, 12], 5, noise=0.1)
+    past = Delay(2, inputs=inputs).bind(data.states, data.inputs)
+    lifting = (State() + Constant()).bind(past.names)
+    A, B, C = (
+        0.2 * rng.standard_normal(size)
+        for size in ((lifting.nz, lifting.nz), (lifting.nz, 1), (2, lifting.nz))
+    )
+    model = LinearPredictor(A, B, C, lifting, data.dt, data.states, data.inputs, embedding=past)
+    step = model.step_map()
+    for relift in (False, True):
+        errors = []
+        for e in data:
+            for k in range(2, len(e) - 3 + 1):
+                before = Episode(X=e.X[: k + 1], U=e.U[:k])
+                zeta = past.point(e.X[k], before)
+                x = step.rollout(zeta, e.U[k : k + 3]) if relift else model.rollout(zeta, e.U[k : k + 3])
+                errors.append(e.X[k + 1 : k + 4] - x[1:, :2])
+        result = score(model, data, 3, relift=relift)
+        assert result.starts == len(errors) == 13
+        assert np.allclose(result.rmse, np.sqrt(np.mean(np.square(errors), axis=0)), rtol=1e-10)
+    with pytest.raises(
+        DataError, match="episode 0 has 7 steps behind the 2 of the embedding, the horizon is 8"
+    ):
+        score(model, data, 8)
 
 
 def test_of_many_starts_evenly_spread_ones_give_the_quantiles(monkeypatch: pytest.MonkeyPatch) -> None:
