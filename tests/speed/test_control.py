@@ -69,86 +69,153 @@ def test_step_with_nothing_active(benchmark, model):
 class Kept:
     """A solver that writes down what it is asked, beside the bare solver of the same QP."""
 
-    def __init__(self, solve, asked):
-        self.solver, self.asked, self.limits = solve._solver, asked, None
-        self.other = bare(solve.program.qp, self.solver._settings)
+    goes_on = False
+
+    def __init__(self, solve, name, asked):
+        self.solver, self.qp, self.asked = solve._solver, solve.program.qp, asked
+        self.other = BARE[name](self.qp, self.solver._settings)
 
     def reset(self):
         self.solver.reset()
 
-    def update(self, low, high):
-        self.limits = np.maximum(low, -1e30), np.minimum(high, 1e30)
-        self.solver.update(low, high)
+    def shift(self, by):
+        self.limits = self.qp.low - by, self.qp.high - by
+        self.solver.shift(by)
 
     def solve(self, v, y, time_limit=None):
         solution = self.solver.solve(v, y, time_limit)
-        self.asked.append((self.other, *self.limits, v.copy(), y.copy(), solution.iterations))
+        low, high = np.maximum(self.limits[0], -1e30), np.minimum(self.limits[1], 1e30)
+        self.asked.append((self.other, low, high, v.copy(), y.copy(), solution.iterations))
         return solution
 
 
-def bare(qp, settings):
-    import scipy.sparse
-
-    solver = osqp.OSQP()
-    P = scipy.sparse.csc_matrix(np.triu(qp.P))
+def bare_osqp(qp, settings):
+    solver, (P, A) = osqp.OSQP(), qp.sparse()
     low, high = np.maximum(qp.low, -1e30), np.minimum(qp.high, 1e30)
-    solver.setup(P, qp.q, scipy.sparse.csc_matrix(qp.A), low, high, verbose=False, **{**DEFAULTS, **settings})
-    return solver
+    solver.setup(P, qp.q, A, low, high, verbose=False, **{**DEFAULTS, **settings})
+
+    def step(low, high, v, y):
+        solver.update(l=low, u=high)
+        solver.warm_start(x=v, y=y)
+        return solver.solve(raise_error=False).info.iter
+
+    return step
 
 
-def bare_step(solver, low, high, v, y):
-    solver.update(l=low, u=high)
-    solver.warm_start(x=v, y=y)
-    return solver.solve(raise_error=False)
+def bare_daqp(qp, settings):
+    daqp = pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
+    solver = daqp.Model()
+    solver.setup(qp.P, qp.q, qp.A, np.minimum(qp.high, 1e30), np.maximum(qp.low, -1e30))
+
+    def step(low, high, v, y):
+        solver.update(bupper=high, blower=low)
+        return solver.solve()[3]["iterations"]
+
+    return step
+
+
+BARE = {"osqp": bare_osqp, "daqp": bare_daqp}
+
+
+def beside_the_bare_solver(mpc, name, states, rounds):
+    """Return seconds of whole steps, of the bare solver on their QPs, one after the other, and the iterations."""
+    asked, reference = [], np.zeros(len(states[0]))
+    solves = [s for s in (mpc._constrained._hard, mpc._constrained._soft) if s is not None]
+    figures = []
+    for _ in range(rounds):
+        kept = [Kept(solve, name, asked) for solve in solves]  # the bare solvers start afresh, too
+        own = [solve._solver for solve in solves]
+        for solve, stand_in in zip(solves, kept, strict=True):
+            solve._solver = stand_in
+        mpc.reset()
+        questions = []
+        for x in states:
+            asked.clear()
+            mpc(x, reference)
+            questions.append(list(asked))
+        for solve, solver in zip(solves, own, strict=True):
+            solve._solver = solver
+        mpc.reset()
+        for x, asks in zip(states, questions, strict=True):
+            t, move = timed(mpc, x, reference)
+            if not asks or move.status not in (km.Status.OPTIMAL, km.Status.SOFTENED):
+                for ask in asks:
+                    ask[0](*ask[1:5])
+                continue
+            spent = 0.0
+            for other, *question, count in asks:
+                s, iterations = timed(other, *question)
+                spent += s
+                assert name == "daqp" or iterations == count
+            figures.append((t, spent, move.iterations))
+    return np.array(figures).T
+
+
+def compared(benchmark, ours, theirs, iterations):
+    quantiles = {
+        f"{who}{what} µs": 1e6 * float(np.quantile(times, q))
+        for who, times in (("", ours), ("bare ", theirs))
+        for what, q in (("median", 0.5), ("p99", 0.99))
+    }
+    report(
+        benchmark,
+        steps=len(ours),
+        **quantiles,
+        **{
+            "ratio of medians": float(np.median(ours) / np.median(theirs)),
+            "median of ratios": float(np.median(ours / theirs)),
+            "median iterations": float(np.median(iterations)),
+        },
+    )
 
 
 @pytest.mark.parametrize("limits", ["inputs", "inputs and soft states"])
 def test_step_with_limits_active(benchmark, model, limits):
     """The same QPs, one after the other, by the controller and by OSQP's own Python interface."""
     plant = pendulum()
-    box = (
-        km.Limits(-10, 10)
-        if limits == "inputs"
-        else km.Limits(-10, 10, x_min=[-np.inf, -1.5], x_max=[np.inf, 1.5])
-    )
-    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), box, 40)
-    reference, asked, x, states = np.zeros(2), [], np.array([1.4, 0.0]), []
-    solves = [s for s in (mpc._constrained._hard, mpc._constrained._soft) if s is not None]
-    for solve in solves:
-        solve._solver = Kept(solve, asked)
+    ends = {} if limits == "inputs" else {"x_min": [-np.inf, -1.5], "x_max": [np.inf, 1.5]}
+    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(-10, 10, **ends), 40)
+    x, states = np.array([1.4, 0.0]), []
     for _ in range(300):
-        asked.clear()
-        move = mpc(x, reference)
-        states.append((x, list(asked)))
-        x = plant(x, move.u)
+        states.append(x)
+        x = plant(x, mpc(x, np.zeros(2)).u)
         x[0] = np.mod(x[0] + np.pi, 2 * np.pi) - np.pi
-    for solve in solves:
-        solve._solver = solve._solver.solver
-    mpc.reset()
-    ours, theirs, iterations = [], [], []
-    for x, questions in states:
-        t, move = timed(mpc, x, reference)
-        if not questions:
-            continue
-        spent = 0.0
-        for other, low, high, v, y, count in questions:
-            s, result = timed(bare_step, other, low, high, v, y)
-            assert result.info.iter == count
-            spent += s
-        assert move.iterations == sum(question[-1] for question in questions)
-        iterations.append(move.iterations)
-        ours.append(t)
-        theirs.append(spent)
-    assert len(ours) > 100
-    benchmark(mpc, states[1][0], reference)
+    found = beside_the_bare_solver(mpc, "osqp", states, 1)
+    assert len(found[0]) > 100
+    benchmark(mpc, states[1], np.zeros(2))
+    compared(benchmark, *found)
+
+
+CHAIN = np.array([[1, 0.1, 0, 0], [0, 1.02, 0.1, 0], [0, 0, 0.95, 0.1], [0, 0, 0, 0.9]])
+
+
+@pytest.mark.parametrize(("N", "outputs"), [(20, 1), (50, 2)], ids=["20x40", "50x150"])
+@pytest.mark.parametrize("name", ["osqp", "daqp"])
+def test_whole_step_against_the_bare_solver(benchmark, name, N, outputs):
+    """N inputs and `outputs` hard states a step, 12 loops of 40 steps; and the same step where nothing is active."""
+    pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
+    B, end = np.array([[0.0], [0.05], [0.1], [0.1]]), np.array([6.0, 1.5, np.inf, np.inf])
+    end[outputs:] = np.inf
+    model = km.LinearPredictor(CHAIN, B, np.eye(4), km.State(), 0.1, tuple("abcd"), ("u",))
+    limits = km.Limits(-1, 1, x_min=-end, x_max=end, slack=None)
+    mpc, states = km.KoopmanMPC(model, km.Cost(np.ones(4), 0.1), limits, N, solver=name), []
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        x = rng.normal(size=4) * [2, 0.5, 0.5, 0.5]
+        for _ in range(40):
+            states.append(x)
+            x = CHAIN @ x + B @ mpc(x, np.zeros(4)).u
+    rows = len(mpc._constrained._hard.program.low)
+    assert rows == N * (1 + outputs)
+    ours, theirs, iterations = beside_the_bare_solver(mpc, name, states, 5)
+    free = [timed(mpc, np.array([0.01, 0, 0, 0]), np.zeros(4))[0] for _ in range(2000)]
+    benchmark(mpc, states[0], np.zeros(4))
+    compared(benchmark, ours, theirs, iterations)
     report(
         benchmark,
         **{
-            "median µs": 1e6 * float(np.median(ours)),
-            "bare median µs": 1e6 * float(np.median(theirs)),
-            "ratio of medians": float(np.median(ours) / np.median(theirs)),
-            "median of ratios": float(np.median(np.divide(ours, theirs))),
-            "median iterations": float(np.median(iterations)),
+            "free median µs": 1e6 * float(np.median(free)),
+            "free to bare": float(np.median(free) / np.median(theirs)),
         },
     )
 
