@@ -15,12 +15,16 @@ from koopmpc.predict.score import Score
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_FAR = 8.0  # times the errors of the best model that are shown of the others
+
 
 @styled
 def plot_error(
     scores: Score | Mapping[str, Score], *, states: Chosen | None = None, width: Width = "one column"
 ) -> "Figure":
     """Draw the root-mean-square error and the 5 to 95 % band of the errors against the steps ahead, a panel a state.
+
+    A model whose errors are more than eight times those of the best leaves the picture.
 
     Parameters
     ----------
@@ -38,6 +42,8 @@ def plot_error(
     DataError
         There is no score; there are too many states for one figure.
     """
+    from matplotlib.ticker import MaxNLocator
+
     named = {"": scores} if isinstance(scores, Score) else dict(scores)
     if not named:
         raise DataError("there is no score; pass one, or several by name")
@@ -56,14 +62,36 @@ def plot_error(
         for j, (name, score) in enumerate(named.items()):
             _draw(panel, score, i, j, name)
         panel.set(ylabel=f"error of {first.states[i]}", xlim=(1, max(s.horizon for s in named.values())))
+        panel.set_ylim(*_room([_extent(score, i) for score in named.values()]))
     for empty in axes.flat[len(chosen) :]:
         empty.remove()
     for panel in axes.flat[max(len(chosen) - columns, 0) : len(chosen)]:
         panel.set_xlabel("steps ahead")
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
         panel.tick_params(labelbottom=True)
+    most = 2 if width == "one column" else 4  # models beside one another, each a column of its own
     handles, labels = axes.flat[0].get_legend_handles_labels()
-    made.legend(handles, labels, loc="outside upper center", ncols=2)
+    made.legend(
+        handles, labels, loc="outside upper center", ncols=2 if len(named) == 1 else min(len(named), most)
+    )
     return made
+
+
+def _extent(score: Score, i: int) -> tuple[float, float]:
+    """Return how far below and above 0 the finite errors of a state reach."""
+    rows = np.concatenate([score.low[:, i], score.high[:, i], score.rmse[:, i]])
+    finite = rows[np.isfinite(rows)]
+    return float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
+
+
+def _room(extents: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return an axis for all of the best model and for others not far beyond it."""
+    best = min(high - low for low, high in extents)
+    widest = _FAR * best if best > 0 else np.inf
+    low, high = min(low for low, _ in extents), max(high for _, high in extents)
+    low, high = max(low, -widest / 2), min(high, widest / 2)
+    margin = 0.05 * ((high - low) or 1.0)
+    return low - margin, high + margin
 
 
 def _draw(axes: Any, score: Score, i: int, j: int, name: str) -> None:

@@ -146,3 +146,13 @@ def test_a_model_with_a_memory_forecasts_from_the_first_known_past() -> None:
         assert curve(made.axes[0], "prediction")[1] == pytest.approx(data[0].X[4:25, 0], abs=1e-6)
     axes = plot_eigenfunctions(model, 0, ("angle", 2), data, points=5).axes[0]
     assert axes.get_ylabel() == "angle[k-1] [rad]"
+
+
+def test_a_bad_model_does_not_hide_the_good_one() -> None:
+    data = episodes(noise=0.05)
+    good = score(turning(), data, 10)
+    for bad in (turning(3.0), turning(1e200)):
+        for axes, rmse in zip(
+            plot_error({"good": good, "bad": score(bad, data, 10)}).axes, good.rmse.T, strict=True
+        ):
+            assert rmse.max() < axes.get_ylim()[1] < 100 * rmse.max()
