@@ -7,6 +7,8 @@ from jaxtyping import Float, Int
 
 from koopmpc.identify.ridge import Ridge, cross_validated
 
+_CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
+
 
 @dataclass(frozen=True, eq=False)
 class Rows:
@@ -88,7 +90,11 @@ def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
     """Return rank and condition number of the columns P of `rows`, scaled to unit norm; inf if dependent."""
     if P.shape[1] == 0:
         return 0, 1.0
-    s = np.linalg.svd(unit(P), compute_uv=False)
+    columns = unit(P)
+    squares = np.linalg.eigvalsh(columns.T @ columns)
+    if squares[0] > _CLEAR * squares[-1]:
+        return P.shape[1], float(np.sqrt(squares[-1] / squares[0]))
+    s = np.linalg.svd(columns, compute_uv=False)
     rank = int(np.sum(s > cutoff(rows) * s[0]))
     return rank, float(s[0] / s[-1]) if rank == P.shape[1] else np.inf
 

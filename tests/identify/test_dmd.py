@@ -70,9 +70,9 @@ def test_tall_data_without_a_square_array_of_the_states() -> None:
 
 @pytest.mark.parametrize("with_input", [False, True])
 def test_the_small_side_and_the_moments_agree(with_input: bool) -> None:
-    # 12 pairs of 8 states go through moments; the same turned into 13 states do not
+    # 20 pairs of 8 states go through moments; the same turned into 13 states do not
     rng = np.random.default_rng(0)
-    data = random_episodes(0, [6, 6], 8, 1 if with_input else 0)
+    data = random_episodes(0, [10, 10], 8, 1 if with_input else 0)
     Q = np.linalg.qr(rng.standard_normal((13, 8)))[0]
     wide = Episodes([Episode(X=e.X @ Q.T, U=e.U) for e in data], 0.1)
     fit = dmdc if with_input else dmd
