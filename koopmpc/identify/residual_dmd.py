@@ -95,13 +95,15 @@ def residual_dmd(predictor: Predictor, total: Moments, *, tolerance: float = TOL
         )
     values, V = eigen(np.ascontiguousarray(predictor.A.T))
     P, T, _ = both_sides(total)
-    gap = (T - P @ _one_step(predictor, total)) @ V
+    with np.errstate(over="ignore", invalid="ignore"):
+        gap = _norms((T - P @ _one_step(predictor, total)) @ V)
+    gap[np.isnan(gap)] = np.inf  # of an A beyond the finite numbers
     size = _norms(P[:, : total.nz] @ V)
     floor = np.finfo(float).eps * _norms(
         np.abs(P[:, : total.nz]) @ np.abs(V)
     )  # below it φ is 0 but for rounding
     live = size > floor
-    residuals = np.divide(_norms(gap), size, out=np.full(len(size), np.inf), where=live)
+    residuals = np.divide(gap, size, out=np.full(len(size), np.inf), where=live)
     return ResidualDMD(values, residuals, tolerance, total.samples)
 
 

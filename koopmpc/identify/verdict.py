@@ -67,7 +67,8 @@ def _spectrum(evidence: Evidence) -> list[Finding]:
     bad = of.spurious
     if not bad.any():
         return []
-    growth = np.abs(of.eigenvalues) ** evidence.score.horizon
+    with np.errstate(over="ignore"):
+        growth = np.abs(of.eigenvalues) ** evidence.score.horizon
     growing = bad & (growth > _GROWS)
     worst = int(np.argmax(np.where(growing, growth, 0.0) if growing.any() else of.residuals))
     told = (
@@ -75,7 +76,8 @@ def _spectrum(evidence: Evidence) -> list[Finding]:
     )
     says = f"{int(bad.sum())} of {len(bad)} eigenpairs are spurious (residual above {percent(of.tolerance)} a step)"
     if growing.any():
-        says += f", and {int(growing.sum())} of them grow: {told} by {growth[worst]:.2g} over the horizon"
+        n = int(growing.sum())
+        says += f", and {n} of them grow{'s' * (n == 1)}: {told} by {growth[worst]:.2g} over the horizon"
         return [Finding(False, says, "drop observables, raise the ridge, or truncate the rank")]
     do = "read no modes or frequencies from these; predictions may still be good"
     return [Finding(False, f"{says}, the worst {told}", do)]
@@ -153,7 +155,7 @@ def _band(evidence: Evidence) -> list[Finding]:
     if np.isfinite(band.quantile):
         return []
     if band.episodes >= band.needed:
-        return [Finding(True, "predictions leave the finite numbers", "look at the spectrum of A")]
+        return [Finding(False, "forecasts leave the finite numbers", "look at the spectrum of A")]
     return [
         Finding(
             False,

@@ -20,6 +20,7 @@ from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.state import State
 from koopmpc.plant.step_map import discretize
+from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.score import score
 from koopmpc.predict.spectrum import linearity_error
 from koopmpc.values import from_data, to_data
@@ -197,6 +198,17 @@ def test_few_episodes_give_no_band_and_it_says_so(data) -> None:
     assert np.isinf(report.band.quantile)
     assert any("3 calibration episodes, at least 9 are needed" in f.says for f in report.findings)
     assert report.trusted
+
+
+def test_a_model_that_diverges_gets_a_report_too(data) -> None:
+    train, held_out = data
+    good = edmd(train, State())
+    wild = LinearPredictor(np.diag([1e200, 1e3]), good.B, good.C, State(), good.dt, good.states, good.inputs)
+    report = trust(wild, held_out, HORIZON, train=train)
+    assert report.steps == 0
+    assert str(report).startswith("DO NOT TRUST, not even for one step (0.05 s)")
+    assert any("leave the finite numbers" in finding.says for finding in report.findings)
+    assert any("2 of them grow" in finding.says for finding in report.findings)
 
 
 def test_it_is_a_value_of_plain_data(data) -> None:
