@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
+from scipy.linalg.blas import dgemv
 
 from koopmpc import checks
 from koopmpc.data.delay import Delay
@@ -126,12 +128,12 @@ class LinearPredictor(Predictor):
         start = self.start(x0, history)
         Z = np.empty((len(inputs) + 1, self.nz))
         Z[0] = self.lifting(start)
-        forced = inputs @ self.B.T
+        Z[1:] = inputs @ self.B.T
         if W is not None:
-            forced += checks.array(W, "W", (len(inputs), self.nw)) @ self.E.T
-        for k in range(len(inputs)):
-            np.dot(self.A, Z[k], out=Z[k + 1])
-            Z[k + 1] += forced[k]
+            Z[1:] += checks.array(W, "W", (len(inputs), self.nw)) @ self.E.T
+        transposed, rows = self.A.T, list(Z)
+        for z, z_next in pairwise(rows):  # z_next += A z in place: BLAS has no faster way for one vector
+            dgemv(1.0, transposed, z, 1.0, z_next, 0, 1, 0, 1, 1, 1)
         X = Z @ self.C.T
         X[0] = start[: self.nx]
         return X
