@@ -100,30 +100,32 @@ class Window:
         """Take in a block of rows, the newest last."""
         absorb(self._R, rows)
         self._back.append(rows.copy())
-        while (len(self._front) + len(self._back) - 1) * self._block >= self._length:
-            self._turn()
-            self._front.popleft()
+        self._drop(0)
 
     def factor(self, pending: Table) -> tuple[Triangle, float]:
         """Return R and the number of rows in the window, the last of them those that wait."""
-        held = (len(self._front) + len(self._back)) * self._block + len(pending)
-        old = max(held - self._length, 0)  # rows that have left the window
-        if old > (len(self._front) + len(self._back)) * self._block:
-            R = empty(self._nd)
-            absorb(R, pending[-self._length :])
-            return R, float(self._length)
-        if old and not self._front:
+        pending = pending[-self._length :]
+        old = self._drop(len(pending))
+        if old:
             self._turn()
         R = self._R.copy(order="F")
-        if self._front:
-            skipped, part = divmod(old, self._block)
-            if part:
-                absorb(R, self._front[skipped][1][part:])
-                skipped += 1
-            if skipped < len(self._front):
-                absorb(R, self._front[skipped][0])
+        if old:
+            absorb(R, self._front[0][1][old:])
+        if len(self._front) > bool(old):
+            absorb(R, self._front[bool(old)][0])
         absorb(R, pending)
-        return R, float(held - old)
+        return R, float(self._held - old + len(pending))
+
+    @property
+    def _held(self) -> int:
+        return (len(self._front) + len(self._back)) * self._block
+
+    def _drop(self, waiting: int) -> int:
+        """Let blocks go that lie before the window; return how many rows of the oldest one do."""
+        while self._held + waiting - self._length >= self._block:
+            self._turn()
+            self._front.popleft()
+        return max(self._held + waiting - self._length, 0)
 
     def _turn(self) -> None:
         """Make the back the front where that is empty."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-_STEPS = 50_000
+_STEPS = 20_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -150,7 +150,8 @@ class OnlineEDMD:
         pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw)) if nw else None
         count = 1 if single else len(now)
         states = np.concatenate([now.reshape(count, nx), after.reshape(count, nx)])
-        Z = self._full(states)
+        with np.errstate(all="ignore"):  # what is not finite is named below
+            Z = self._full(states)
         if not np.isfinite(Z).all():
             bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
             raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")

@@ -27,7 +27,7 @@ def sparse_edmd(
     episodes: Episodes | Source,
     lifting: Lifting,
     *,
-    penalty: float,
+    penalty: float = 1e-3,
     over: Literal["observables", "entries"] = "observables",
     adaptive: bool = True,
 ) -> LinearPredictor:
@@ -51,8 +51,8 @@ def sparse_edmd(
     over
         "observables" (group LASSO: few columns of A) or "entries" (LASSO: few numbers in A and B).
     adaptive
-        Weights 1 / |coefficient of the plain fit|, which spare large ones and find the true set from enough data;
-        else 1.
+        Weights 1 / |coefficient of a ridge fit| (by generalised cross-validation), which spare large ones and find
+        the true set from enough data; else 1.
 
     Raises
     ------
@@ -116,14 +116,17 @@ def _closed(
     nz, worst = len(kept), 0.0
     size, unit = norms(rows.P), np.sqrt(np.sum(rows.T**2, axis=0) + rows.rest)
     P, T = rows.P / np.where(size > 0, size, 1.0), rows.T / np.where(unit > 0, unit, 1.0)
-    scaled = Rows(P, T, np.zeros(nz), rows.samples)
+    rest = rows.rest / np.where(unit > 0, unit, 1.0) ** 2
     while True:
         targets = np.flatnonzero(kept)
         rated = np.ones(P.shape[1], dtype=bool)  # the columns that pay
         if not entries:
             rated[nz:] = False
             rated[targets] = False
-        plain = np.abs(solve(Rows(P, T[:, targets], scaled.rest[targets], rows.samples)).K[rated])
+        if not rated.any():
+            return np.ones((P.shape[1], nz), dtype=bool), worst
+        task = Rows(P, T[:, targets], rest[targets], rows.samples)
+        plain = np.abs(solve(task, ridge="gcv").K[rated])
         if not entries:
             plain = np.sqrt(np.sum(plain**2, axis=1, keepdims=True)) * np.ones_like(plain)
         weights = penalty / np.maximum(plain, 1e-12) if adaptive else np.full_like(plain, penalty)

@@ -1,0 +1,148 @@
+"""LASSO and group LASSO: CVXPY's solution, the true observables out of a redundant dictionary, and what stays."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError
+from koopmpc.identify.edmd import edmd
+from koopmpc.identify.lasso import lasso
+from koopmpc.identify.sparse import sparse_edmd
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.picked import Picked
+from koopmpc.lifting.state import State
+from koopmpc.predict.linear import load_predictor
+from tests.bare import shown
+from tests.identify.plants import one_step_pairs
+
+SMALL = Constant() + State() + Monomials(4)
+DICTIONARY = SMALL + Fourier(2)  # collinear to 1e-13
+
+
+CODE = "show(lambda: km.sparse_edmd(km.Episodes([km.Episode(X=np.eye(4))], 0.1), km.State(), over='rows'))"
+
+
+def slow_manifold(noise: float = 0.0, seed: int = 0, count: int = 600) -> Episodes:
+    """x₀⁺ = 0.9 x₀, x₁⁺ = 0.5 x₁ + 0.3 x₀² + u: exact on x₀, x₁, x₀² (Brunton et al., PLoS ONE 11, 2016)."""
+    rng = np.random.default_rng(seed)
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        ahead = np.array([0.9 * x[0], 0.5 * x[1] + 0.3 * x[0] ** 2 + u[0]])
+        return ahead + noise * rng.standard_normal(2)
+
+    return one_step_pairs(step, 2, 1, count, seed)
+
+
+@given(st.integers(0, 999), st.booleans(), st.floats(0.01, 3.0), st.integers(1, 3))
+@settings(max_examples=6)
+def test_the_solver_equals_cvxpy(seed: int, grouped: bool, penalty: float, targets: int) -> None:
+    rng = np.random.default_rng(seed)
+    P, T = rng.standard_normal((30, 6)), rng.standard_normal((30, targets))
+    P[:, 5] = P[:, 0] + 0.1 * P[:, 5]
+    weights = penalty * rng.uniform(0.5, 2, (6, 1)) * np.ones((1, targets))
+    found = lasso(P.T @ P, P.T @ T, weights, grouped=grouped)
+    K = cp.Variable((6, targets))
+    price = (
+        sum(w * cp.norm(k) for w, k in zip(weights[:, 0], K, strict=True))
+        if grouped
+        else cp.sum(cp.multiply(weights, cp.abs(K)))
+    )
+    cp.Problem(cp.Minimize(0.5 * cp.sum_squares(T - P @ K) + price)).solve(
+        solver=cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9
+    )
+    assert np.allclose(found.K, K.value, rtol=0, atol=1e-3)
+    # the optimality conditions, which no solver's tolerance blurs
+    slope = P.T @ (T - P @ found.K)
+    if grouped:
+        size = np.linalg.norm(found.K, axis=1)
+        zero = size == 0
+        assert (np.linalg.norm(slope[zero], axis=1) <= weights[zero, 0] * (1 + 1e-9)).all()
+        pull = found.K[~zero] / size[~zero, None] * weights[~zero]
+    else:
+        zero = found.K == 0
+        assert (np.abs(slope[zero]) <= weights[zero] * (1 + 1e-9)).all()
+        pull = np.sign(found.K[~zero]) * weights[~zero]
+    assert np.allclose(slope[~zero], pull, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(("noise", "penalty"), [(0.0, 1e-6), (0.02, 1e-3), (0.1, 1e-2)])
+@pytest.mark.parametrize("over", ["observables", "entries"])
+def test_the_right_observables_are_found(noise: float, penalty: float, over: str) -> None:
+    dictionary = SMALL if noise else DICTIONARY
+    model = sparse_edmd(slow_manifold(noise, seed=1), dictionary, penalty=penalty, over=over)
+    assert model.lifting.names == ("1", "x0", "x1", "x0^2")
+    true = np.array([[1, 0, 0, 0], [0, 0.9, 0, 0], [0, 0, 0.5, 0.3], [noise**2, 0, 0, 0.81]])
+    assert np.allclose(model.A, true, rtol=0, atol=1e-9 + noise / 2)
+    assert np.allclose(model.B, [[0], [0], [1], [0]], rtol=0, atol=1e-9 + noise / 2)
+    assert np.array_equal(model.C, np.eye(4)[1:3])
+    dropped = model.report.changes[0]
+    whole = dictionary.bind(("x0", "x1")).nz
+    assert dropped.startswith(f"{whole - 4} of {whole} observables dropped: x0*x1, x1^2")
+    if noise == 0:
+        x0, U = np.array([0.7, -0.4]), np.linspace(-1, 1, 20)[:, None]
+        X = [x0]
+        for u in U:
+            X.append(np.array([0.9 * X[-1][0], 0.5 * X[-1][1] + 0.3 * X[-1][0] ** 2 + u[0]]))
+        assert np.allclose(model.rollout(x0, U), X, rtol=0, atol=1e-8)
+
+
+def test_entries_that_are_zero_are_exactly_zero() -> None:
+    model = sparse_edmd(slow_manifold(0.02, seed=1), SMALL, over="entries")
+    assert np.array_equal(model.A[1:] != 0, np.array([[0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]], bool))
+    assert np.array_equal(model.B[:, 0] != 0, [False, False, True, False])
+
+
+def test_least_squares_on_what_is_kept() -> None:
+    data = slow_manifold(0.02, seed=2)
+    model = sparse_edmd(data, SMALL)
+    refit = edmd(data, model.lifting)
+    assert np.allclose(model.A, refit.A, rtol=0, atol=1e-9)
+    assert np.allclose(model.B, refit.B, rtol=0, atol=1e-9)
+    assert np.allclose(model.report.residual, refit.report.residual, rtol=1e-6)
+
+
+def test_a_large_penalty_leaves_the_states_and_a_small_one_everything() -> None:
+    data = slow_manifold(0.02)
+    assert sparse_edmd(data, DICTIONARY, penalty=1e3).lifting.names == ("1", "x0", "x1")
+    every = State() + Monomials(2)
+    whole = sparse_edmd(data, every, penalty=1e-12, adaptive=False)
+    assert whole.lifting.names == every.bind(data.states).names
+    assert np.allclose(whole.A, edmd(data, every).A, rtol=0, atol=1e-9)
+
+
+def test_units_mean_nothing() -> None:
+    data = slow_manifold(0.02, seed=3)
+    units = np.array([1e-4, 1e4])
+    scaled = Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
+    a, b = (sparse_edmd(d, SMALL).lifting.names for d in (data, scaled))
+    assert a == b
+
+
+def test_the_chosen_lifting_is_data_and_the_same_function_twice(tmp_path) -> None:
+    model = sparse_edmd(slow_manifold(), DICTIONARY, penalty=1e-6)
+    model.save(tmp_path / "model.npz")
+    again = load_predictor(tmp_path / "model.npz")
+    assert again == model
+    X = np.random.default_rng(0).uniform(-1, 1, (7, 2))
+    whole = DICTIONARY.bind(("x0", "x1"))
+    places = [whole.names.index(name) for name in model.lifting.names]
+    assert np.allclose(again.lift(X), whole(X)[:, places], rtol=0, atol=1e-15)
+    assert np.allclose(
+        model.step_map()(X[0], [0.3]), [0.9 * X[0, 0], 0.5 * X[0, 1] + 0.3 * X[0, 0] ** 2 + 0.3]
+    )
+
+
+def test_bad_arguments() -> None:
+    assert shown(CODE) == ['DataError over is \'rows\'; pass "observables" or "entries"']
+    data = slow_manifold(count=30)
+    with pytest.raises(DataError, match="penalty is 0"):
+        sparse_edmd(data, DICTIONARY, penalty=0)
+    with pytest.raises(DataError, match="the lifting lacks the state 'x0'"):
+        sparse_edmd(data, Monomials(2), penalty=1)
+    with pytest.raises(DataError, match="which holds 9"):
+        Picked(State(), (9,)).bind(("a", "b"))
