@@ -9,6 +9,7 @@ Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. 
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
+from scipy.linalg import lstsq
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
@@ -18,6 +19,7 @@ from koopmpc.lifting.projected import Projected
 from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 
+_ROUNDING = float(np.finfo(float).eps)
 _ROWS = 4096  # states whose eigenfunctions are held at once
 
 
@@ -33,22 +35,29 @@ def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " 
 
 
 def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, " nz"]:
-    """Return b = Φ⁺ ψ(x), the share of each mode in the state x.
+    """Return b = Φ⁺ ψ(x), the share of each mode in the state x, or the best shares over a whole run.
 
     Φ holds the modes in the lifted coordinates, one a column: the exact modes of a rank-truncated fit, else
-    the eigenvectors of A.
+    the eigenvectors of A. Of a run it is b = argmin Σ_k ‖ψ(x_k) − Φ Λᵏ b‖², which noise in x_0 alone moves less.
 
     Parameters
     ----------
     predictor
         Its `modes` are the state's rows of Φ.
     x
-        (nx,)
+        (nx,), or (steps, nx): x_0, x_1, … of a run without input, one `dt` apart.
     """
-    state = checks.array(x, "x", (predictor.nx,))
+    states = checks.array(x, "x")
     modes, lifting = _lifted_modes(predictor)
-    z = lifting(state).astype(complex)
-    return np.linalg.lstsq(modes, z, rcond=None)[0]
+    if states.ndim == 1:
+        z = lifting(checks.array(states, "x", (predictor.nx,)))
+        return lstsq(modes, z.astype(complex), cond=_ROUNDING * max(modes.shape), lapack_driver="gelsy")[0]
+    Z = lifting(checks.array(states, "x", (None, predictor.nx)))
+    basis, small = np.linalg.qr(modes)  # what lies outside of Φ no b can reach
+    powers = np.power(predictor.eigenvalues, np.arange(len(Z))[:, None])
+    stacked = (small * powers[:, None, :]).reshape(-1, modes.shape[1])
+    seen = (Z @ basis.conj()).ravel()
+    return lstsq(stacked, seen, cond=_ROUNDING * max(stacked.shape), lapack_driver="gelsy")[0]
 
 
 def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> Float[np.ndarray, "steps nx"]:
@@ -59,7 +68,7 @@ def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> 
     predictor
         Its inputs are taken as 0.
     x0
-        (nx,), the state at t = 0.
+        (nx,), the state at t = 0; or (steps, nx), a run from t = 0 on, whose best amplitudes are taken.
     times
         (steps,) [s].
     """

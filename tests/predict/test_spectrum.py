@@ -91,6 +91,37 @@ def test_amplitudes_of_an_unreduced_model_are_its_eigenfunctions() -> None:
     assert np.allclose(amplitudes(model, [0.3, 0.4]), model.eigenfunctions([[0.3, 0.4]])[0])
 
 
+@given(st.integers(0, 99), st.sampled_from([None, 3]))
+def test_amplitudes_of_a_run_are_the_best_over_all_its_snapshots(seed: int, rank: int | None) -> None:
+    rng = np.random.default_rng(seed)
+    A = random_predictor(seed, 5, 0).A
+    X = [rng.standard_normal(5)]
+    for _ in range(12):
+        X.append(A @ X[-1])
+    X = np.array(X) + 0.05 * rng.standard_normal((13, 5))
+    model = dmd(Episodes([Episode(X=X)], 0.1), rank=rank)
+    powers = model.eigenvalues ** np.arange(13)[:, None]
+
+    def error(b: np.ndarray) -> float:
+        return float(np.sum(np.abs(X - (powers * b) @ model.modes.T) ** 2))
+
+    best = amplitudes(model, X)
+    least = error(best)
+    assert least <= error(amplitudes(model, X[0]))
+    assert all(
+        error(best + 1e-3 * (rng.standard_normal(b) + 1j * rng.standard_normal(b))) >= least
+        for b in [len(best)] * 10
+    )
+    ahead = reconstruct(model, X, 0.1 * np.arange(13))
+    assert np.sum((X - ahead) ** 2) == pytest.approx(least, rel=1e-6)
+
+
+def test_amplitudes_of_an_exact_run_are_those_of_its_start() -> None:
+    model = random_predictor(1, 4, 0)
+    X = model.rollout([1.0, -2, 0.5, 0.3], np.empty((10, 0)))
+    assert np.allclose(amplitudes(model, X), amplitudes(model, X[0]), atol=1e-10)
+
+
 def test_eigenfunctions_of_an_exact_model_evolve_linearly() -> None:
     data = quadratic_data()
     lifting = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
