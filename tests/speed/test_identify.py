@@ -1,15 +1,22 @@
-"""EDMD against the bare accumulation of its Gram matrix, and its memory."""
+"""Moments against the bare accumulation of their Gram matrix; their memory; few episodes and many; two workers."""
 
+import gc
 import time
 import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.folder import Files
+from koopmpc.data.stream import Stream
 from koopmpc.identify.chunks import ROWS
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.moments import moments
+from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.state import State
 
 pytestmark = pytest.mark.speed
@@ -30,15 +37,20 @@ def data(snapshots: int, steps: int = 5000) -> Episodes:
 
 def bare(chunks: list[np.ndarray], snapshots: int) -> float:
     """Return the seconds of Σ DᵀD over rows [ψ u ψ⁺] that are lifted already and laid out side by side."""
-    start = time.perf_counter()
+    start = time.process_time()
     total = np.zeros((2 * NX + 1, 2 * NX + 1))
     for k in range(snapshots // ROWS):
         D = chunks[k % len(chunks)]
         total += D.T @ D
-    return time.perf_counter() - start
+    return time.process_time() - start
 
 
-def test_edmd_of_a_million_snapshots(benchmark) -> None:
+def told(benchmark) -> None:
+    print(dict(benchmark.extra_info))  # noqa: T201
+
+
+@pytest.mark.parametrize(("route", "limit"), [("gram", 1.5), ("qr", 10)])
+def test_moments_of_a_million_snapshots(benchmark, route: str, limit: float) -> None:
     snapshots = 1_000_000
     episodes = data(snapshots)
     rng = np.random.default_rng(1)
@@ -46,18 +58,21 @@ def test_edmd_of_a_million_snapshots(benchmark) -> None:
     pairs: list[tuple[float, float]] = []
 
     def both() -> None:
-        start = time.perf_counter()
-        edmd(episodes, State())
-        pairs.append((time.perf_counter() - start, bare(chunks, snapshots)))
+        start = time.process_time()
+        if route == "gram":
+            edmd(episodes, State())  # which chooses Gram here
+        else:
+            moments(episodes, State(), route="qr")
+        pairs.append((time.process_time() - start, bare(chunks, snapshots)))
 
     benchmark.pedantic(both, rounds=5, warmup_rounds=1)
     ours, gram = np.median(pairs, axis=0)
     benchmark.extra_info |= {
-        "edmd [s]": round(float(ours), 3),
+        f"{'edmd' if route == 'gram' else 'qr'} [s]": round(float(ours), 3),
         "bare Gram [s]": round(float(gram), 3),
-        "ratio to bare Gram (≤ 2)": round(float(np.median([a / b for a, b in pairs])), 2),
+        f"ratio to bare Gram (≤ {limit:g})": round(float(np.median([a / b for a, b in pairs])), 2),
     }
-    print(dict(benchmark.extra_info))  # noqa: T201
+    told(benchmark)
 
 
 @pytest.mark.parametrize("route", ["gram", "qr"])
@@ -65,15 +80,106 @@ def test_memory_does_not_grow_with_the_snapshots(benchmark, route: str) -> None:
     peaks: dict[str, float] = {}
 
     def measure() -> None:
-        for snapshots in (20_000, 200_000):
+        for snapshots in (20_000, 1_000_000):
             episodes = data(snapshots)
             tracemalloc.start()
             moments(episodes, State(), route=route)
-            peaks[f"peak at {snapshots} [MB]"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 2)
+            peaks[f"extra at {snapshots} [MB]"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 2)
             tracemalloc.stop()
 
     benchmark.pedantic(measure, rounds=1)
     benchmark.extra_info |= peaks
-    print(dict(benchmark.extra_info))  # noqa: T201
+    told(benchmark)
     small, large = peaks.values()
     assert large < 1.1 * small
+    assert large < 64
+
+
+@pytest.mark.parametrize("route", ["gram", "qr"])
+def test_a_stream_of_ten_million_rows_needs_no_memory_of_its_own(benchmark, route: str) -> None:
+    rng = np.random.default_rng(0)
+    one = Episodes([Episode(X=rng.standard_normal((20_001, 3))) for _ in range(5)], 0.1)
+    peaks: dict[str, float] = {}
+
+    def measure() -> None:
+        for sets in (10, 100):
+            gc.collect()
+            tracemalloc.start()
+            moments(Stream(one for _ in range(sets)), State(), route=route)
+            peaks[f"extra at {sets * 100_000} [MB]"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 2)
+            tracemalloc.stop()
+
+    benchmark.pedantic(measure, rounds=1)
+    benchmark.extra_info |= peaks
+    told(benchmark)
+    small, large = peaks.values()
+    assert large < 1.1 * small
+    assert large < 64
+
+
+def test_five_thousand_episodes_cost_what_a_hundred_do(benchmark) -> None:
+    rng = np.random.default_rng(0)
+    sets = {
+        count: Episodes(
+            [
+                Episode(
+                    X=rng.standard_normal((100_000 // count + 1, NX)),
+                    U=rng.standard_normal((100_000 // count, 1)),
+                )
+                for _ in range(count)
+            ],
+            0.1,
+        )
+        for count in (100, 1000, 5000)
+    }
+    seconds: dict[int, list[float]] = {count: [] for count in sets}
+
+    def every() -> None:
+        for count, episodes in sets.items():
+            start = time.process_time()
+            edmd(episodes, State())
+            seconds[count].append(time.process_time() - start)
+
+    benchmark.pedantic(every, rounds=7, warmup_rounds=1)
+    best = {count: min(own) for count, own in seconds.items()}
+    benchmark.extra_info |= {f"{count} episodes [s]": round(own, 3) for count, own in best.items()}
+    benchmark.extra_info["5000 episodes / 100"] = round(best[5000] / best[100], 2)
+    told(benchmark)
+
+
+@contextmanager
+def cluster(workers: int) -> Iterator[str]:
+    from distributed import LocalCluster
+
+    ports = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(n_workers=workers, threads_per_worker=1, host="127.0.0.1", **ports) as running:
+        yield running.scheduler_address
+
+
+def test_two_dask_workers_against_one(benchmark, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(24):
+        episode = Episode(X=rng.standard_normal((20_001, 8)), U=rng.standard_normal((20_000, 1)))
+        Episodes([episode], 0.1).save(tmp_path / f"{i:02}.npz")
+    lifting = State() + Gaussian(rng.standard_normal((92, 8)), 2.0)
+    source, pairs = Files(tmp_path), []
+
+    with cluster(1) as one, cluster(2) as two:
+        where = ({"scheduler": one}, {"scheduler": two})
+
+        def both() -> None:
+            seconds: list[float] = []
+            for how in where:
+                start = time.perf_counter()
+                moments(source, lifting, route="gram", **how)
+                seconds.append(time.perf_counter() - start)
+            pairs.append(seconds)
+
+        benchmark.pedantic(both, rounds=4, warmup_rounds=1)
+    best_one, best_two = np.min(pairs[1:], axis=0)
+    benchmark.extra_info |= {
+        "one worker [s]": round(float(best_one), 2),
+        "two workers [s]": round(float(best_two), 2),
+        "one / two (≥ 1.7)": round(float(np.median([a / b for a, b in pairs[1:]])), 2),
+    }
+    told(benchmark)
