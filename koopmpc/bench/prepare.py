@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from koopmpc.bench.problem import Problem
 from koopmpc.control.equilibrium import Equilibria
+from koopmpc.control.learned_map import learned_map
 from koopmpc.control.outputs import outputs
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
@@ -69,8 +70,8 @@ class Prepared:
         plant = truth if isinstance(truth, StepMap) else self.step_map
         if problem.cost.u_target == "zero":
             return np.zeros((steps, plant.nu))
-        seen = outputs(plant, problem.cost, problem.limits_of(case))
-        equilibria = Equilibria(plant, problem.cost, seen, 10 * problem.horizon)
+        seen = outputs(plant.states, plant.nu, problem.cost, problem.limits_of(case))
+        equilibria = Equilibria(learned_map(plant), problem.cost, seen, 10 * problem.horizon)
         rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
         distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
         return np.array([equilibria.find(row)[1] for row in distinct])[of.ravel()]

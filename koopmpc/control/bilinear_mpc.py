@@ -1,6 +1,6 @@
 """BilinearMPC: real-time iteration on a bilinear predictor, or on any learned map, in the dimension of the state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -11,24 +11,28 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.equilibrium import Equilibria
-from koopmpc.control.fallback import PlanMemory
+from koopmpc.control.equilibrium import Equilibria, Goal
+from koopmpc.control.fallback import PlanMemory, admitted, hard
+from koopmpc.control.horizon import blocked
+from koopmpc.control.learned_map import Source, learned_map
 from koopmpc.control.lifted import HUGE, reference_rows
-from koopmpc.control.limits import Box, Limits, softened
-from koopmpc.control.move import Fallback, Move, Plan, Status
+from koopmpc.control.limits import Limits, softened
+from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.origin import Origin, Sizes, numbers
 from koopmpc.control.outputs import outputs
+from koopmpc.control.receding import Receding
 from koopmpc.control.rti import SHORTEST, RealTimeIteration
-from koopmpc.errors import ShapeError
+from koopmpc.control.staged import Changes, Direct
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.state import MeasuredState
 from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
 
 FIRST = 10  # passes of a first step, at most
 SETTLED = 1e-6  # a first plan rests when no input moves by more than this share of its size
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 
-class BilinearMPC:
+class BilinearMPC(Receding):
     """Minimise the Cost over N steps of x⁺ = F(x, u) within the Limits, one linearisation a step.
 
     F is the predictor's re-lifted map x⁺ = C(A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), so whatever the dictionary the problem
@@ -48,12 +52,21 @@ class BilinearMPC:
     horizon
         N steps of the model's dt.
     passes
-        Linearisations a step. The first step starts from rest at x and may take up to thirty.
+        Linearisations a step. The first step starts from rest at x and may take up to ten.
+    estimator
+        A `LiftedDisturbance`: x⁺ = F(x, u) + d with d filtered from what F misses, so that no offset is left.
+    latency, moves
+        As for KoopmanMPC.
+    time_limit
+        Wall-clock time a step may take [s]. A pass that has not ended by then is given up for the fallback, and its
+        plan is improved in the next step; what is late although it was found is used. Either way the status is
+        TIME_LIMIT.
 
     Raises
     ------
     DataError, ShapeError, DefinitenessError
-        A horizon or passes below 1, or weights and limits that do not fit.
+        A horizon or passes below 1, an estimator that needs a linear predictor, or weights and limits that do not
+        fit.
 
     References
     ----------
@@ -61,133 +74,229 @@ class BilinearMPC:
     SIAM J. Control Optim. 43, 2005.
     """
 
-    solver_fails = False  # set by fault injection alone, see control.move.Fallible
-
     def __init__(
         self,
-        predictor: BilinearPredictor | LinearPredictor | StepMap,
+        predictor: Source,
         cost: Cost,
         limits: Limits | None = None,
         horizon: int = 20,
         *,
         passes: int = 1,
+        estimator: LiftedDisturbance | None = None,
+        latency: int = 0,
+        moves: int | Sequence[int] | None = None,
+        time_limit: float | None = None,
     ) -> None:
-        self.predictor, self.cost = predictor, cost
-        self.limits = Limits() if limits is None else limits
-        self.step_map = predictor if isinstance(predictor, StepMap) else predictor.step_map()
-        self._N = checks.count(horizon, "horizon")
+        self._map = model = learned_map(predictor)
+        super().__init__(predictor.dt, model.nu, cost, limits, horizon, latency, time_limit)
         self._passes = checks.count(passes, "passes")
-        self._outputs = outputs(self.step_map, cost, self.limits)
-        self._equilibria = Equilibria(self.step_map, cost, self._outputs, 10 * self._N)
-        self._iteration = RealTimeIteration(self.step_map, self._outputs, self._N)
-        s = self._iteration.soft_rows
-        self._soft_box = Box(self._outputs.box.low[s], self._outputs.box.high[s])
-        self._memory = PlanMemory(self._outputs.inputs, self._N)
+        self._blocks = blocked(moves, self._N)
+        self._outputs = o = outputs(predictor.states, model.nu, self.cost, self.limits)
+        self._rated = o.rated or len(self._blocks) < self._N
+        self._staged = Changes(model.F, o, self._blocks) if self._rated else Direct(model.F, o, self._blocks)
+        self._equilibria = Equilibria(model, self.cost, o, 10 * self._N)
+        self._iteration = RealTimeIteration(self._staged.problem)
+        self._iteration.theta[:] = model.theta
+        self._hard_rates = hard(o.rates, o.rate_softness.linear)
+        self._memory = PlanMemory(o.inputs, self._N, o.rates)
+        self._estimator = estimator
+        if estimator is not None:
+            advice = "LiftedKalman filters a linear predictor's z; here y is the whole state"
+            checks.kind(estimator, "estimator", LiftedDisturbance, advice)
+        self._disturbed = estimator is not None or model.nw > 0
+        self._origin = Origin(
+            model,
+            MeasuredState(model.nx) if estimator is None else estimator.watch(model, model.nx),
+            Sizes(model.nx, model.nu, model.nw, self._N),
+            self._latency,
+            rated=self._rated,
+            estimated=estimator is not None,
+        )
         self._reference_key: bytes | None = None
-        self._planned = False
+        self._goal: Goal | None = None
+        self._warm = False
         self.reset()
 
     def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...]]:
-        build = partial(BilinearMPC, passes=self._passes)
+        build = partial(
+            BilinearMPC,
+            passes=self._passes,
+            estimator=self._estimator,
+            latency=self._latency,
+            moves=self._blocks,
+            time_limit=self._time_limit,
+        )
         return build, (self.predictor, self.cost, self.limits, self._N)
 
     @property
-    def dt(self) -> float:
-        """Sampling time [s]."""
-        return self.step_map.dt
+    def predictor(self) -> Source:
+        """The model."""
+        return self._map.source
 
     @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self.step_map.nu
-
-    @property
-    def horizon(self) -> int:
-        """Steps N of the plan."""
-        return self._N
+    def step_map(self) -> StepMap:
+        """The model as a map, x⁺ = F(x, u)."""
+        source = self._map.source
+        return source if isinstance(source, StepMap) else source.step_map()
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget the plan; `u_prev` is held if the first step fails."""
+        """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         self._memory.reset(u_prev)
-        self._planned = False
+        self._origin.reset(x0, self._memory.last())
+        self._planned = self._warm = False
+        self._goal, self._reference_key = None, None
+        self._iteration.e[:] = 0.0
+
+    def update(self, predictor: Source) -> None:
+        """Go on with new A, B, N, C and E of the same lifting: the plan and the last input are kept.
+
+        Raises
+        ------
+        DataError
+            The predictor is of another kind, or has another lifting, dt, states, inputs or disturbances.
+        """
+        self._map = self._map.updated(predictor)
+        self._iteration.theta[:] = self._map.theta
+        self._equilibria.adopt(self._map)
+        self._origin.adopt(self._map)
+        self._origin.observer.adopt(self._map)  # pyright: ignore[reportArgumentType]
+        self._reference_key = self._goal = None
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
         if not self._planned:
             return None
-        return Plan(self._iteration.X.copy(), self._iteration.U.copy())
+        X, U = self._staged.plan(self._iteration.X, self._iteration.U)
+        return Plan(X.copy(), U.copy())
 
-    def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
+    def __call__(
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+    ) -> Move:
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
-        x = np.asarray(y, dtype=np.float64)
-        if x.shape != (self.step_map.nx,):
-            raise ShapeError(f"y has shape {x.shape}, expected ({self.step_map.nx},), one value a state")
-        target = np.asarray(reference, dtype=np.float64)
-        key = target.tobytes()
-        known = key == self._reference_key or self._aim(target, key)
-        if not known or not np.abs(x).max() < HUGE:
-            return self._fail(applied, Status.BAD_MEASUREMENT, 0, start)
+        origin = self._origin
+        origin.take(y, self._memory.last(), applied, w)
+        x, u_prev = origin.z, self._known_input()
+        target = numbers(reference, "reference")
+        known = np.abs(x).max() < HUGE
+        if known and self._disturbed:
+            known = self._push()
+        if not (known and self._aim(target)):
+            return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
+        s, conflict = self._staged.start(x, u_prev), False
+        if self._rated:
+            first, conflict = self._staged.first(u_prev)
+            self._iteration.low[0, : self._nu], self._iteration.high[0, : self._nu] = first
+        deadline = start + self._allowed
         status, iterations = Status.FAILED, 0
-        if self._planned:
-            self._move_on()
-            status, iterations = self._improve(x, self._passes)
-        if status not in GOOD:  # there is no plan, or it has lost the plant
-            self._guess(x)
-            status, more = self._improve(x, max(FIRST, self._passes))
+        if self._warm:
+            self._move_on(u_prev)
+            status, iterations = self._improve(s, u_prev, self._passes, deadline)
+        if (
+            status not in GOOD and status is not Status.TIME_LIMIT
+        ):  # there is no plan, or it has lost the plant
+            self._guess(x, u_prev)
+            status, more = self._improve(s, u_prev, max(FIRST, self._passes), deadline)
             iterations += more
         if self.solver_fails:
             status = Status.FAILED
         if status not in GOOD:
-            return self._fail(applied, status, iterations, start)
-        self._planned = True
-        U = self._iteration.U.copy()
+            return self._lose(applied, status, iterations, start)
+        self._planned = self._warm = True
+        U = self._staged.plan(self._iteration.X, self._iteration.U)[1].copy()
+        if self._hard_rates is not None:
+            U[0] = admitted(U[0], self._outputs.inputs, self._hard_rates, u_prev)
         self._memory.keep(U.ravel())
-        return Move(U[0].copy(), status, Fallback.NONE, perf_counter() - start, iterations)
+        return self._move(U[0].copy(), Status.SOFTENED if conflict else status, iterations, start)
 
-    def _improve(self, x: Float[np.ndarray, " nx"], passes: int) -> tuple[Status, int]:
+    def _improve(
+        self, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], passes: int, deadline: float
+    ) -> tuple[Status, int]:
         """Return how the last of these passes ended, and the iterations of all; they end early at a solution."""
-        total, status = 0, Status.FAILED
-        for _ in range(passes):
-            found = self._iteration.step(x)
+        total, status, iteration = 0, Status.FAILED, self._iteration
+        for k in range(passes):
+            if k and perf_counter() > deadline:
+                break  # what the passes before it found is used, and late
+            found = iteration.step(s, deadline)
             total += found.iterations
             if found.status not in GOOD:
-                return found.status, total
-            length = self._iteration.take(x, found)
-            status = Status.SOFTENED if softened(found.slacks, self._soft_box) else found.status
+                return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
+            length = iteration.take(s, found)
+            self._enter(*self._staged.plan(iteration.X, iteration.U), u_prev)
+            status = Status.SOFTENED if softened(found.slacks, iteration.soft_box) else found.status
             if length < SHORTEST:
                 status = Status.FAILED
-            elif np.abs(found.U).max() <= SETTLED * (1 + np.abs(self._iteration.U).max()):
+            elif np.abs(found.U).max() <= SETTLED * (1 + np.abs(iteration.U).max()):
                 break
         return status, total
 
-    def _guess(self, x: Float[np.ndarray, " nx"]) -> None:
+    def _enter(
+        self,
+        X: Float[np.ndarray, "N1 nx"],
+        U: Float[np.ndarray, "N nu"],
+        u_prev: Float[np.ndarray, " nu"],
+    ) -> None:
+        """Make this the plan."""
+        self._iteration.X[:], self._iteration.U[:] = self._staged.along(X, U, u_prev)
+
+    def _guess(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]) -> None:
         """Start a plan: the free motion of the model from x, or rest at x where that leaves the finite numbers."""
-        X, U = self._iteration.X, self._iteration.U
-        U[:] = np.clip(0.0, *self._outputs.inputs)
-        X[:] = self.step_map.rollout(x, U)
+        U = np.tile(
+            np.clip(u_prev if self._rated else np.zeros(self._nu), *self._outputs.inputs), (self._N, 1)
+        )
+        X = np.tile(x, (self._N + 1, 1))
+        for k, u in enumerate(U):
+            X[k + 1] = self._map.step(X[k], u) + self._iteration.e[k, : len(x)]
         if not np.abs(X).max() < HUGE:
             X[:] = x
+        self._enter(X, U, u_prev)
 
-    def _move_on(self) -> None:
+    def _move_on(self, u_prev: Float[np.ndarray, " nu"]) -> None:
         """Make the plan of the last step the start of this one; its last stage is one step of the model."""
-        X, U = self._iteration.X, self._iteration.U
+        X, U = (part.copy() for part in self._staged.plan(self._iteration.X, self._iteration.U))
         X[:-1], U[:-1] = X[1:], U[1:]
-        X[-1] = self.step_map(X[-2], U[-1])
+        X[-1] = self._map.step(X[-2], U[-1]) + self._iteration.e[-1, : X.shape[1]]
+        self._enter(X, U, u_prev)
 
-    def _aim(self, reference: Float[np.ndarray, "..."], key: bytes) -> bool:
+    def _push(self) -> bool:
+        """Hand e_k = E w_k + d to the iteration; False where it is not finite."""
+        origin, e = self._origin, self._iteration.e[:, : self._map.nx]
+        pushed = origin.W @ self._map.push.T
+        if origin.d.size:
+            pushed = pushed + origin.d
+        if not np.abs(pushed).max() < HUGE:
+            return False
+        if (pushed[-1] != e[-1]).any():
+            self._reference_key = None
+        e[:] = pushed
+        return True
+
+    def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
         """Hand the reference and its goals to the iteration; False where it is not finite."""
-        R = reference_rows(reference, self._N, len(self._outputs.Q))
+        key = reference.tobytes()
+        if key == self._reference_key:
+            return True
+        R = reference_rows(self._previewed(reference), self._N, len(self._outputs.Q))
         self._reference_key = None
         if not np.isfinite(R).all():
             return False
         goals = [self._equilibria(row) for row in R]
-        self._iteration.aim(R[1:], np.array([goal.u for goal in goals[:-1]]), goals[-1])
+        U_r, goal = np.array([goal.u for goal in goals[:-1]]), goals[-1]
+        if self._disturbed:  # the last disturbance of the preview stays
+            e = self._iteration.e[-1, : self._map.nx]
+            moved = np.array([each.slope for each in goals[:-1]]) @ e
+            U_r = np.clip(U_r + moved, *self._outputs.inputs)
+            goal = self._goal = self._equilibria.pushed(R[-1], e, self._goal)
+            U_r[(R[:-1] == R[-1]).all(axis=1)] = goal.u
+        self._iteration.aim(self._staged.aim(R[1:], U_r, goal))
         self._reference_key = key
         return True
 
-    def _fail(self, applied: ArrayLike | None, status: Status, iterations: int, start: float) -> Move:
-        """Return what stands in for a failed step; the next one starts anew."""
-        self._planned = False
-        u, fallback = self._memory.instead(None, applied)
-        return Move(u, status, fallback, perf_counter() - start, iterations)
+    def _lose(self, applied: ArrayLike | None, status: Status, iterations: int, start: float) -> Move:
+        """Return what stands in for a failed step; the next one starts anew, unless there was no time."""
+        self._warm = status is Status.TIME_LIMIT
+        return self._fail(None, applied, status, iterations, start)

@@ -22,7 +22,7 @@ from koopmpc.control.plan_map import PlanMap
 from koopmpc.control.receding import Receding
 from koopmpc.errors import DataError
 from koopmpc.estimate.measured import Measured
-from koopmpc.estimate.observer import Estimator, Observer
+from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.linear import LinearPredictor
 
@@ -130,6 +130,7 @@ class KoopmanMPC(Receding):
             self._latency,
             rated=self._rated,
             estimated=self._disturbed,
+            remembers=predictor.embedding is not None,
         )
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
@@ -151,11 +152,6 @@ class KoopmanMPC(Receding):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._see()
-
-    @property
-    def observer(self) -> Observer:
-        """The estimate now: its z, and its disturbance d."""
-        return self._origin.observer
 
     @property
     def coordinates(self) -> str:

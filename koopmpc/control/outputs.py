@@ -8,14 +8,13 @@ from jaxtyping import Float
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Box, Limits, Softness
-from koopmpc.errors import DataError
-from koopmpc.plant.step_map import StepMap
 
 
 class Outputs(NamedTuple):
     """Functions of x with their weights and limits: tracked of(x) (nr, Q), limited g(x) (ng, box), and the inputs'.
 
-    softness says what it costs to leave the box, row by row; a linear weight of inf makes a row hard.
+    softness says what it costs to leave the box, row by row; a linear weight of inf makes a row hard. R_delta and
+    `rates` are None where the change of the inputs is free.
     """
 
     tracked: ca.Function
@@ -25,34 +24,35 @@ class Outputs(NamedTuple):
     inputs: Box
     box: Box
     softness: Softness
+    R_delta: Float[np.ndarray, "nu nu"] | None
+    rates: Box | None
+    rate_softness: Softness
+
+    @property
+    def rated(self) -> bool:
+        """Whether the change of the inputs counts."""
+        return self.R_delta is not None or self.rates is not None
 
 
-def outputs(step_map: StepMap, cost: Cost, limits: Limits) -> Outputs:
-    """Return what `cost` tracks and `limits` bound on the states and inputs of `step_map`; rows without limit go.
-
-    Raises
-    ------
-    DataError
-        There are limits or weights of the inputs' changes.
-    """
-    if limits.rates(step_map.nu) is not None or cost.rate(step_map.nu) is not None:
-        raise DataError(
-            "a controller on x⁺ = F(x, u) knows no rate limits and no R_delta; leave du_min, du_max and R_delta out, "
-            "or use KoopmanMPC"
-        )
-    x = ca.SX.sym("x", step_map.nx)
-    of = cost.of.bind(step_map.states)
-    Q, R = cost.matrices(of.nz, step_map.nu)
-    bound = None if limits.of is None else limits.of.bind(step_map.states)
+def outputs(states: tuple[str, ...], nu: int, cost: Cost, limits: Limits) -> Outputs:
+    """Return what `cost` tracks and `limits` bound, of these states and of `nu` inputs; rows without limit go."""
+    nx = len(states)
+    x = ca.SX.sym("x", nx)
+    of = cost.of.bind(states)
+    Q, R = cost.matrices(of.nz, nu)
+    bound = None if limits.of is None else limits.of.bind(states)
     values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    rows = limits.rows(step_map.nx, 0 if bound is None else bound.nz)
+    rows = limits.rows(nx, 0 if bound is None else bound.nz)
     kept = np.flatnonzero(rows.kept).tolist()
     return Outputs(
         ca.Function("tracked", [x], [ca.densify(of.symbolic(x))]),
         ca.Function("limited", [x], [ca.densify(values[kept, 0])]),
         Q,
         R,
-        limits.inputs(step_map.nu),
+        limits.inputs(nu),
         rows.box,
         rows.softness,
+        cost.rate(nu),
+        limits.rates(nu),
+        limits.rate_softness(nu),
     )

@@ -11,7 +11,10 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.fallback import PlanMemory
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
+from koopmpc.control.origin import Origin
 from koopmpc.errors import DataError
+from koopmpc.estimate.observer import Observer
+from koopmpc.lifting.buffered import HUGE
 
 
 class Receding:
@@ -31,6 +34,7 @@ class Receding:
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
     _memory: PlanMemory
+    _origin: Origin
 
     def __init__(
         self,
@@ -68,6 +72,11 @@ class Receding:
         """Steps of preview: N of the plan, after those of the latency."""
         return self._N + self._latency
 
+    @property
+    def observer(self) -> Observer:
+        """The estimate now: its z, and its disturbance d."""
+        return self._origin.observer
+
     def _move(self, u: Float[np.ndarray, " nu"], status: Status, iterations: int, start: float) -> Move:
         """Return a good step; a late one says so."""
         taken = perf_counter() - start
@@ -88,6 +97,15 @@ class Receding:
         u, fallback = self._memory.instead(free, applied)
         taken = perf_counter() - start
         return Move(u, status if taken <= self._allowed else Status.TIME_LIMIT, fallback, taken, iterations)
+
+    def _known_input(self) -> Float[np.ndarray, " nu"]:
+        """Return the input that rates count from: what was applied, where it can be used."""
+        u_prev = self._origin.u_prev
+        if not u_prev.size:
+            return self._memory.last()
+        if not (np.abs(u_prev) < HUGE).all():
+            u_prev[:] = self._memory.last()
+        return u_prev
 
     def _previewed(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the reference from the step on at which the plan starts."""

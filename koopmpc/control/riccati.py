@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.linalg.lapack import dpotrs
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from koopmpc import checks
 from koopmpc.errors import DataError, DefinitenessError
@@ -150,11 +150,11 @@ def _iterate(
     rested = 0
     for _ in range(most):
         K_next, _, P_next = _step(A, B, Q, R, P, M)
-        if not np.isfinite(P_next).all() or float(np.abs(P_next).max()) > LARGEST * scale:
+        if not P_next.max() <= LARGEST * scale:  # P ⪰ 0: its largest entry is on its diagonal; False for NaN
             return Gain(K, P), False
-        moved = float(np.abs(K_next - K).max(initial=0.0))
+        moved = abs(K_next - K).max()
         P, K = P_next, K_next
-        rested = rested + 1 if moved <= SETTLED * float(np.abs(K).max(initial=0.0)) else 0
+        rested = rested + 1 if moved <= SETTLED * abs(K).max() else 0
         if rested >= min(len(A), RESTS):
             break
     return Gain(K, P), True
@@ -184,14 +184,13 @@ def _step(
 ) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "nz nz"]]:
     BP = B.T @ P
     S = R + BP @ B
-    try:
-        L = np.linalg.cholesky(0.5 * (S + S.T))
-    except np.linalg.LinAlgError as error:
+    L, info = dpotrf(S, lower=1)
+    if info:
         least = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
         raise DefinitenessError(
             f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state"
             " that every input moves"
-        ) from error
+        )
     K = _solved(L, BP @ A if M is None else BP @ A + M.T)
     P = Q + A.T @ (P @ (A - B @ K))
     if M is not None:

@@ -10,10 +10,11 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.equilibrium import Goal, flat
+from koopmpc.control.equilibrium import flat
+from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
-from koopmpc.control.outputs import Outputs
-from koopmpc.plant.step_map import StepMap
+from koopmpc.control.staged import Aim, Problem
+from koopmpc.errors import DataError
 
 Solver = Literal["ipopt", "fatrop", "sqpmethod"]
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
@@ -58,14 +59,6 @@ class Horizon(NamedTuple):
     iterations: int
 
 
-class Aim(NamedTuple):
-    """What a horizon tracks: reference rows of x_1 … x_N, inputs u_r, and the goal at its end."""
-
-    R: Float[np.ndarray, "N nr"]
-    U: Float[np.ndarray, "N nu"]
-    goal: Goal
-
-
 class Start(NamedTuple):
     """Where a solver begins: variables, and multipliers of their bounds and of the constraints."""
 
@@ -79,25 +72,23 @@ class Shooting:
 
     Parameters
     ----------
-    step_map
-        F.
-    outputs
-        What is tracked and limited.
-    N
-        Steps.
+    problem
+        F, what is tracked and limited, and the stages.
     solver, options
         CasADi's solver, and its options by CasADi's names.
+
+    Raises
+    ------
+    DataError
+        The solver refuses its options.
     """
 
-    def __init__(
-        self,
-        step_map: StepMap,
-        outputs: Outputs,
-        N: int,
-        solver: Solver,
-        options: Mapping[str, Any],
-    ) -> None:
-        nx, nu, nr, ng = step_map.nx, step_map.nu, len(outputs.Q), len(outputs.box.low)
+    def __init__(self, problem: Problem, solver: Solver, options: Mapping[str, Any]) -> None:
+        outputs, N = problem, len(problem.free)
+        nx, nu, nr, ng = problem.nx, problem.F.size1_in(1), len(outputs.Q), len(outputs.box.low)
+        x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
+        F = ca.Function("F", [x, u], [problem.F(x, u, ca.DM(0, 1))])
+        smooth = problem.F.is_a("SXFunction")
         linear, quadratic = outputs.softness
         soft = np.flatnonzero(np.isfinite(linear))
         ns = len(soft)
@@ -106,7 +97,7 @@ class Shooting:
         x0, r, u_r = ca.MX.sym("x0", nx), ca.MX.sym("r", nr, N), ca.MX.sym("u_r", nu, N)
         M, L, m = (ca.MX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1))
 
-        gaps = X - step_map.F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U)  # the sign that fatrop wants
+        gaps = X - F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U)  # the sign that fatrop wants
         end = M @ outputs.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
         f = _weighted(U - u_r, outputs.R) + ca.sumsqr(end)
         if N > 1:
@@ -142,15 +133,18 @@ class Shooting:
         lows, highs = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
         lows[path_at], highs[path_at] = np.concatenate(low), np.concatenate(high)
         unlimited, zero = np.full(nx, np.inf), np.zeros(ns)
+        lowest = np.tile(np.concatenate([outputs.inputs.low, -unlimited, zero]), (N, 1))
+        highest = np.tile(np.concatenate([outputs.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
+        lowest[~problem.free, :nu] = highest[~problem.free, :nu] = 0.0
         self._bounds = {
-            "lbx": np.tile(np.concatenate([outputs.inputs.low, -unlimited, zero]), N),
-            "ubx": np.tile(np.concatenate([outputs.inputs.high, unlimited, np.full(ns, np.inf)]), N),
+            "lbx": lowest.ravel(),
+            "ubx": highest.ravel(),
             "lbg": lows,
             "ubg": highs,
         }
         parameters = ca.vertcat(x0, ca.vec(r), ca.vec(u_r), ca.vec(M), ca.vec(L), m)
         nlp = {"x": ca.vec(W), "p": parameters, "f": f, "g": ca.vertcat(*g)}
-        given: dict[str, Any] = {"expand": step_map.F.is_a("SXFunction"), "error_on_fail": False}
+        given: dict[str, Any] = {"expand": smooth, "error_on_fail": False}
         if solver == "fatrop":
             given |= {
                 "N": N,
@@ -158,9 +152,16 @@ class Shooting:
                 "nu": [nu] + [ns + nu] * (N - 1) + [ns],
                 "ng": [0] + [npath] * N,
             }
-        self._solver = ca.nlpsol(
-            "shooting", solver, nlp, {"print_time": False, **_OPTIONS[solver], **given, **options}
-        )
+        try:
+            self._solver = ca.nlpsol(
+                "shooting", solver, nlp, {"print_time": False, **_OPTIONS[solver], **given, **options}
+            )
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
+            raise DataError(
+                f"{solver} was not built with settings {dict(options)}: {reason}; pass its own settings by CasADi's "
+                'names, for example {"ipopt.tol": 1e-8}'
+            ) from error
         self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
 
     def at(self, X: Float[np.ndarray, "N nx"], U: Float[np.ndarray, "N nu"]) -> Start:
@@ -169,10 +170,13 @@ class Shooting:
         W[:, : self._split[0]], W[:, self._split[0] : self._split[1]] = U, X
         return Start(W.ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
 
-    def solve(self, x0: Float[np.ndarray, " nx"], aim: Aim, start: Start) -> tuple[Horizon, Start]:
-        """Solve from `start`; return the solution, and the start that it leaves for the next step."""
-        goal = aim.goal
-        p = [x0, aim.R.ravel(), aim.U.ravel(), goal.M.ravel("F"), goal.L.ravel("F"), goal.m]
+    def solve(
+        self, x0: Float[np.ndarray, " nx"], aim: Aim, start: Start, first: Box
+    ) -> tuple[Horizon, Start]:
+        """Solve from `start` with u_0 inside `first`; return the solution, and the start that it leaves."""
+        nu = self._split[0]
+        self._bounds["lbx"][:nu], self._bounds["ubx"][:nu] = first
+        p = [x0, aim.R.ravel(), aim.U.ravel(), aim.M.ravel("F"), aim.L.ravel("F"), aim.m]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
         found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
         stats = self._solver.stats()

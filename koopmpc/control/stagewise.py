@@ -15,44 +15,44 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.outputs import Outputs
-from koopmpc.plant.step_map import StepMap
+from koopmpc.control.staged import Problem
 
 _SHORT = 0.995  # share of the way to the nearest bound
 
 
 class Sides(NamedTuple):
-    """The finite ends of limits, hard ones first: distance d = sign (y − bound) / span ≥ 0, y = [u_k; g(x_{k+1})].
+    """The finite ends of limits, hard ones first: distance d = sign (y − end) / span ≥ 0, y = [u_k; g(x_{k+1})].
 
     A soft side has d + ε ≥ 0, ε ≥ 0, at the price linear ε + ½ quadratic ε².
     """
 
     row: Int[np.ndarray, " ns"]
     sign: Float[np.ndarray, " ns"]
-    bound: Float[np.ndarray, " ns"]
     span: Float[np.ndarray, " ns"]
     soft: int
     linear: Float[np.ndarray, " nsoft"]
     quadratic: Float[np.ndarray, " nsoft"]
 
 
-def linearisation(step_map: StepMap, outputs: Outputs, N: int) -> ca.Function:
-    """Return (X, U, R, U_r, M, L, m) → (A, B, F, Q, q, r, g, G), stage beside stage.
+def linearisation(problem: Problem) -> ca.Function:
+    """Return (X, U, R, U_r, M, L, m, θ) → (A, B, F, Q, q, r, g, G), stage beside stage.
 
-    A, B, F at (X_k, U_k), k = 0 … N−1; the rest at X_{k+1}: Q = JᵀQJ and q = JᵀQ(of(x) − r) with J = ∂of/∂x
-    (Gauss–Newton), at the end those of ‖M of(x) + L x − m‖²; r = R (u − u_r); g the limited outputs, G = ∂g/∂x.
+    A, B, F at (X_k, U_k), k = 0 … N−1, B zero where a stage has no input; the rest at X_{k+1}: Q = JᵀQJ and
+    q = JᵀQ(of(x) − r) with J = ∂of/∂x (Gauss–Newton), at the end those of ‖M of(x) + L x − m‖²; r = R (u − u_r);
+    g the limited outputs, G = ∂g/∂x.
     """
-    nx, nu, nr, ng = step_map.nx, step_map.nu, len(outputs.Q), len(outputs.box.low)
-    x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
-    x_next = step_map.F(x, u)
+    nx, nu, nr = problem.nx, problem.F.size1_in(1), len(problem.Q)
+    ng, N = len(problem.box.low), len(problem.free)
+    x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", problem.F.size1_in(2))
+    x_next = problem.F(x, u, t)
     derivatives = [ca.densify(ca.jacobian(x_next, x)), ca.densify(ca.jacobian(x_next, u)), x_next]
-    dynamics = ca.Function("dynamics", [x, u], derivatives)
-    if step_map.F.is_a("SXFunction"):
+    dynamics = ca.Function("dynamics", [x, u, t], derivatives)
+    if problem.F.is_a("SXFunction"):
         dynamics = dynamics.expand("dynamics", {"cse": True})
     s, r = ca.SX.sym("x", nx), ca.SX.sym("r", nr)
-    of, g = outputs.tracked(s), outputs.limited(s)
+    of, g = problem.tracked(s), problem.limited(s)
     J = ca.jacobian(of, s)
-    weighted = J.T @ ca.DM(outputs.Q)
+    weighted = J.T @ ca.DM(problem.Q)
     stage = ca.Function(
         "stage", [s, r], [ca.densify(weighted @ J), ca.densify(weighted @ (of - r))], {"cse": True}
     )
@@ -66,14 +66,35 @@ def linearisation(step_map: StepMap, outputs: Outputs, N: int) -> ca.Function:
     X, U = ca.MX.sym("X", nx, N + 1), ca.MX.sym("U", nu, N)
     R, U_r = ca.MX.sym("R", nr, N), ca.MX.sym("U_r", nu, N)
     goal = [ca.MX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1)]
-    A, B, F = dynamics.map(N)(X[:, :N], U)
+    # called stage by stage, for a map would copy θ for each of them
+    stages = [dynamics(X[:, k], U[:, k], t) for k in range(N)]
+    A = ca.horzcat(*(stage[0] for stage in stages))
+    B = ca.horzcat(
+        *(each[1] if free else ca.MX(ca.DM(nx, nu)) for each, free in zip(stages, problem.free, strict=True))
+    )
+    F = ca.horzcat(*(stage[2] for stage in stages))
     Q, q = end(X[:, N], *goal)
     if N > 1:
         Q_k, q_k = stage.map(N - 1)(X[:, 1:N], R[:, : N - 1])
         Q, q = ca.horzcat(Q_k, Q), ca.horzcat(q_k, q)
     g_k, G = limited.map(N)(X[:, 1:]) if ng else (ca.MX(0, N), ca.MX(0, N * nx))
-    found = [A, B, F, Q, q, ca.DM(outputs.R) @ (U - U_r), g_k, G]
-    return ca.Function("linearisation", [X, U, R, U_r, *goal], found)
+    found = [A, ca.densify(B), F, Q, q, ca.DM(problem.R) @ (U - U_r), g_k, G]
+    return ca.Function("linearisation", [X, U, R, U_r, *goal, t], found)
+
+
+def simulation(problem: Problem) -> ca.Function:
+    """Return (X, U, θ) → F(X_k, U_k), stage beside stage."""
+    nx, nu, N = problem.nx, problem.F.size1_in(1), len(problem.free)
+    X, U, t = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N), ca.MX.sym("t", problem.F.size1_in(2))
+    found = ca.horzcat(*(problem.F(X[:, k], U[:, k], t) for k in range(N)))
+    return ca.Function("simulation", [X, U, t], [found])
+
+
+def weights(problem: Problem) -> Float[np.ndarray, "nu m"]:
+    """Return R stage beside stage; a stage without an input has a weight of its own, so that it rests at zero."""
+    nu = len(problem.R)
+    held = max(float(np.trace(problem.R)), float(np.trace(problem.Q))) / nu * np.eye(nu)
+    return np.hstack([problem.R if free else held for free in problem.free])
 
 
 class Passes:
@@ -137,17 +158,17 @@ class Passes:
         return X, U
 
 
-def unconstrained(passes: Passes, R: Float[np.ndarray, "nu nu"]) -> ca.Function:
+def unconstrained(passes: Passes, R: Float[np.ndarray, "nu m"]) -> ca.Function:
     """Return (A, B, c, Q, q, r, δx_0) → (δX, δU, diag S): the solution without limits, and the inputs' curvatures."""
     nx, nu, N = passes.nx, passes.nu, passes.N
     A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
-    factors = passes.factors(A, B, c, Q, ca.repmat(ca.MX(ca.DM(R)), 1, N))
+    factors = passes.factors(A, B, c, Q, ca.MX(ca.DM(R)))
     X, U = passes.solve(factors, B, c, q, r, x0)
     curvature = ca.sum1(factors[2] ** 2)  # column by column the diagonal of S
     return ca.Function("unconstrained", [A, B, c, Q, q, r, x0], [X, U, curvature])
 
 
-def interior_step(passes: Passes, R: Float[np.ndarray, "nu nu"], sides: Sides, ng: int) -> ca.Function:
+def interior_step(passes: Passes, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
     """Return one predictor–corrector step of the interior-point method.
 
     (A, B, c, Q, q, r, δx_0, G, d; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the distances of the plan
@@ -187,7 +208,7 @@ def interior_step(passes: Passes, R: Float[np.ndarray, "nu nu"], sides: Sides, n
     eased = w / (1 + w * K)
     gap = d + moved + padded(eps) - t
     weights = (S.T**2) @ eased
-    R_k = ca.repmat(ca.MX(ca.DM(R)), 1, N) + diagonal(weights[:nu, :])
+    R_k = ca.MX(ca.DM(R)) + diagonal(weights[:nu, :])
     Q_k = Q + gram(G, weights[nu:, :]) if ng else Q
     factors = passes.factors(A, B, c, Q_k, R_k)
 

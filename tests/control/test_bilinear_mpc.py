@@ -220,8 +220,6 @@ def test_refusals() -> None:
         BilinearMPC(model, CIRCLE, None, 0)
     with pytest.raises(DataError, match="passes is 0; it must be at least 1"):
         BilinearMPC(model, CIRCLE, None, 5, passes=0)
-    with pytest.raises(DataError, match="knows no rate limits and no R_delta"):
-        BilinearMPC(model, CIRCLE, Limits(du_max=1), 5)
     with pytest.raises(ShapeError, match="Q_N weighs x_N − r_N, but the reference is not of the state"):
         BilinearMPC(model, Cost(Q=[2, 2, 0.2], R=0.1, Q_N=[1, 1], of=UPRIGHT), None, 5)
     mpc = BilinearMPC(model, CIRCLE, None, 5)

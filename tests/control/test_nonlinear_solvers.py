@@ -6,6 +6,7 @@ import pytest
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.equilibrium import Equilibria
+from koopmpc.control.learned_map import learned_map
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear_mpc import NonlinearMPC
@@ -70,8 +71,8 @@ def test_several_starts_leave_a_local_optimum() -> None:
 
 def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() -> None:
     plant, cost = pendulum(), Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = outputs(plant, cost, Limits(-2, 2))
-    goal = Equilibria(plant, cost, read, 300)(np.array([0.0, 1.0, 0.0]))
+    read = outputs(plant.states, plant.nu, cost, Limits(-2, 2))
+    goal = Equilibria(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
 
     def end(x: np.ndarray) -> float:
         e = goal.M @ read.tracked(x).full().ravel() + goal.L @ x - goal.m
@@ -91,5 +92,6 @@ def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() ->
 def test_the_goal_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
     """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
     plant, cost = pendulum(), Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    goal = Equilibria(plant, cost, outputs(plant, cost, Limits(-2, 2)), 300)(np.array([0.0, -1.0, 0.0]))
+    read = outputs(plant.states, plant.nu, cost, Limits(-2, 2))
+    goal = Equilibria(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
     assert np.cos(goal.x[0]) < -0.99
