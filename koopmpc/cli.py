@@ -128,6 +128,30 @@ def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrot
         open_viewer(logs)
 
 
+@app.command()
+def reproduce(
+    paper: Annotated[str, typer.Argument(help="The paper: snyder.")],
+    logs: Logs = Path("logs"),
+) -> None:
+    """Do a paper again: its figures, its numbers, and a verdict on each of its claims."""
+    from time import perf_counter
+
+    from koopmpc.bench.reproduce.registry import find_paper
+    from koopmpc.bench.reproduce.verdicts import verdict_table
+
+    out, err = _console(), Console(stderr=True)
+    with _friendly():
+        found = find_paper(paper)
+        folder = _new_folder(logs, paper)
+        start = perf_counter()
+        with err.status("") as status:
+            outcome = found.reproduce(folder, False, status.update)
+        out.print(verdict_table(found.title, outcome.claims))
+        for path in (outcome.report, outcome.recording):
+            out.print(Text(str(path)), soft_wrap=True)
+        out.print(Text(f"done in {perf_counter() - start:.0f} s"))
+
+
 def _sweep(
     problems: Sequence["Problem"],
     controllers: list[str] | None,

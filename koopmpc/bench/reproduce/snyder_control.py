@@ -1,0 +1,173 @@
+"""Past Snyder & Song (2021): data that show what the input does, and control on models of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.bench.reproduce.beyond import Prediction, centred, prediction
+from koopmpc.bench.reproduce.contest import Contest
+from koopmpc.bench.reproduce.plants import CartPole, Pendulum
+from koopmpc.bench.reproduce.reconstruction import unwarned
+from koopmpc.bench.reproduce.scenes import Scene
+from koopmpc.bench.reproduce.snyder_scenes import (
+    CART_POLE_WEIGHTS,
+    PENDULUM_WEIGHTS,
+    TARGET,
+    UP,
+    gains,
+)
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.data.collect import Uniform, collect
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.excitation import Feedback, Noise
+from koopmpc.identify.dmd import dmd, dmdc
+from koopmpc.identify.edmd import edmd
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import State
+from koopmpc.plant.dynamics import Dynamics
+from koopmpc.plant.integrators import RK4
+from koopmpc.plant.step_map import StepMap, discretize
+
+DT = 0.05  # of the controllers [s]
+LIFTINGS: Mapping[str, Lifting] = {
+    "DMDc": State() + Constant(),
+    "Fourier 1": State() + Fourier(1) + Constant(),
+    "monomials 3": State() + Monomials(3) + Constant(),
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a controller has to do, and how the plant is shaken for the data of its model.
+
+    Attributes
+    ----------
+    dynamics, x_eq, K
+        The plant; where it rests; the feedback that holds it while data are taken, None where it needs none.
+    spread, noise
+        Data start in x_eq ± spread, and u is shaken by ± noise.
+    cost, limit
+        The paper's weights; |u| in the runs with limits, below what LQR would take.
+    x0, reference
+        From where to where.
+    """
+
+    dynamics: Dynamics
+    x_eq: Sequence[float]
+    K: str | None
+    spread: Sequence[float]
+    noise: float
+    cost: Cost
+    limit: float
+    x0: Sequence[float]
+    reference: Sequence[float]
+
+
+_DRIVEN, _CARRIED = Cost(*PENDULUM_WEIGHTS), Cost(*CART_POLE_WEIGHTS)
+_REST, _START = (0.0, 0.0), (np.pi / 4, 0.0)
+TASKS: Mapping[str, Task] = {
+    "pendulum, hanging, π/4": Task(Pendulum(), _REST, None, (1.2, 2.0), 4.0, _DRIVEN, 2.0, _START, _REST),
+    "pendulum, upright, π/4": Task(
+        Pendulum(upright=True), _REST, "upright", (1.0, 1.0), 10.0, _DRIVEN, 20.0, _START, _REST
+    ),
+    "cart-pole, 2 m shift": Task(
+        CartPole(), UP, "cart-pole", (2.0, 1.0, 0.1, 0.1), 5.0, _CARRIED, 3.0, (-1.0, 0.0, np.pi, 0.0), TARGET
+    ),
+    "cart-pole, 0.3 rad off": Task(
+        CartPole(),
+        UP,
+        "cart-pole",
+        (2.0, 1.0, 0.4, 0.4),
+        10.0,
+        _CARRIED,
+        40.0,
+        (0.0, 0.0, np.pi + 0.3, 0.0),
+        UP,
+    ),
+}
+
+
+def contest(title: str, steps: int, horizon: int, episodes: int = 100) -> Contest:
+    """Return one of `TASKS` with its models, fitted to so many exciting episodes of 3 s."""
+    task = TASKS[title]
+    plant = discretize(task.dynamics, DT, RK4(4))
+    K = None if task.K is None else gains()[task.K]
+    data = _excited(plant, task.x_eq, K, task.spread, task.noise, episodes=episodes, steps=60)
+    with unwarned():
+        models = {name: edmd(data, lifting) for name, lifting in LIFTINGS.items()}
+    return Contest(
+        title,
+        plant,
+        np.asarray(task.x_eq),
+        models,
+        task.cost,
+        Limits(u_min=-task.limit, u_max=task.limit),
+        np.asarray(task.x0),
+        np.asarray(task.reference),
+        steps,
+        horizon,
+    )
+
+
+def predictions(
+    scene: Scene, spread: Sequence[float], noise: float, episodes: int = 40
+) -> dict[str, Prediction]:
+    """Return what is predicted by fits of one trajectory under feedback, and by fits of exciting data, with inputs.
+
+    Inputs are held over a sample; coordinates are x − x_ref, so that no origin is in the way.
+
+    Parameters
+    ----------
+    scene
+        The plant, its feedback and its start.
+    spread, noise
+        Exciting data, and what is predicted, start in x_ref ± spread; u is shaken by ± noise.
+    episodes
+        How many exciting ones, of 3 s.
+    """
+    plant = discretize(scene.dynamics, scene.dt, RK4(2))
+    K = scene.K
+    assert K is not None
+    x_ref = np.broadcast_to(scene.x_ref, plant.nx)
+    law = Feedback(K, x_ref=x_ref)
+    one = centred(collect(plant, scene.x0, law, episodes=1, steps=scene.steps), x_ref)
+    rich = centred(_excited(plant, x_ref, K, spread, noise, episodes=episodes, steps=300), x_ref)
+    starts = Uniform(x_ref - spread, x_ref + spread)
+    feedback = centred(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
+    excited = centred(_excited(plant, x_ref, K, spread, noise, episodes=10, steps=200, seed=2), x_ref)
+    B = plant.linearize(x_ref, np.zeros(plant.nu)).B
+    with unwarned():
+        models = {
+            "DMD, feedback data": dmd(one),
+            "DMDc, feedback data": dmdc(one),
+            "DMDc, exciting data": dmdc(rich),
+            "EDMDc, exciting data": edmd(rich, State() + Fourier(1)),
+        }
+    return {name: prediction(name, model, feedback, excited, B) for name, model in models.items()}
+
+
+def _excited(
+    plant: StepMap,
+    x_ref: ArrayLike,
+    K: Float[np.ndarray, "nu nx"] | None,
+    spread: Sequence[float],
+    noise: float,
+    *,
+    episodes: int,
+    steps: int,
+    seed: int = 0,
+) -> Episodes:
+    """Return episodes from x_ref ± spread under noise of ± `noise`, on top of feedback where there is K."""
+    middle = checks.vector(x_ref, "x_ref", plant.nx)
+    shaken = Noise(-noise, noise, hold=max(1, round(0.05 / plant.dt)))
+    excitation = shaken if K is None else Feedback(K, shaken, x_ref=middle)
+    starts = Uniform(middle - spread, middle + spread)
+    return collect(plant, starts, excitation, episodes=episodes, steps=steps, rng=seed)

@@ -1,0 +1,48 @@
+"""record_curves: what is written can be read, and what would end the viewer is not written."""
+
+import numpy as np
+import pytest
+
+from koopmpc.errors import DataError, LogError, ShapeError
+from koopmpc.recording.curves import Curves, record_curves
+
+
+def written(path):
+    from rerun.chunk import RrdReader
+
+    found = {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.split(":")[-1] in ("scalars", "text"):
+                found.setdefault(chunk.entity_path, []).extend(batch.column(name).to_pylist())
+    return found
+
+
+def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
+    truth = np.arange(10.0).reshape(5, 2)
+    holed = truth + 0.5
+    holed[1, 0] = np.nan
+    holed[:, 1] = np.nan  # no entity at all: a timeline without a row ends the viewer
+    tab = Curves("one, two", 0.1, ("x [m]", "v [m/s]"), {"truth": truth, "model a": holed})
+    record_curves([tab], tmp_path / "deep" / "c.rrd", application="koopmpc-test", page="# Uᵀ")
+    found = written(tmp_path / "deep" / "c.rrd")
+    flat = {entity: [row[0] for row in rows] for entity, rows in found.items()}
+    assert flat["/one_two/x_m/truth"] == truth[:, 0].tolist()
+    assert flat["/one_two/x_m/model_a"] == [0.5, 4.5, 6.5, 8.5]
+    assert flat["/one_two/v_m_s/truth"] == truth[:, 1].tolist()
+    assert "/one_two/v_m_s/model_a" not in flat
+    assert flat["/page"] == ["# U^T"]
+
+
+def test_refusals(tmp_path):
+    tab = Curves("one", 0.1, ("x",), {"truth": np.zeros((3, 1))})
+    with pytest.raises(DataError, match="there is no curve to record"):
+        record_curves([], tmp_path / "c.rrd", application="koopmpc-test", page="")
+    with pytest.raises(DataError, match="two tabs are called 'one'"):
+        record_curves([tab, tab], tmp_path / "c.rrd", application="koopmpc-test", page="")
+    wide = Curves("one", 0.1, ("x", "y"), {"truth": np.zeros((3, 1))})
+    with pytest.raises(ShapeError, match=r"truth has shape \(3, 1\), expected \(any, 2\)"):
+        record_curves([wide], tmp_path / "c.rrd", application="koopmpc-test", page="")
+    with pytest.raises(LogError, match="is a folder"):
+        record_curves([tab], tmp_path, application="koopmpc-test", page="")
