@@ -2,26 +2,31 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.fit import Regression
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.moments import How, Moments, moments
 from koopmpc.identify.solve import Rows, scaled_rank
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.report import FitReport
 
 
-def read(episodes: Episodes | Source, lifting: Lifting) -> tuple[Moments, tuple[str, ...]]:
+def read(
+    episodes: Episodes | Source, lifting: Lifting, embedding: Delay | None, **how: Unpack[How]
+) -> tuple[Moments, tuple[str, ...]]:
     """Return the moments of the rows [ψ(x) u w ψ(x⁺)], and the names of w."""
     source = source_of(episodes)
-    return moments(source.driven(), lifting), source.disturbances
+    sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
+    return moments(source.driven(), lifting, embedding=sized, **how), source.disturbances
 
 
 def tikhonov(ridge: float) -> float:
@@ -51,7 +56,7 @@ def assembled(
     K: Float[np.ndarray, "n nz"],
     disturbances: Sequence[str],
     *,
-    how: str,
+    rule: str,
     ridge: float = 0.0,
     sentences: Sequence[str] = (),
     changes: Sequence[str] = (),
@@ -67,7 +72,7 @@ def assembled(
         Coefficients of ψ(x⁺) on [ψ(x) u w].
     disturbances
         Names of w, the last of the task's inputs.
-    how
+    rule
         What solved it, in words.
     ridge, sentences, changes
         For the report.
@@ -79,7 +84,7 @@ def assembled(
     rank, condition = scaled_rank(rows, rows.P)
     report = FitReport(
         method=task.method,
-        route=f"{task.route}, {how}",
+        route=f"{task.route}, {rule}",
         samples=rows.samples,
         condition=condition,
         rank=rank,
@@ -104,4 +109,5 @@ def assembled(
         report,
         E=K[nz + nu :].T,
         disturbances=disturbances,
+        embedding=task.embedding,
     )

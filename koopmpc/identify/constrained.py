@@ -1,13 +1,17 @@
 """EDMD under priors: known entries by plain linear algebra, bounds and couplings by a convex program."""
 
+from typing import Unpack
+
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.identify.assemble import assembled, growth, read, tikhonov
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
+from koopmpc.identify.moments import How
 from koopmpc.identify.prior import Entries, Prior
 from koopmpc.identify.program import optimum, violation
 from koopmpc.identify.solve import Rows, norms, solve
@@ -18,7 +22,13 @@ _MET = 1e-10  # priors missed by less than this, in units of the data, are met
 
 
 def constrained_edmd(
-    episodes: Episodes | Source, lifting: Lifting, *, prior: Prior, ridge: float = 0.0
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    prior: Prior,
+    ridge: float = 0.0,
+    **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares among the A, B, E that agree with what is known of them.
 
@@ -33,10 +43,14 @@ def constrained_edmd(
         Episodes or a Source; no pair spans two of them.
     lifting
         ψ: R^nx → R^nz.
+    embedding
+        ψ acts on the state and its past, ``Delay(2)`` say.
     prior
         What is known; its shapes and names are those of the lifting's observables and of the inputs.
     ridge
         Tikhonov weight on unit-norm columns of what is free.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
 
     Raises
     ------
@@ -49,7 +63,7 @@ def constrained_edmd(
         The free columns are dependent or ill-conditioned, or the solver met its tolerance only roughly.
     """
     ridge = tikhonov(ridge)
-    total, disturbances = read(episodes, lifting)
+    total, disturbances = read(episodes, lifting, embedding, **how)
     task = regression(total, "constrained_edmd")
     nz, names = task.lifting.nz, task.lifting.names
     entries = prior.entries(names, task.inputs)
@@ -71,7 +85,7 @@ def constrained_edmd(
         task,
         K,
         disturbances,
-        how=f"{'Clarabel' if statuses else 'linear algebra'} under priors, ridge {ridge:g}",
+        rule=f"{'Clarabel' if statuses else 'linear algebra'} under priors, ridge {ridge:g}",
         ridge=ridge,
         sentences=sentences,
         changes=changes,

@@ -185,7 +185,7 @@ class OnlineEDMD:
             task,
             solution.K,
             self._disturbances,
-            how=f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, ridge {self._ridge:g}",
+            rule=f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, ridge {self._ridge:g}",
             ridge=self._ridge,
             sentences=sentences,
             warn=False,

@@ -1,12 +1,13 @@
 """EDMD that keeps few observables, or few entries of A and B."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Unpack
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
@@ -15,6 +16,7 @@ from koopmpc.identify.constrained import linear
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
 from koopmpc.identify.lasso import lasso
+from koopmpc.identify.moments import How
 from koopmpc.identify.prior import Entries
 from koopmpc.identify.solve import Rows, norms, onto, solve
 from koopmpc.lifting.base import Lifting
@@ -27,9 +29,11 @@ def sparse_edmd(
     episodes: Episodes | Source,
     lifting: Lifting,
     *,
+    embedding: Delay | None = None,
     penalty: float = 1e-3,
     over: Literal["observables", "entries"] = "observables",
     adaptive: bool = True,
+    **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit z⁺ = A z + B u + E w on those observables z of ψ that predict the states, and each other.
 
@@ -45,6 +49,8 @@ def sparse_edmd(
         Episodes or a Source; no pair spans two of them.
     lifting
         ψ, the dictionary; it must hold the states.
+    embedding
+        ψ acts on the state and its past, ``Delay(2)`` say.
     penalty
         Above 0. With adaptive weights an observable stays out if it explains less than about this share of the
         targets' energy.
@@ -53,6 +59,8 @@ def sparse_edmd(
     adaptive
         Weights 1 / |coefficient of a ridge fit| (by generalised cross-validation), which spare large ones and find
         the true set from enough data; else 1.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
 
     Raises
     ------
@@ -72,7 +80,7 @@ def sparse_edmd(
     penalty = checks.positive(penalty, "penalty")
     if over not in ("observables", "entries"):
         raise DataError(f'over is {over!r}; pass "observables" or "entries"')
-    total, disturbances = read(episodes, lifting)
+    total, disturbances = read(episodes, lifting, embedding, **how)
     task = regression(total, "sparse_edmd")
     names, nz = task.lifting.names, task.lifting.nz
     missing = [state for state in task.states if state not in names]
@@ -85,7 +93,7 @@ def sparse_edmd(
     stay = np.flatnonzero(kept)
     columns = np.concatenate([stay, np.arange(nz, len(used))])
     few = Rows(rows.P[:, columns], rows.T[:, stay], rows.rest[stay], rows.samples)
-    picked = Picked(task.lifting, tuple(map(int, stay))).bind(task.states)
+    picked = Picked(task.lifting, tuple(map(int, stay))).bind(task.lifting._states)
     sentences = doubts(few, picked.names, task.inputs, regular=False)[0]
     if missed > 1e-6:
         sentences.append(
@@ -105,8 +113,8 @@ def sparse_edmd(
     place = {name: i for i, name in enumerate(picked.names)}
     where = np.array([place[state] for state in task.states])
     part = replace(task, rows=few, lifting=picked, C=task.C[:, stay], x_next=where)
-    how = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
-    return assembled(part, K, disturbances, how=how, sentences=sentences, changes=changes)
+    rule = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
+    return assembled(part, K, disturbances, rule=rule, sentences=sentences, changes=changes)
 
 
 def _closed(

@@ -1,9 +1,12 @@
 """EDMD whose A has no eigenvalue beyond a circle."""
 
+from typing import Unpack
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.identify.assemble import assembled, growth, read, tikhonov
@@ -11,6 +14,7 @@ from koopmpc.identify.contraction import Misfit, clipped, inside, nearest, radiu
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
 from koopmpc.identify.lyapunov import lyapunov_fit
+from koopmpc.identify.moments import How
 from koopmpc.identify.solve import Rows, norms, onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
@@ -21,7 +25,13 @@ _ROUNDING = 1e-9  # an eigenvalue this close to the circle is on it
 
 
 def stable_edmd(
-    episodes: Episodes | Source, lifting: Lifting, *, radius: float = 1.0, ridge: float = 0.0
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    radius: float = 1.0,
+    ridge: float = 0.0,
+    **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares with every eigenvalue |λ(A)| ≤ radius.
 
@@ -39,10 +49,14 @@ def stable_edmd(
         Episodes or a Source; no pair spans two of them.
     lifting
         ψ: R^nx → R^nz.
+    embedding
+        ψ acts on the state and its past, ``Delay(2)`` say.
     radius
         ρ > 0; below 1 it asks for a rate of decay.
     ridge
         Tikhonov weight on unit-norm columns.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
 
     Raises
     ------
@@ -55,7 +69,7 @@ def stable_edmd(
         As `edmd`. ``report.changes`` tells the spectral radius and the misfit before and after.
     """
     rho, ridge = checks.positive(radius, "radius"), tikhonov(ridge)
-    total, disturbances = read(episodes, lifting)
+    total, disturbances = read(episodes, lifting, embedding, **how)
     task = regression(total, "stable_edmd")
     nz, names = task.lifting.nz, task.lifting.names
     rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
@@ -67,14 +81,14 @@ def stable_edmd(
         K[:, names.index(one)] = np.eye(len(K))[names.index(one)]
     before = radius_of(K[np.ix_(moving, moving)].T)
     changes = [f"spectral radius {before:.6g}, not above {rho:g}: the plain fit stays"]
-    how = f"ridge {ridge:g}"
+    rule = f"ridge {ridge:g}"
     if before > rho + _ROUNDING:
         stable = _stabilised(rows, K, moving, rho, ridge)
         after = radius_of(stable[np.ix_(moving, moving)].T)
-        how = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, ridge {ridge:g}"
+        rule = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, ridge {ridge:g}"
         changes = [f"spectral radius {before:.6g} before, {after:.6g} after", growth(rows, stable, K)]
         K = stable
-    return assembled(task, K, disturbances, how=how, ridge=ridge, sentences=sentences, changes=changes)
+    return assembled(task, K, disturbances, rule=rule, ridge=ridge, sentences=sentences, changes=changes)
 
 
 def _stabilised(

@@ -6,12 +6,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError
+from koopmpc.identify.constrained import constrained_edmd
 from koopmpc.identify.contraction import Misfit, clipped, nearest, radius_of
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.lyapunov import lyapunov_fit
 from koopmpc.identify.moments import moments
+from koopmpc.identify.prior import Prior
+from koopmpc.identify.sparse import sparse_edmd
 from koopmpc.identify.stable import stable_edmd
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.monomials import Monomials
@@ -164,6 +168,22 @@ def test_two_hundred_observables() -> None:
     assert loss <= worst
     said = f"nz 200, {total.samples} pairs: {seconds:.1f} s, loss / clipping's {loss / worst:.3f}"
     print(said, *model.report.changes, sep="; ")  # noqa: T201
+
+
+def test_delays_weights_and_the_past_in_all_three_fits() -> None:
+    data, lifting = random_episodes(3, [60, 40], 2, 1), State() + Constant()
+    how = {"embedding": Delay(1), "weights": lambda episode: len(episode) / 50}
+    plain = edmd(data, lifting, **how)
+    for model in (
+        stable_edmd(data, lifting, radius=5.0, **how),
+        constrained_edmd(data, lifting, prior=Prior(), **how),
+        sparse_edmd(data, lifting, penalty=1e-12, adaptive=False, **how),
+    ):
+        assert np.allclose(model.A, plain.A, rtol=0, atol=1e-9)
+        assert np.allclose(model.B, plain.B, rtol=0, atol=1e-9)
+        assert np.array_equal(model.C, plain.C)
+        assert model.embedding == plain.embedding
+        assert model.lifting.names == plain.lifting.names
 
 
 def test_bad_arguments() -> None:
