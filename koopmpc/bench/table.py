@@ -26,7 +26,9 @@ _STATUS = {
 }
 
 LEGEND = (
-    "cost: Σ‖x−r‖²_Q + ‖u−u_r‖²_R over the run, u_r the input that holds r, and its ratio to nonlinear-mpc. "
+    "cost: Σ‖x−r‖²_Q + ‖u−u_r‖²_R over the run, u_r the input that holds r, and its ratio to nonlinear-mpc. That plans "
+    "with the equations: where the plant carries a load that they do not know it is no oracle, and a ratio can be "
+    "below 1. "
     "settles: time until the weighted error stays below 2 % of its first value; within 5 %, only 5 % is kept "
     "over the last tenth of the run; does not reach, not even that. off: largest entry of x−r at the end. "
     "over: largest violation of a state or output limit. p50, p99: time of a step. Steps: free, the unconstrained "

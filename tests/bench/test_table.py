@@ -56,6 +56,7 @@ def test_each_row_says_how_it_went():
     assert "within 5 %" in line["linear-mpc"]
     legend = " ".join(printed(table(rows())).split()).split(" cost: ")[1]
     assert all(f"{word}, " in legend for word in ("within 5 %", "does not reach", "free", "clipped"))
+    assert "a load that they do not know it is no oracle, and a ratio can be below 1" in legend
     assert "2.35 s" in line["koopman-mpc"]
     assert "0.25" in line["koopman-mpc"]
     assert "13 µs" in line["nonlinear-mpc"]
