@@ -9,20 +9,22 @@ from typing import Any
 
 from koopmpc.data.agreement import About, about, joined
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.ranges import RangePart, ranges
 from koopmpc.data.source import Part, Source
 from koopmpc.data.storage import load_episodes
 from koopmpc.errors import DataError, KoopmpcError, LogError
 
 Reader = Callable[[Path], Episodes]
 SUFFIXES = (".npz", ".parquet", ".csv", ".rrd")
-_PART = 8_000_000  # bytes of small files that are one part
+_PART = 8_000_000  # bytes of a part of several files, or of a range of one
+_LARGE = 32_000_000  # bytes from which a file is cut
 
 
 class Files(Source):
     """The episodes of a folder's .npz, .parquet, .csv and .rrd files, in the order of their names.
 
-    A part is a file, or several small neighbours; it is read when its turn comes, and not kept. The first file
-    tells dt and names, and each other must agree.
+    A part is a file, or several small neighbours, or a range of rows of a large .npz file; it is read when its
+    turn comes, and not kept. The first file tells dt and names, and each other must agree.
 
     Parameters
     ----------
@@ -52,22 +54,37 @@ class Files(Source):
             raise DataError(f"a reader of your own is given no {', '.join(reading)}; bind them with partial")
         self.files = _found(paths)
         self._reader = partial(load_episodes, **reading) if reader is None else reader
-        first = _read(self.files[0], self._reader)
+        self._plain = reader is None and not reading
+        cut = self._cut(self.files[0], 0, None)
+        first = cut[0].load() if cut else _read(self.files[0], self._reader)
         self._about = about(first, str(self.files[0]))
         super().__init__(first.dt, first.states, first.inputs, first.disturbances)
 
     def parts(self, history: int = 0) -> list[Part]:
         """Return the parts in order."""
-        groups: list[list[Path]] = []
-        room = -1
+        parts: list[Part] = []
+        group: list[Path] = []
+        room = _PART
         for file in self.files:
             size = file.stat().st_size
-            if size > room:
-                groups.append([])
-                room = _PART
-            groups[-1].append(file)
-            room -= size
-        return [FilePart(tuple(group), self._reader, self._about) for group in groups]
+            cut = self._cut(file, history, self._about)
+            if group and (cut or size > room):
+                parts.append(FilePart(tuple(group), self._reader, self._about))
+                group, room = [], _PART
+            if cut:
+                parts += cut
+            else:
+                group.append(file)
+                room -= size
+        if group:
+            parts.append(FilePart(tuple(group), self._reader, self._about))
+        return parts
+
+    def _cut(self, file: Path, history: int, about: About | None) -> list[RangePart] | None:
+        """Return the parts of a large file that can be read in ranges."""
+        if not self._plain or file.suffix != ".npz" or file.stat().st_size < _LARGE:
+            return None
+        return ranges(file, _PART, history, about)
 
 
 @dataclass(frozen=True, eq=False)
