@@ -13,6 +13,7 @@ from koopmpc.identify.assemble import assembled, growth, read, tikhonov
 from koopmpc.identify.contraction import Misfit, clipped, inside, nearest, radius_of
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.edmd import regression
+from koopmpc.identify.fit import Regression
 from koopmpc.identify.lyapunov import lyapunov_fit
 from koopmpc.identify.moments import How
 from koopmpc.identify.solve import Rows, norms, onto, solve
@@ -66,7 +67,8 @@ def stable_edmd(
     Warns
     -----
     FitWarning
-        As `edmd`. ``report.changes`` tells the spectral radius and the misfit before and after.
+        As `edmd`. ``report.changes`` tells the spectral radius, the misfit and each state's residual before and
+        after: small residuals may grow much, for each observable counts relative to its own size.
     """
     rho, ridge = checks.positive(radius, "radius"), tikhonov(ridge)
     total, disturbances = read(episodes, lifting, embedding, **how)
@@ -87,8 +89,21 @@ def stable_edmd(
         after = radius_of(stable[np.ix_(moving, moving)].T)
         rule = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, ridge {ridge:g}"
         changes = [f"spectral radius {before:.6g} before, {after:.6g} after", growth(rows, stable, K)]
+        changes += _losses(task, K, stable)
         K = stable
     return assembled(task, K, disturbances, rule=rule, ridge=ridge, sentences=sentences, changes=changes)
+
+
+def _losses(
+    task: Regression, plain: Float[np.ndarray, "n nz"], stable: Float[np.ndarray, "n nz"]
+) -> list[str]:
+    """Return for each state what stability costs its one-step residual, in words."""
+    C = np.eye(task.lifting.nz) if task.C is None else task.C
+    pairs = zip(*(task.rows.residual(task.x_next, K @ C.T) for K in (plain, stable)), strict=True)
+    return [
+        f"one-step residual of {name!r}: {before:.3g} before, {after:.3g} after"
+        for name, (before, after) in zip(task.states, pairs, strict=True)
+    ]
 
 
 def _stabilised(

@@ -219,8 +219,8 @@ def test_ten_million_updates(forgetting: float) -> None:
 
 @pytest.mark.slow
 def test_single_updates() -> None:
-    error = long_run(300_000, 1, 0.999, 0)
-    print(f"3·10⁵ single updates: largest error of A, B {error:.1e}")  # noqa: T201
+    error = long_run(100_000, 1, 0.999, 0)
+    print(f"10⁵ single updates: largest error of A, B {error:.1e}")  # noqa: T201
     assert error < 1e-9
 
 

@@ -75,6 +75,9 @@ def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radi
         f"spectral radius {radius_of(plain.A):.6g} before, {radius_of(model.A):.6g} after"
         in model.report.changes
     )
+    losses = zip(data.states, plain.report.residual, model.report.residual, strict=True)
+    said = tuple(f"one-step residual of {n!r}: {b:.3g} before, {a:.3g} after" for n, b, a in losses)
+    assert model.report.changes[2:] == said
 
 
 def test_one_observable_moves_to_the_circle() -> None:
