@@ -28,7 +28,7 @@ from koopmpc.estimate.state import MeasuredState
 from koopmpc.plant.step_map import StepMap
 
 FIRST = 10  # passes of a first step, at most
-SETTLED = 1e-6  # a first plan rests when no input moves by more than this share of its size
+SETTLED = 1e-6  # a first plan rests when no input and no state moves by more than this share of their size
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 
@@ -39,9 +39,11 @@ class BilinearMPC(Receding):
     has the dimension of x. The controller keeps the planned states X_k as well as the inputs u_k and moves both on by
     one step. Each pass linearises at (X_k, u_k), with defects c_k = F(X_k, u_k) − X_{k+1} and δx_0 = x − X_0, and
     adds the solution of that quadratic program (Gauss–Newton in the tracked outputs), halved until F is
-    near its linearisation along it. The inputs are never simulated over the horizon, save for a first plan, the free
-    motion: on an unstable plant that multiplies the model's error a thousandfold. A Riccati recursion solves the
-    program; where its plan breaks a limit, an interior-point method whose steps are Riccati recursions.
+    near its linearisation along it. The inputs are never simulated over the horizon: on an unstable plant that
+    multiplies the model's error a thousandfold, and a first plan along the free motion may end where no data were. A
+    Riccati recursion solves the program; where its plan breaks a limit, an interior-point method whose steps are
+    Riccati recursions. Where changes of the inputs count, or moves are blocked, they are its inputs, and the last
+    input is part of the state.
 
     Parameters
     ----------
@@ -228,9 +230,10 @@ class BilinearMPC(Receding):
             length = iteration.take(s, found)
             self._enter(*self._staged.plan(iteration.X, iteration.U), u_prev)
             status = Status.SOFTENED if softened(found.slacks, iteration.soft_box) else found.status
+            moved = (found.U, iteration.U), (found.X, iteration.X)
             if length < SHORTEST:
                 status = Status.FAILED
-            elif np.abs(found.U).max() <= SETTLED * (1 + np.abs(iteration.U).max()):
+            elif all(np.abs(d).max() <= SETTLED * (1 + np.abs(v).max()) for d, v in moved):
                 break
         return status, total
 
@@ -244,16 +247,9 @@ class BilinearMPC(Receding):
         self._iteration.X[:], self._iteration.U[:] = self._staged.along(X, U, u_prev)
 
     def _guess(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]) -> None:
-        """Start a plan: the free motion of the model from x, or rest at x where that leaves the finite numbers."""
-        U = np.tile(
-            np.clip(u_prev if self._rated else np.zeros(self._nu), *self._outputs.inputs), (self._N, 1)
-        )
-        X = np.tile(x, (self._N + 1, 1))
-        for k, u in enumerate(U):
-            X[k + 1] = self._map.step(X[k], u) + self._iteration.e[k, : len(x)]
-        if not np.abs(X).max() < HUGE:
-            X[:] = x
-        self._enter(X, U, u_prev)
+        """Start a plan: rest at x. The free motion of a learned model may leave its data, and lead to a plan there."""
+        u = np.clip(u_prev if self._rated else np.zeros(self._nu), *self._outputs.inputs)
+        self._enter(np.tile(x, (self._N + 1, 1)), np.tile(u, (self._N, 1)), u_prev)
 
     def _move_on(self, u_prev: Float[np.ndarray, " nu"]) -> None:
         """Make the plan of the last step the start of this one; its last stage is one step of the model."""

@@ -76,6 +76,16 @@ def test_a_linear_model_of_the_same_data_does_not() -> None:
     assert sum(upright(run) for run in learned.runs(linear, 2)) == 0
 
 
+def test_its_first_plan_stays_where_the_model_was_learned() -> None:
+    """Half a radian off: a first plan along the free fall, beyond the data, would end in the model's own invention."""
+    learned = Learned("cart_pole")
+    problem, case = learned.problem, learned.problem.cases["recover"]
+    mpc = BilinearMPC(learned.model, problem.cost, problem.limits, problem.horizon)
+    run = simulate(learned.parts.step_map, mpc, x0=case.x0, reference=case.reference, steps=case.steps)
+    assert np.abs(run.X[-1] - case.reference).max() < 0.05
+    assert np.abs(run.X[:, 2] - np.pi).max() < 0.7
+
+
 @pytest.mark.slow
 def test_at_least_95_of_100_starts_swing_up(learned: Learned) -> None:
     runs = learned.runs(learned.bilinear(), 100)
