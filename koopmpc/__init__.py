@@ -88,6 +88,7 @@ from koopmpc.predict.linear import LinearPredictor, load_predictor
 from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+from koopmpc.recording.episodes import run_episodes
 from koopmpc.recording.model import record_model
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
@@ -221,6 +222,7 @@ __all__ = [
     "record",
     "record_model",
     "residual_dmd",
+    "run_episodes",
     "save_figure",
     "score",
     "simulate",

@@ -13,7 +13,7 @@ _KEY = b"koopmpc.episodes"
 ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
 
-def check_names(names: tuple[str, ...]) -> None:
+def check_names(names: tuple[str, ...], suffix: str) -> None:
     """Raise where a state or an input is named like one of the table's own columns.
 
     Raises
@@ -24,7 +24,7 @@ def check_names(names: tuple[str, ...]) -> None:
     for name in ("episode", "step"):
         if name in names:
             raise DataError(
-                f"a .parquet file has a column {name!r} of its own; rename the state, or save as .npz"
+                f"a {suffix} file has a column {name!r} of its own; rename the state, or save as .npz"
             )
 
 
@@ -35,7 +35,7 @@ def write(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    episode, step = _index(steps)
+    episode, step = positions(steps)
     last = step == steps[episode]
     full = np.zeros((len(X), U.shape[1]))
     full[~last] = U
@@ -87,7 +87,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     named = json.loads(about)
     episode, step = (table[name].to_numpy() for name in ("episode", "step"))
     steps = np.bincount(episode) - 1
-    expected = _index(steps)
+    expected = positions(steps)
     if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
         raise ValueError("rows are missing or out of order")
     last = step == steps[episode]
@@ -101,7 +101,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     )
 
 
-def _index(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def positions(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the episode and the step of every row."""
     rows = steps + 1
     first = np.cumsum(rows) - rows

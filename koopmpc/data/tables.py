@@ -1,62 +1,141 @@
 """A user's own table as episodes: a row a time step, a column a state or an input."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.data import parquet
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.roles import Roles, roles
+from koopmpc.data.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.errors import DataError, FitWarning, KoopmpcError
 
 
-def read_table(
-    file: Path, dt: float | None, states: Sequence[str] | None, inputs: Sequence[str] | None
-) -> Episodes:
-    """Return the episodes of a plain .parquet table; `load_episodes` says what its columns mean.
+@dataclass(frozen=True)
+class Told:
+    """What the caller says of a table; None is found out."""
+
+    dt: float | None = None
+    states: Sequence[str] | None = None
+    inputs: Sequence[str] | None = None
+    disturbances: Sequence[str] | None = None
+    resample: float | None = None
+
+    @property
+    def nothing(self) -> bool:
+        """Whether all is to be found out."""
+        return all(value is None for value in vars(self).values())
+
+
+def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], told: Told) -> Episodes:
+    """Return the episodes of a plain table; `load_episodes` says what its columns mean.
+
+    Parameters
+    ----------
+    file
+        For messages.
+    names
+        All columns, in their order.
+    columns
+        Those whose names are there once.
+    told
+        What need not be found out.
 
     Raises
     ------
     DataError
-        Something is not told, a column is missing, or its rows are no whole episodes.
+        Something is not told and cannot be found out, a column is missing, or its rows are no whole episodes.
     """
-    names = parquet.names(file)
-    if dt is None or states is None or inputs is None:
-        missing = [n for n, v in (("dt", dt), ("states", states), ("inputs", inputs)) if v is None]
-        raise DataError(
-            f"{file} is a table that does not say what it holds: pass {', '.join(f'{n}=' for n in missing)}; "
-            f"its columns are {', '.join(names)}"
-        )
-    for what, given in (("states", states), ("inputs", inputs)):
-        if isinstance(given, str):
-            raise DataError(f"{what} is {given!r}; pass a tuple of names")
-    own = (*states, *inputs)
-    for name in own:
-        if names.count(name) != 1:
-            has = "has two columns" if name in names else "has no column"
-            raise DataError(f"{file} {has} {name!r}; its columns are {', '.join(names)}")
-    index = [name for name in ("episode", "step") if names.count(name) == 1 and name not in own]
-    columns = parquet.columns(file, [*index, *own])
+    where = str(file)
+    numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
+    found = roles(
+        names,
+        where,
+        states=told.states,
+        inputs=told.inputs,
+        disturbances=told.disturbances,
+        numeric=numeric,
+    )
     rows = len(next(iter(columns.values()))) if columns else 0
-    episode = _numbered(columns["episode"], file) if "episode" in index else np.zeros(rows, dtype=np.intp)
-    step = checks.array(columns["step"], f"{file}: step", (None,)) if "step" in index else np.arange(rows)
-    order = np.lexsort((step, episode))
     table = {
-        name: checks.array(columns[name], f"{file}: {name}", (None,), finite=False)[order] for name in own
+        name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values
     }
-    X, U = (_stacked([table[name] for name in some], rows) for some in (states, inputs))
-    found: list[Episode] = []
+    time = None if found.time is None else _time(columns[found.time], found)
+    if time is None and told.resample is not None:
+        raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
+    episode = np.zeros(rows, dtype=np.intp)
+    if found.episode is not None:
+        episode = _numbered(columns[found.episode], file)
+    step = None
+    if found.step is not None and time is None:
+        step = checks.array(columns[found.step], f"{where}: step", (None,))
+    X, U, W = (
+        _stacked([table[n] for n in some], rows) for some in (found.states, found.inputs, found.disturbances)
+    )
+    parts: list[Signals] = []
     for e in range(int(episode.max(initial=-1)) + 1):
-        here = episode[order] == e
-        if "step" in index and (np.diff(step[order][here]) != 1).any():
-            raise DataError(f"{file}, episode {e}: steps are missing or come twice; split it there")
-        try:
-            found.append(Episode(X=X[here], U=U[here][:-1]))
-        except KoopmpcError as error:
-            raise DataError(f"{file}, episode {e}: {error}") from error
-    return Episodes(found, dt, tuple(states), tuple(inputs))
+        here = np.flatnonzero(episode == e)
+        if step is not None:
+            here = here[np.argsort(step[here], kind="stable")]
+            if (np.diff(step[here]) != 1).any():
+                raise DataError(f"{where}, episode {e}: steps are missing or come twice; split it there")
+        of = None if time is None else time[here]
+        parts += restarts(Signals(of, X[here], U[here], W[here], here + 1))
+    dt = told.resample if told.resample is not None else told.dt
+    if dt is None:
+        if time is None:
+            raise DataError(
+                f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'; its columns are "
+                f"{', '.join(names)}"
+            )
+        dt = sample_time([part.time for part in parts if part.time is not None], where)
+    dt = checks.positive(dt, "dt", "s")
+    if told.resample is not None:
+        parts = [piece for part in parts for piece in resampled(part, dt)]
+    if found.guessed:
+        _doubt(found, table, where, alone=told.inputs is None and not found.inputs)
+    try:
+        episodes = episodes_from(parts, dt, where)
+        return Episodes(episodes, dt, found.states, found.inputs, found.disturbances)
+    except KoopmpcError as error:
+        if str(error).startswith(where):
+            raise
+        raise DataError(f"{where}: {error}") from error
+
+
+def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
+    """Warn of what a guess may have taken for something else, and of columns that say nothing."""
+    if alone:
+        warnings.warn(
+            f"{where}: no column is named as an input, so the plant is taken to run by itself; its states are "
+            f"{', '.join(found.states)}; pass inputs= if some of them are inputs",
+            FitWarning,
+            stacklevel=3,
+        )
+    for i, name in enumerate(found.values):
+        column = table[name][np.isfinite(table[name])]
+        if len(column) and np.ptp(column) == 0:
+            warnings.warn(
+                f"{where}: {name!r} is {column[0]:g} throughout; leave it out: pass states= and inputs=",
+                FitWarning,
+                stacklevel=3,
+            )
+            continue
+        for other in found.values[:i]:
+            if np.array_equal(table[name], table[other], equal_nan=True):
+                warnings.warn(
+                    f"{where}: {name!r} repeats {other!r}; leave one out: pass states= and inputs=",
+                    FitWarning,
+                    stacklevel=3,
+                )
+
+
+def _time(column: np.ndarray, found: Roles) -> Float[np.ndarray, " M"]:
+    return checks.array(column, str(found.time), (None,), finite=False) * found.scale
 
 
 def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:

@@ -176,7 +176,9 @@ from koopmpc.identify.bilinear import bilinear_edmd
 show(lambda: bilinear_edmd(X, km.State()))
 """
     )
-    episodes = "; pass Episodes([Episode(X=…, U=…), …], dt), or what collect returns"
+    episodes = (
+        "; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, Files(folder) or Stream(episodes)"
+    )
     assert lines == [
         "DataError episode 0 is a ndarray; pass Episode(X=…, U=…)",
         "DataError episodes is a ndarray; pass a list of Episode(X=…, U=…)",

@@ -78,19 +78,24 @@ def test_a_state_may_be_named_step(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("columns", "told", "text"),
     [
-        ({}, {}, r"does not say what it holds: pass dt=, states=, inputs=; its columns are x, u"),
-        ({}, {"dt": 0.1, "states": ["x"]}, r"does not say what it holds: pass inputs=; its columns"),
+        ({}, {}, r"does not say its sample time: pass dt=, or add a column 'time \[s\]'; its columns are x, u"),
+        ({}, {"resample": 0.1}, r"has no column of time to resample by; its columns are x, u"),
+        ({}, {"dt": 0.1, "states": []}, r"has no column that could be a state: its columns are x, u; pass states="),
+        ({"time [h]": [0, 1, 2]}, {}, r"the unit of 'time \[h\]' is not one of s, ms"),
+        ({"time": [1, 1, 1]}, {"states": ["x"]}, r"time does not advance in any two rows; pass dt="),
+        ({"time": [0, 0.1, 0.22]}, {"states": ["x"], "inputs": ["u"]}, 
+         r"sampling is unequal: 2 of 2 steps differ from dt = 0\.11 s by more "
+         r"than 2 %, the first at row 1, where it is 0\.1 s; pass resample=0\.11"),
         ({}, TOLD | {"states": "x"}, r"states is 'x'; pass a tuple of names"),
         ({}, TOLD | {"states": ["v"]}, r"own\.parquet has no column 'v'; its columns are x, u"),
         ({}, TOLD | {"dt": 0.0}, r"dt is 0 s; it must be above zero"),
-        ({"x": [1.0, None, 2.0]}, TOLD, r"own\.parquet, episode 0: X holds 1 NaN or inf, the first at \(1, 0\)"),
-        ({"u": [1.0, None, 2.0]}, TOLD, r"own\.parquet, episode 0: U holds 1 NaN or inf"),
+        ({"x": [1.0, None, 2.0]}, TOLD, r"own\.parquet: no two rows in sequence hold all states and inputs"),
+        ({"u": [None, None, None]}, TOLD, r"own\.parquet: u is not an array of numbers"),
         ({"x": ["a", "b", "c"]}, TOLD, r"own\.parquet: x is not an array of numbers"),
         ({"step": [0, 1, 3]}, TOLD, r"own\.parquet, episode 0: steps are missing or come twice"),
         ({"step": [0, 1, 1]}, TOLD, r"own\.parquet, episode 0: steps are missing or come twice"),
-        ({"episode": [0, 0, 1]}, TOLD, r"episode 1 is too short: X has 1 row"),
         ({"episode": ["a", "a", None]}, TOLD, r"has rows whose episode is null; give each row"),
-        ({"x": pa.array([], pa.float64()), "u": pa.array([], pa.float64())}, TOLD, r"there is no episode; pass at"),
+        ({"x": pa.array([], pa.float64()), "u": pa.array([], pa.float64())}, TOLD, r"no two rows in sequence"),
     ],
 )  # fmt: skip
 def test_what_is_missing_is_named(tmp_path: Path, columns: dict, told: dict, text: str) -> None:

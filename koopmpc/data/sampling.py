@@ -1,0 +1,156 @@
+"""Rows of a table as uniformly sampled episodes: where sampling breaks, values are missing, or time is unequal."""
+
+import warnings
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from koopmpc.data.episodes import Episode
+from koopmpc.errors import DataError, FitWarning
+
+_JITTER = 0.02  # share of dt by which a step may differ
+_GAP = 1.5  # steps longer than this times dt are gaps
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Rows of one episode: time [s] or None, states, inputs, disturbances; `rows` says where in the file they stand."""
+
+    time: Float[np.ndarray, " M"] | None
+    X: Float[np.ndarray, "M nx"]
+    U: Float[np.ndarray, "M nu"]
+    W: Float[np.ndarray, "M nw"]
+    rows: Int[np.ndarray, " M"]
+
+    def cut(self, first: int, last: int) -> "Signals":
+        """Return rows first … last − 1."""
+        part = slice(first, last)
+        time = None if self.time is None else self.time[part]
+        return Signals(time, self.X[part], self.U[part], self.W[part], self.rows[part])
+
+
+def sample_time(times: list[np.ndarray], where: str) -> float:
+    """Return the median step of a time column, given part by part, to six digits.
+
+    Raises
+    ------
+    DataError
+        There are less than two rows, or time stands still.
+    """
+    steps = np.concatenate([np.zeros(0), *map(np.diff, times)])
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    if not len(steps):
+        raise DataError(f"{where}: time does not advance in any two rows; pass dt=")
+    return float(f"{np.median(steps):.6g}")
+
+
+def restarts(signals: Signals) -> list[Signals]:
+    """Return the parts between which time goes back: a recorder that was started anew."""
+    if signals.time is None:
+        return [signals]
+    at = _edges(np.diff(signals.time) < 0)
+    return [signals.cut(a, b) for a, b in pairwise(at)]
+
+
+def resampled(signals: Signals, dt: float) -> list[Signals]:
+    """Return the rows at t₀, t₀ + dt, …: states between two rows interpolated, inputs and disturbances held.
+
+    Rows with a value missing are left out first. A step of more than 1.5 times both dt and the median step is a gap,
+    and cuts.
+    """
+    assert signals.time is not None, "only a table with a time column is resampled"
+    whole = np.isfinite(signals.X).all(axis=1) & np.isfinite(signals.time)
+    X, U, W = signals.X[whole], signals.U[whole], signals.W[whole]
+    kept = Signals(signals.time[whole], X, U, W, signals.rows[whole])
+    assert kept.time is not None
+    ahead = np.diff(kept.time)
+    if not len(ahead):
+        return []
+    longest = _GAP * max(dt, float(np.median(ahead)))
+    at = _edges(ahead > longest)
+    parts = [kept.cut(a, b) for a, b in pairwise(at)]
+    return [_on_grid(part, dt) for part in parts if len(part.X) > 1]
+
+
+def _on_grid(part: Signals, dt: float) -> Signals:
+    time = part.time
+    assert time is not None
+    distinct = np.concatenate([[True], np.diff(time) > 0])
+    t = time[distinct]
+    X, U, W, rows = part.X[distinct], part.U[distinct], part.W[distinct], part.rows[distinct]
+    count = int(np.floor((t[-1] - t[0]) / dt * (1 + 1e-9))) + 1
+    grid = t[0] + dt * np.arange(count)
+    before = np.asarray(np.searchsorted(t, grid + 1e-9 * dt, side="right"), dtype=np.intp)
+    held = np.clip(before - 1, 0, len(t) - 1)
+    states = np.empty((count, X.shape[1]))
+    for i in range(X.shape[1]):
+        states[:, i] = np.interp(grid, t, X[:, i])
+    return Signals(grid, states, U[held], W[held], rows[held])
+
+
+def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:
+    """Return the episodes between gaps; a warning counts what was cut and lost.
+
+    A gap is a missing value, a step of time of more than 1.5 dt, or a row without a neighbour.
+
+    Raises
+    ------
+    DataError
+        Sampling is unequal, or nothing is left.
+    """
+    found: list[Episode] = []
+    rows = kept = 0
+    gaps: list[int] = []
+    for part in parts:
+        rows += len(part.X)
+        for first, last in _runs(part, dt, where, gaps):
+            if last - first < 2:
+                continue
+            kept += last - first
+            X, U, W = (values[first:last] for values in (part.X, part.U, part.W))
+            found.append(Episode(X=X, U=U[:-1], W=W[:-1]))
+    lost = rows - kept
+    if not found:
+        raise DataError(
+            f"{where}: no two rows in sequence hold all states and inputs; a column may be empty, or named as an "
+            "input by mistake"
+        )
+    if gaps or lost:
+        shown = ", ".join(str(row) for row in gaps[:3]) + (", …" if len(gaps) > 3 else "")
+        at = f" (after row {shown})" if gaps else ""
+        warnings.warn(
+            f"{where}: {len(gaps)} gaps{at} cut {len(parts)} episodes into {len(found)}; {lost} of {rows} rows are "
+            "lost",
+            FitWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def _runs(part: Signals, dt: float, where: str, gaps: list[int]) -> list[tuple[int, int]]:
+    """Return [first, last) of what is sampled without a gap, and note the file's rows before the gaps."""
+    known = np.asarray(np.isfinite(part.X).all(axis=1), dtype=np.bool_)
+    driven = np.asarray(np.isfinite(np.hstack([part.U, part.W])).all(axis=1), dtype=np.bool_)
+    joined = known[:-1] & known[1:] & driven[:-1]  # row k leads to row k + 1
+    if part.time is not None:
+        steps = np.diff(part.time)
+        joined = joined & np.isfinite(steps) & (steps <= _GAP * dt)
+        uneven = np.flatnonzero(joined & (np.abs(steps - dt) > _JITTER * dt))
+        if len(uneven):
+            k = int(uneven[0])
+            raise DataError(
+                f"{where}: sampling is unequal: {len(uneven)} of {len(steps)} steps differ from dt = {dt:g} s by "
+                f"more than 2 %, the first at row {part.rows[k]}, where it is {steps[k]:g} s; pass resample={dt:g} to "
+                "interpolate"
+            )
+    breaks = np.flatnonzero(~joined)
+    first_of_each = breaks[np.diff(breaks, prepend=-2) > 1]
+    gaps.extend(int(part.rows[k]) for k in first_of_each)
+    return list(pairwise(_edges(~joined)))
+
+
+def _edges(broken: Bool[np.ndarray, " steps"]) -> list[int]:
+    """Return 0, the rows that do not follow the one before them, and the number of rows."""
+    return [0, *(int(k) + 1 for k in np.flatnonzero(broken)), len(broken) + 1]

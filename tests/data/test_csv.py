@@ -1,0 +1,150 @@
+"""Tables as text: what is told and what is guessed, gaps, unequal time, and files that are no tables."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from koopmpc.data.storage import load_episodes
+from koopmpc.errors import DataError, FitWarning, LogError
+
+
+def text(file: Path, content: str, encoding: str = "utf-8") -> Path:
+    file.write_bytes(content.encode(encoding))
+    return file
+
+
+def test_a_log_that_says_nothing_is_understood(tmp_path: Path) -> None:
+    file = text(
+        tmp_path / "log.csv",
+        "time [s],theta [rad],omega,force [N],note\n0,1,2,5,a\n0.1,3,4,6,b\n0.2,5,6,,c\n",
+    )
+    read = load_episodes(file)
+    assert (read.dt, read.states, read.inputs) == (0.1, ("theta [rad]", "omega"), ("force [N]",))
+    assert read[0].X.tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert read[0].U.tolist() == [[5], [6]]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "# by hand\n# twice\nt,x,u\n0,1.5,1\n1,2.5,2\n2,3.5,\n",
+        "t;x;u\n0;1,5;1\n1;2,5;2\n2;3,5;\n",
+        "t\tx\tu\n0\t1.5\t1\n1\t2.5\t2\n2\t3.5\tNaN\n",
+        "\ufefft,x,u\r\n0,1.5,1\r\n1,2.5,2\r\n2,3.5,\r\n",
+        "time [ms],x,u\n0,1.5,1\n1000,2.5,2\n2000,3.5,\n",
+        "timestamp,x,u\n2026-01-01 00:00:00,1.5,1\n2026-01-01 00:00:01,2.5,2\n2026-01-01 00:00:02,3.5,\n",
+    ],
+)
+def test_the_ways_in_which_programs_write_one_table(tmp_path: Path, content: str) -> None:
+    read = load_episodes(text(tmp_path / "log.csv", content))
+    assert (read.dt, read.states, read.inputs) == (1.0, ("x",), ("u",))
+    assert (read[0].X.ravel().tolist(), read[0].U.ravel().tolist()) == ([1.5, 2.5, 3.5], [1.0, 2.0])
+
+
+def test_letters_of_another_encoding(tmp_path: Path) -> None:
+    read = load_episodes(
+        text(tmp_path / "log.csv", "t,φ\n0,1\n1,2\n".replace("φ", "é"), "latin-1"), inputs=[]
+    )
+    assert read.states == ("é",)
+
+
+def test_what_is_told_counts(tmp_path: Path) -> None:
+    file = text(tmp_path / "log.csv", "a,b,w,u1\n1,2,3,4\n5,6,7,8\n")
+    read = load_episodes(file, dt=0.5, states=["u1"], inputs=["a"], disturbances=["b"])
+    assert (read.states, read.inputs, read.disturbances, read.dt) == (("u1",), ("a",), ("b",), 0.5)
+    guessed = load_episodes(file, dt=0.5)
+    assert (guessed.states, guessed.inputs, guessed.disturbances) == (("a", "b"), ("u1",), ("w",))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(5, 40), st.sets(st.integers(0, 39), max_size=6), st.sets(st.integers(0, 39), max_size=4))
+def test_gaps_cut_and_no_pair_spans_one(tmp_path: Path, T: int, holes: set[int], late: set[int]) -> None:
+    """Each pair of the result is a pair of whole rows, one dt apart, and none of these is lost."""
+    t = np.arange(T) + np.array([sum(k > j for j in late) * 3 for k in range(T)])
+    x = [np.nan if k in holes else float(k) for k in range(T)]
+    rows = [f"{tk},{xk},{10 * k}" for k, (tk, xk) in enumerate(zip(t, x, strict=True))]
+    file = text(tmp_path / "log.csv", "\n".join(["t,x,u", *rows]) + "\n")
+    pairs = [k for k in range(T - 1) if k not in holes and k + 1 not in holes and t[k + 1] - t[k] == 1]
+    if not pairs:
+        with pytest.raises(DataError, match="no two rows in sequence"):
+            load_episodes(file, dt=1.0)
+        return
+    if len(pairs) == T - 1:
+        read = load_episodes(file, dt=1.0)
+    else:
+        with pytest.warns(
+            FitWarning, match=r"gaps \(after row .*\) cut 1 episodes into \d+; \d+ of \d+ rows"
+        ):
+            read = load_episodes(file, dt=1.0)
+    found = [int(x) for e in read for x in e.X[:-1, 0]]
+    assert found == pairs
+    assert all(np.array_equal(e.U, 10 * e.X[:-1]) for e in read)
+    assert all((np.diff(e.X[:, 0]) == 1).all() for e in read)
+
+
+def test_time_that_goes_back_starts_an_episode(tmp_path: Path) -> None:
+    read = load_episodes(text(tmp_path / "log.csv", "t,x,u\n0,1,1\n1,2,1\n0,7,1\n1,8,2\n2,9,1\n"))
+    assert [e.X.ravel().tolist() for e in read] == [[1, 2], [7, 8, 9]]
+
+
+def test_unequal_time_is_named_and_resampled(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.08, 0.12, 60))
+    rows = [f"{v!r},{2 * v - 1!r},{k}" for k, v in enumerate(t.tolist())]
+    file = text(tmp_path / "log.csv", "\n".join(["t,x,u", *rows]))
+    with pytest.raises(
+        DataError, match=r"steps differ from dt = .* by more than 2 %, the first at row 1, where it"
+    ):
+        load_episodes(file)
+    (episode,) = read = load_episodes(file, resample=0.05)
+    grid = t[0] + 0.05 * np.arange(len(episode.X))
+    assert read.dt == 0.05
+    assert grid[-1] <= t[-1] < grid[-1] + 0.05
+    assert np.allclose(episode.X[:, 0], 2 * grid - 1, atol=1e-12)  # a straight line is its own interpolation
+    held = np.searchsorted(t, grid[:-1] + 1e-9, side="right") - 1
+    assert episode.U[:, 0].tolist() == held.tolist()
+
+
+def test_columns_that_say_nothing_are_named(tmp_path: Path) -> None:
+    file = text(tmp_path / "log.csv", "t,x,y,c,u\n0,1,1,7,1\n1,2,2,7,0\n2,4,4,7,1\n")
+    with pytest.warns(FitWarning) as caught:
+        load_episodes(file)
+    said = [str(w.message) for w in caught]
+    assert any("'y' repeats 'x'; leave one out" in s for s in said)
+    assert any("'c' is 7 throughout; leave it out" in s for s in said)
+    with pytest.warns(
+        FitWarning, match="no column is named as an input, .* its states are x, y; pass inputs="
+    ):
+        load_episodes(text(tmp_path / "free.csv", "t,x,y\n0,1,5\n1,2,3\n"))
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "said"),
+    [
+        ("", LogError, "it is no .csv file, or was cut"),
+        ("\n\n", LogError, "it is no .csv file"),
+        ("t,x,u\n0,1,2\n1,2\n", LogError, "can be read: CSV parse error: Expected 3 columns, got 2"),
+        ("0,1,2\n1,2,3\n", LogError, "has no line of names: its first row is 0, 1, 2"),
+        ("t,x,x\n0,1,2\n1,2,3\n", DataError, "has two columns 'x'; rename one"),
+        ("t,u\n0,1\n1,2\n", DataError, "has no column that could be a state: its columns are t, u"),
+        ("t,x,u\n", DataError, "has no column that could be a state|no two rows in sequence|does not advance"),
+        ("x,u\n1,2\n2,3\n", DataError, "does not say its sample time: pass dt="),
+    ],
+)  # fmt: skip
+def test_what_is_no_table_is_refused(tmp_path: Path, content: str, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        load_episodes(text(tmp_path / "log.csv", content))
+
+
+def test_a_changed_file_of_our_own_is_refused(tmp_path: Path) -> None:
+    file = text(tmp_path / "log.csv", "t,x,u\n0,1,2\n1,2,3\n2,3,4\n")
+    load_episodes(file).save(tmp_path / "own.csv")
+    lines = (tmp_path / "own.csv").read_text().splitlines()
+    text(tmp_path / "own.csv", "\n".join([*lines[:3], *lines[4:]]))
+    with pytest.raises(
+        LogError, match="holds no episodes that can be read: its rows are not those that were written"
+    ):
+        load_episodes(tmp_path / "own.csv")
