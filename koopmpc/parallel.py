@@ -320,20 +320,23 @@ def _awaited(job: _Job[Any], future: Any, client: Any) -> Any:
 def _client(scheduler: str, workers: int | None) -> Generator[Any]:
     """Return a client of the cluster; a local one, which only this machine sees, is taken down after."""
     try:
+        from dask import config
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise KoopmpcError("a scheduler needs Dask; install it with: pip install 'koopmpc[dask]'") from error
     with ExitStack() as open_now:
         address: Any = scheduler
         if scheduler == "local":
-            cluster: Any = LocalCluster(
-                n_workers=workers or os.cpu_count(),
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=_ANY_PORT,
-                worker_dashboard_address=_ANY_PORT,
-            )
+            # Dask has its workers give freed memory back at once, which makes fresh arrays cost more than their sums
+            with config.set({"distributed.nanny.pre-spawn-environ": dict.fromkeys(_THREADS, "1")}):
+                cluster: Any = LocalCluster(
+                    n_workers=workers or os.cpu_count(),
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address=_ANY_PORT,
+                    worker_dashboard_address=_ANY_PORT,
+                )
             address = open_now.enter_context(cluster)
         try:
             client = open_now.enter_context(Client(address, set_as_default=False, timeout=_ANSWER))
