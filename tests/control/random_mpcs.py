@@ -177,7 +177,8 @@ def _written_down(kind, mpc, limits, pair, weights, scale, hard_rates):
 def optimality(case, x, r, u_prev, U, tolerance):
     """Return (violation of hard rows, distance from stationarity) of the plan U, both relative.
 
-    Measured in the norm of H: the unconstrained optimum is one unit of it away from U = 0. A row within `tolerance`
+    Measured in the norm of H, as shares of the distance to the unconstrained optimum and of the largest force: that
+    of a row, or the price of a slack. A row within `tolerance`
     of its end may push with any multiplier; that of a soft row stays below its price, and is its price beyond.
     """
     rows, L = case.rows, case.half
@@ -189,6 +190,7 @@ def optimality(case, x, r, u_prev, U, tolerance):
     scale = reach * unit + np.abs(values) + 1e-300
     over = np.maximum(values - rows.high, rows.low - values)
     hard = np.isinf(rows.linear)
+    unit_of_force = unit + float((rows.linear * reach)[~hard].max(initial=0.0))
     violation = float((over / scale)[hard].max(initial=0.0))
     columns, caps = [], []
     pushed = np.zeros(len(U))
@@ -202,10 +204,10 @@ def optimality(case, x, r, u_prev, U, tolerance):
         for i in np.flatnonzero(~near & ~hard & (distance > 0)):
             push = sign * (rows.linear[i] + 2 * rows.quadratic[i] * distance[i]) * pull[:, i]
             pushed += push
-            unit += np.linalg.norm(push)
+            unit_of_force += np.linalg.norm(push)
     right = -(g + pushed)
     if not columns:
-        return violation, float(np.linalg.norm(right) / (unit + 1e-300))
+        return violation, float(np.linalg.norm(right) / (unit_of_force + 1e-300))
     J = np.stack(columns, axis=1)
     size = np.linalg.norm(J, axis=0)
     J, caps = J / size, np.array(caps) * size
@@ -214,7 +216,7 @@ def optimality(case, x, r, u_prev, U, tolerance):
     else:
         found = scipy.optimize.lsq_linear(J, right, (0.0, np.maximum(caps, 1e-300)), method="bvls", tol=1e-14)
         y, rest = found.x, np.linalg.norm(J @ found.x - right)
-    return violation, float(rest / (unit + np.abs(y).sum() + 1e-300))
+    return violation, float(rest / (unit_of_force + np.abs(y).sum() + 1e-300))
 
 
 def feasible(case, x, u_prev):

@@ -10,10 +10,9 @@ import koopmpc as km
 from tests.control.random_mpcs import KINDS, feasible, optimality, random_case
 
 GOOD = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
-# How far from the optimum, relative, in the norm of the Hessian. OSQP stops at 1e-5 of the largest force, where rows
-# are soft at 1e-4 of it, and prices are forces of up to 1e4; every QP of it is also held to just that, see conftest.
+# How far from the optimum, as a share of the largest force. OSQP stops at 1e-5 of it, at 1e-4 where rows are soft, in
+# the norm of single entries, and each of its QPs is held to just that, see conftest; DAQP is exact to rounding.
 EXACT = {"osqp": 1e-2, "daqp": 1e-6}
-SOFT = {"osqp": 1e-1, "daqp": 1e-6}
 STEPS = 20
 
 
@@ -53,11 +52,11 @@ def steps(case, rng):
         x = case.A @ x + case.B @ move.u
 
 
-def through_controllers(rng, count, share):
+def through_controllers(seed, count, share):
     """Return how often each kind ended in each status, of `count` steps, of which a share is checked by brute force."""
     seen, worst = collections.Counter(), collections.Counter()
     for i in range(count // STEPS):
-        solver = ("osqp", "daqp")[i % 2]
+        rng, solver = np.random.default_rng((seed, i)), ("osqp", "daqp")[i % 2]
         case = random_case(rng, KINDS[i // 2 % len(KINDS)], solver)
         for x, r, u_prev, move, plan in steps(case, rng):
             inside(case, move.u, u_prev)
@@ -73,23 +72,22 @@ def through_controllers(rng, count, share):
                 seen[solver, "checked"] += 1
                 worst[solver, "violation"] = max(worst[solver, "violation"], violation)
                 worst[solver, "distance"] = max(worst[solver, "distance"], distance)
-                enough = (EXACT if np.isinf(case.rows.linear).all() else SOFT)[solver]
-                assert violation < EXACT[solver], (i, case.kind, status, violation)
-                assert distance < enough, (i, case.kind, status, distance)
+                assert max(violation, distance) < EXACT[solver], (seed, i, status, violation, distance)
     return seen, worst
 
 
 def test_a_sample_of_random_qps_through_whole_controllers():
     pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
-    seen, _ = through_controllers(np.random.default_rng(1), 720, 1.0)
-    assert sum(n for key, n in seen.items() if key[-1] in {status.name for status in GOOD}) > 500
+    seen, _ = through_controllers(1, 540, 1.0)
+    assert sum(n for key, n in seen.items() if key[-1] in {status.name for status in GOOD}) > 350
     assert sum(n for key, n in seen.items() if key[-1] == "INFEASIBLE") > 5
 
 
 @pytest.mark.slow
 def test_a_hundred_thousand_random_qps_through_whole_controllers():
     pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
-    seen, worst = through_controllers(np.random.default_rng(2), 100_000, 0.3)
+    seen, worst = through_controllers(2, 100_000, 0.3)
+    assert sum(n for key, n in seen.items() if key[-1] in km.Status.__members__) == 100_000
     lines = [f"{' '.join(key):40s} {n}" for key, n in sorted(seen.items())]
     lines += [f"worst {' '.join(key):20s} {value:.2g}" for key, value in worst.items()]
     sys.stdout.write("\n" + "\n".join(lines) + "\n")
