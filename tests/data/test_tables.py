@@ -83,7 +83,7 @@ def test_a_state_may_be_named_step(tmp_path: Path) -> None:
         ({}, {"dt": 0.1, "states": []}, r"has no column that could be a state: its columns are x, u; pass states="),
         ({"time [h]": [0, 1, 2]}, {}, r"the unit of 'time \[h\]' is not one of s, ms"),
         ({"time": [1, 1, 1]}, {"states": ["x"]}, r"time does not advance in any two rows; pass dt="),
-        ({"time": [0, 0.1, 0.22]}, {"states": ["x"], "inputs": ["u"]}, 
+        ({"time": [0, 0.1, 0.22]}, {"states": ["x"], "inputs": ["u"]},
          r"sampling is unequal: 2 of 2 steps differ from dt = 0\.11 s by more "
          r"than 2 %, the first at row 1, where it is 0\.1 s; pass resample=0\.11"),
         ({}, TOLD | {"states": "x"}, r"states is 'x'; pass a tuple of names"),
