@@ -164,3 +164,27 @@ def test_a_millisecond_is_held_or_reported(benchmark, name):
             "max ms": max(times) * 1e3,
         },
     )
+
+
+@pytest.mark.parametrize("name", ["osqp", "daqp"])
+@pytest.mark.parametrize("states", ["free", "soft"])
+def test_whole_steps_of_a_millisecond(benchmark, name, states):
+    """N = 100 on an unstable plant, a time limit of 1 ms a step: none is late without saying so, and by how much."""
+    unstable, push = np.array([[1.1, 0.1], [0.0, 1.05]]), np.array([[0.0], [0.1]])
+    model = km.LinearPredictor(unstable, push, np.eye(2), km.State(), 0.1, ("x", "v"), ("u",))
+    ends = {} if states == "free" else {"x_min": [-0.15, -0.3], "x_max": [0.15, 0.3]}
+    mpc = km.KoopmanMPC(
+        model, km.Cost([1, 1], 1e-3), km.Limits(-1, 1, **ends), 100, solver=name, time_limit=1e-3
+    )
+    rng, moves = np.random.default_rng(0), []
+
+    def step():
+        moves.append(mpc(np.array([0.2, 0.1]) + 0.05 * rng.normal(size=2), np.zeros(2)))
+
+    benchmark.pedantic(step, rounds=1000)
+    late = [move for move in moves if move.solve_time > 1e-3]
+    assert all(move.status is km.Status.TIME_LIMIT for move in late)
+    half, high, most = np.quantile([move.solve_time for move in moves], [0.5, 0.99, 1]) * 1e3
+    given_up = sum(move.status is km.Status.TIME_LIMIT for move in moves)
+    figures = {"late": len(late), "given up": given_up, "median ms": half, "p99 ms": high, "max ms": most}
+    report(benchmark, steps=len(moves), **figures)
