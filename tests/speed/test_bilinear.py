@@ -1,6 +1,7 @@
 """One pass of the real-time iteration at N = 50: without limits in reach, at the input limits, and the first step."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,11 +28,15 @@ def report(benchmark, **figures):
     sys.stdout.write(f"\n{benchmark.name}: {said}\n")
 
 
-def test_swing_up_steps(benchmark, parts):
-    """All steps of ten seconds from hanging, by kind."""
+@pytest.mark.parametrize("rated", [False, True])
+def test_swing_up_steps(benchmark, parts, rated):
+    """All steps of ten seconds from hanging, by kind; with limits and weights of the input's changes, and without."""
     prepared, model = parts
     problem, plant = prepared.problem, prepared.step_map
-    mpc = BilinearMPC(model, problem.cost, problem.limits, N)
+    cost, limits = problem.cost, problem.limits
+    if rated:
+        cost, limits = replace(cost, R_delta=0.01), replace(limits, du_max=3.0)
+    mpc = BilinearMPC(model, cost, limits, N)
     x = np.array([0.0, 0.0, np.pi, 0.1])
     mpc(x, [0, 0, 0, 1, 0])
     moves = []
