@@ -38,6 +38,8 @@ from koopmpc.estimate.kalman import LiftedKalman
 from koopmpc.estimate.observer import Estimator
 from koopmpc.figures.eigenfunctions import plot_eigenfunctions
 from koopmpc.figures.error import plot_error
+from koopmpc.figures.reconstruction import plot_reconstruction
+from koopmpc.figures.runs import plot_runs
 from koopmpc.figures.series import plot_rollout, plot_run
 from koopmpc.figures.spectrum import plot_spectrum
 from koopmpc.figures.style import save as save_figure
@@ -84,6 +86,7 @@ from koopmpc.plant.simulated import Plant, SimulatedPlant
 from koopmpc.plant.step_map import Affine, StepMap, discretize
 from koopmpc.predict.bilinear import BilinearPredictor, load_bilinear_predictor
 from koopmpc.predict.conformal import ConformalBand, conformal
+from koopmpc.predict.evolution import evolution_error
 from koopmpc.predict.linear import LinearPredictor, load_predictor
 from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
@@ -200,6 +203,7 @@ __all__ = [
     "dmd",
     "dmdc",
     "edmd",
+    "evolution_error",
     "feedback_share",
     "invariance",
     "linearity_error",
@@ -215,8 +219,10 @@ __all__ = [
     "persistency",
     "plot_eigenfunctions",
     "plot_error",
+    "plot_reconstruction",
     "plot_rollout",
     "plot_run",
+    "plot_runs",
     "plot_spectrum",
     "reconstruct",
     "record",

@@ -96,11 +96,12 @@ def _column(
         panels[-1].semilogy(t, np.clip(error, _LEAST, 10 * _HIGHEST), **line(names.index(name), len(t)))
         errors.append(error[1:])
     if errors:
-        usual = [
+        usual = min(
             float(np.quantile(error, 0.02)) for error in errors
-        ]  # it starts at rounding, and may pass through 0
+        )  # it starts at rounding, and passes through 0
         highest = max(float(error.max()) for error in errors)
-        panels[-1].set_ylim(max(min(usual), _LEAST) / 3, min(3 * max(highest, _LEAST), _HIGHEST))
+        low, high = (float(np.log10(np.clip(v, _LEAST, _HIGHEST))) for v in (usual, highest))
+        panels[-1].set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
 
 
 def _fitting(curve: ArrayLike, name: str, truth: np.ndarray) -> np.ndarray:

@@ -109,11 +109,9 @@ def scenes(others: int = 10) -> dict[str, Scene]:
         "cart-pole-g10": scene(
             "Cart-pole, LQR, g = 10", CartPole(g=10.0), shift, near, gains()["cart-pole-g10"], TARGET
         ),
-        "databook": scene(
-            "Cart-pole of the databook, LQR, exact Jacobian", databook, off, tilt, gains()["databook"], TARGET
-        ),
+        "databook": scene("Databook's cart-pole, LQR", databook, off, tilt, gains()["databook"], TARGET),
         "databook-legacy": scene(
-            "Cart-pole of the databook, LQR, Jacobian as printed (legacy)",
+            "Databook's cart-pole, LQR as printed (legacy)",
             databook,
             off,
             tilt,

@@ -167,21 +167,19 @@ def variants(page: Page, stage: Mapping[str, Scene], fits: Fits) -> None:
             if (scene, method) not in seen
         ],
     )
-    for scene, caption in (
-        ("upright", "Pendulum, upright: DMD and EDMD at full rank"),
-        ("databook", "Cart-pole of the databook, exact Jacobian: at full rank"),
-        ("databook-legacy", "Cart-pole of the databook, Jacobian as printed (legacy): at full rank"),
+    chosen = ("DMD", "EDMD monomials 3", "EDMD Fourier 1")
+    for name, names, caption in (
+        ("upright", ("upright", "upright-lqr"), "Pendulum, upright: at full rank"),
+        ("databook", ("databook", "databook-legacy"), "Cart-pole of the databook: at full rank"),
     ):
-        names = (scene, "upright-lqr") if scene == "upright" else (scene,)
-        chosen = ("DMD", "EDMD monomials 3", "EDMD Fourier 1")
         cases = {
-            stage[name].title: (
-                stage[name].trajectory[0].X,
-                {method: fits[name][method, True].X for method in chosen},
+            stage[scene].title: (
+                stage[scene].trajectory[0].X,
+                {method: fits[scene][method, True].X for method in chosen},
             )
-            for name in names
+            for scene in names
         }
-        draw(page, f"variant-{scene}", caption, cases, stage[scene])
+        draw(page, f"variant-{name}", caption, cases, stage[names[0]])
 
 
 def gains_table(page: Page) -> None:
