@@ -65,6 +65,9 @@ class Bad:
     def reset(self, x0=None):
         self.whole.reset(x0)
 
+    def adopt(self, predictor):
+        self.whole.adopt(predictor)
+
     def update(self, y, u, w):
         return self.whole.update(y, u, w)
 
