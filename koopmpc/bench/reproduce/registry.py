@@ -1,4 +1,7 @@
-"""The papers that are done again, by name: each a module of its name here that defines `paper`."""
+"""The papers that are done again, by name: each a module of its name here that defines `paper`.
+
+docs/<name>.md is the report.md of such a run, and docs/<name>/ its pictures: copy both after a change.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

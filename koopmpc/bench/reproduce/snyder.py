@@ -66,7 +66,7 @@ def held_change(stage: dict[str, Scene], fits: Fits) -> float:
     """Return by how much, relative, an error above `RESOLVED` changes where the feedback is held over a sample."""
     changes: list[float] = []
     for name in ("pendulum-lqr", "cart-pole-lqr"):
-        held = rebuilt(replace(stage[name], held=True))
+        held = rebuilt(replace(stage[name], held=True, others=1))
         changes += [
             abs(held[key].error / fit.error - 1) for key, fit in fits[name].items() if fit.error > RESOLVED
         ]

@@ -91,8 +91,8 @@ def of_text(
     )
     raw, small = fits["cart-pole-lqr"]["DMD", True], fits["pendulum"]["EDMD monomials 3", False]
     hanging, upright = fits["pendulum"]["DMD", True], fits["upright"]["DMD", True]
-    led = cubic.evolution[cubic.leading]
-    box_led = box.evolution[box.leading]
+    led = float(cubic.evolution[cubic.leading])
+    box_led = float(box.evolution[box.leading])
     paper = [p["DMD, feedback data"] for p in predictions.values()]
     blind = [p["DMDc, feedback data"] for p in predictions.values()]
     rich = [p["EDMDc, exciting data"] for p in predictions.values()]
@@ -107,8 +107,7 @@ def of_text(
             holds=cubic.held_out < GENERAL and box.held_out < GENERAL,
             in_part=cubic.error < SMALL,
             why=f"of the fitted trajectory (pendulum, monomials 3: {percent(cubic.error)} %), not of the "
-            f"system: "
-            f"{percent(cubic.held_out)} % from other starts, for the frequency depends on the amplitude",
+            f"system: {percent(cubic.held_out)} % from other starts, for the frequency depends on the amplitude",
         ),
         judged(
             "abstract",
@@ -116,8 +115,7 @@ def of_text(
             holds=led < SMALL and box_led < SMALL,
             in_part=led < SMALL,
             why=f"pendulum, monomials 3: φ(x_k) = λᵏ φ(x₀) to {percent(led)} % over 10 s; cart-pole, "
-            f"Fourier 1: "
-            f"{percent(box_led)} %; on one trajectory φ is known along a curve alone",
+            f"Fourier 1: {percent(box_led)} %; on one trajectory φ is known along a curve alone",
         ),
         judged(
             "abstract",
@@ -141,29 +139,25 @@ def of_text(
             holds=max(p.excited for p in paper) < GENERAL,
             in_part=max(p.feedback for p in paper) < 3 * GENERAL,
             why="reconstruction, no control model: fitted without B, "
-            f"{_listed(p.excited for p in paper)} % off where noise is added to u, and with u known A and "
-            f"B cannot be "
-            f"told apart (B is {_shares(blind)} of the true one); from exciting data "
-            f"{_listed(p.excited for p in rich)} % "
-            f"and {_shares(rich)}",
+            f"{_listed(p.excited for p in paper)} % off where noise is added to u (pendulum and cart-pole), and with u "
+            f"known A and B cannot be told apart: B is {_shares(blind)} times the true one. Models of exciting data "
+            f"are {_listed(p.excited for p in rich)} % off, and B is {_shares(rich)} times the true one",
         ),
         judged(
             "discussion",
             "truncation has to be avoided with monomials 3",
             holds=small.error > BETTER * cubic.error,
-            why=f"pendulum: {percent(cubic.error)} % at rank {cubic.rank}, {percent(small.error)} % at "
-            f"rank {small.rank}",
+            why=f"pendulum: {percent(cubic.error)} % at rank {cubic.rank}, {percent(small.error)} % "
+            f"at rank {small.rank}",
         ),
         judged(
             "discussion",
             "the cart-pole is beyond these observables",
             holds=shift.error > raw.error / SAME,
             in_part=cut.error > raw.error / SAME or box.error > SMALL,
-            why=f"under LQR it is the origin and the truncation: DMD on x − x_ref reaches "
-            f"{percent(centred)} % "
-            f"against {percent(raw.error)} %, monomials 2 at rank {shift.rank} {percent(shift.error)} %; "
-            f"uncontrolled, "
-            f"the large swing stays at {percent(box.error)} %",
+            why=f"under LQR it is the origin and the truncation: DMD on x − x_ref reaches {percent(centred)} % against "
+            f"{percent(raw.error)} %, monomials 2 at rank {shift.rank} {percent(shift.error)} %; uncontrolled, the "
+            f"large swing stays at {percent(box.error)} %",
         ),
         judged(
             "discussion",

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
+from koopmpc.bench.reproduce import snyder_beyond, snyder_text
+from koopmpc.bench.reproduce.beyond import Prediction
+from koopmpc.bench.reproduce.contest import ORACLE
 from koopmpc.bench.reproduce.equations import equations, sides
+from koopmpc.bench.reproduce.page import Page
 from koopmpc.bench.reproduce.plants import Pendulum, frequency
 from koopmpc.bench.reproduce.snyder import held_change, rebuilt
 from koopmpc.bench.reproduce.snyder_beyond import origin
-from koopmpc.bench.reproduce.snyder_claims import of_figures
+from koopmpc.bench.reproduce.snyder_claims import of_figures, of_text
 from koopmpc.bench.reproduce.snyder_scenes import FIGURES, OBSERVABLES, gains, scenes
 from koopmpc.bench.reproduce.verdicts import Verdict
 from koopmpc.predict.spectrum import continuous_eigenvalues
@@ -188,3 +192,51 @@ def test_the_page_holds_these_numbers_and_verdicts(stage, fits):
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert len(pictures) >= 17
     assert all((PAGE.parent / picture).is_file() for picture in pictures)
+
+
+def told(fits, *, ours, feedback, excited):
+    """Return the verdicts of abstract and discussion for made-up costs and predictions."""
+    names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
+    predicted = {"pendulum": {name: Prediction(name, feedback, excited, 1.0, "–") for name in names}}
+    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": ours, ORACLE: 1.0}}
+    return {claim.says: claim.verdict for claim in of_text(fits, 3e-5, predicted, ratios)}
+
+
+def test_verdicts_of_the_text_follow_the_numbers(fits):
+    linear, data = "linear control acts on the nonlinear system", "data under LQR show a controlled system"
+
+    def verdict(says, **numbers):
+        found = told(fits, **({"ours": 1.0, "feedback": 0.0, "excited": 0.0} | numbers))
+        return next(value for claim, value in found.items() if claim.startswith(says))
+
+    assert verdict(linear, ours=1.02) is Verdict.HOLDS
+    assert verdict(linear, ours=1.08) is Verdict.IN_PART
+    assert verdict(linear, ours=1.3) is Verdict.FAILS
+    assert verdict(data, excited=0.01) is Verdict.HOLDS
+    assert verdict(data, excited=0.5) is Verdict.IN_PART
+    assert verdict(data, excited=0.5, feedback=0.5) is Verdict.FAILS
+    assert verdict("the pendulum is inverted") is Verdict.FAILS
+    assert verdict("truncation has to be avoided") is Verdict.HOLDS
+    assert verdict("the cart-pole is beyond") is Verdict.IN_PART
+    assert verdict("EDMD finds the leading Koopman eigenfunctions") is Verdict.IN_PART
+
+
+def test_the_parts_of_the_report(stage, fits, tmp_path, monkeypatch):
+    saved = []
+    for module in (snyder_text, snyder_beyond):
+        monkeypatch.setattr(module, "save", lambda made, path: saved.append(path.stem))
+    page = Page("snyder", tmp_path)
+    claims = of_figures(fits)
+    snyder_text.settings(page, claims, 0.01, 10)
+    snyder_text.verdicts(page, claims)
+    snyder_text.numbers(page, stage, fits, claims)
+    snyder_text.gains_table(page)
+    snyder_text.frequencies(page, fits)
+    snyder_text.theory(page, stage["pendulum"], fits)
+    snyder_text.appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
+    gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
+    assert gains_of_page.strip() in page.markdown
+    assert saved == ["pendulum-eigenfunctions", "appendix-pendulum-dmdc"]
+    assert [curves.columns[-1] for curves in page.curves] == ["log10 of the relative error"] * 2
+    assert "| DMDc, LQR data | 2 of 3 |" in page.markdown
+    assert page.markdown.count("\n| pendulum-") == 18 + 10  # lines of the figures, and claims
