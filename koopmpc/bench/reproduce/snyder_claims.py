@@ -131,7 +131,7 @@ def of_text(
             "the pendulum is inverted",
             holds=upright.error < SMALL,
             why=f"DMD, uncontrolled: {percent(upright.error)} % upright, {percent(hanging.error)} % hanging; "
-            "only θ = 0 hanging gives the paper's pictures",
+            "only θ = 0 hanging agrees with what the paper reports",
         ),
         judged(
             "results",

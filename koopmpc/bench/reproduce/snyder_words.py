@@ -7,7 +7,7 @@ snyder` writes this page, its figures, and one Rerun recording of all curves. Wh
 words. Of {total} claims {summary}."""
 
 SETTINGS = """\
-The paper leaves settings open. These reproduce its pictures: g = 9.81 m/s², one trajectory of 10 s sampled at
+The paper leaves settings open. These reproduce its claims: g = 9.81 m/s², one trajectory of 10 s sampled at
 0.01 s, reconstruction from its first state with b = Φ⁺ψ(x₁), unscaled snapshots, truncated SVD. *Full rank*
 keeps every singular value above 10⁻¹⁰ σ₁; beside it stands rank n, the number of states. Monomials include the
 states and the constant; Fourier observables are x, sin kxᵢ, cos kxᵢ of every state. The pendulum starts at rest
@@ -56,7 +56,7 @@ Under LQR the state settles at (1, 0, π, 0). Its motion about that point has fo
 stay away from the origin takes a fifth, λ = 1: one more than DMD on four states has, and one more than rank 4
 keeps of any lifting. Rank 5 does little better, for a truncated SVD keeps the directions of largest variance,
 which are not those of the motion. With the origin at the target, or a constant among the observables, DMD is
-right; with all singular values kept, EDMD is. No fault of Koopman theory is needed to explain the pictures."""
+right; with all singular values kept, EDMD is. No fault of Koopman theory is needed to explain the results."""
 
 INPUTS = """\
 Under u = −K x the input is a function of the state: a fit without B tells the closed loop, and a fit with B
