@@ -36,14 +36,16 @@ class BilinearMPC(Receding):
     """Minimise the Cost over N steps of x⁺ = F(x, u) within the Limits, one linearisation a step.
 
     F is the predictor's re-lifted map x⁺ = C(A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), so whatever the dictionary the problem
-    has the dimension of x. The controller keeps the planned states X_k as well as the inputs u_k and moves both on by
-    one step. Each pass linearises at (X_k, u_k), with defects c_k = F(X_k, u_k) − X_{k+1} and δx_0 = x − X_0, and
-    adds the solution of that quadratic program (Gauss–Newton in the tracked outputs), halved until F is
-    near its linearisation along it. The inputs are never simulated over the horizon: on an unstable plant that
-    multiplies the model's error a thousandfold, and a first plan along the free motion may end where no data were. A
-    Riccati recursion solves the program; where its plan breaks a limit, an interior-point method whose steps are
-    Riccati recursions. Where changes of the inputs count, or moves are blocked, they are its inputs, and the last
-    input is part of the state.
+    has the dimension of x. Under an embedding x is the point ζ of the plant's state and its past, which the
+    controller keeps: y, the cost, the limits and the disturbance are those of the plant's state.
+
+    The controller keeps the planned states X_k as well as the inputs u_k and moves both on by one step. Each pass
+    linearises at (X_k, u_k), with defects c_k = F(X_k, u_k) − X_{k+1} and δx_0 = x − X_0, and adds the solution of
+    that quadratic program (Gauss–Newton in the tracked outputs), halved until F is near its linearisation along it.
+    The inputs are never simulated over the horizon: on an unstable plant that multiplies the model's error a
+    thousandfold, and a first plan along the free motion may end where no data were. A Riccati recursion solves the
+    program; where its plan breaks a limit, an interior-point method whose steps are Riccati recursions. Where changes
+    of the inputs count, or moves are blocked, they are its inputs, and the last input is part of the state.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ class BilinearMPC(Receding):
         super().__init__(predictor.dt, model.nu, cost, limits, horizon, latency, time_limit)
         self._passes = checks.count(passes, "passes")
         self._blocks = blocked(moves, self._N)
-        self._outputs = o = outputs(predictor.states, model.nu, self.cost, self.limits)
+        self._outputs = o = outputs(predictor.states, model.nu, self.cost, self.limits, model.nx)
         self._rated = o.rated or len(self._blocks) < self._N
         self._staged = Changes(model.F, o, self._blocks) if self._rated else Direct(model.F, o, self._blocks)
         self._equilibria = Equilibria(model, self.cost, o, 10 * self._N)
@@ -108,11 +110,12 @@ class BilinearMPC(Receding):
         self._disturbed = estimator is not None or model.nw > 0
         self._origin = Origin(
             model,
-            MeasuredState(model.nx) if estimator is None else estimator.watch(model, model.nx),
+            MeasuredState(model) if estimator is None else estimator.watch(model),
             Sizes(model.nx, model.nu, model.nw, self._N),
             self._latency,
             rated=self._rated,
             estimated=estimator is not None,
+            remembers=model.embedding is not None,
         )
         self._reference_key: bytes | None = None
         self._goal: Goal | None = None
@@ -169,7 +172,7 @@ class BilinearMPC(Receding):
         if not self._planned:
             return None
         X, U = self._staged.plan(self._iteration.X, self._iteration.U)
-        return Plan(X.copy(), U.copy())
+        return Plan(X[:, : self._map.ny].copy(), U.copy())
 
     def __call__(
         self,

@@ -63,7 +63,7 @@ class Equilibria:
         self._nr = len(outputs.Q)
         self._of_state = isinstance(cost.of, State) and cost.of.whole
         if cost.Q_N is not None:
-            checks.weight(cost.Q_N, "Q_N", model.nx)
+            checks.weight(cost.Q_N, "Q_N", model.ny)
             if not self._of_state:
                 raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
         self._local = Local(model, outputs)
@@ -113,11 +113,11 @@ class Equilibria:
         slope = self._slope(at) * hold
         if self._cost.Q_N is not None:
             M, L, V = (
-                np.zeros((nx + self._nr, nx)),
+                np.zeros((nx + self._nr, self._nr)),
                 np.zeros((nx + self._nr, nx)),
                 np.zeros((nx + self._nr, len(u))),
             )
-            M[:nx] = root(checks.weight(self._cost.Q_N, "Q_N", nx))
+            M[: self._nr] = root(checks.weight(self._cost.Q_N, "Q_N", self._nr))
             return Goal(x, held, M, L, V, M @ row, slope)
         J = at.J
         seen = J.T @ Q @ J
@@ -198,7 +198,7 @@ class Equilibria:
         nx, inputs, box = self._model.nx, self._outputs.inputs, self._outputs.box
         push = np.zeros(nx) if e is None else e
         rest = np.clip(np.zeros(self._model.nu), *inputs)
-        guesses = [np.concatenate([row if self._of_state else np.zeros(nx), rest])]
+        guesses = [np.concatenate([self._model.held(row, rest) if self._of_state else np.zeros(nx), rest])]
         if near is not None:
             guesses = [np.concatenate([near.x, near.u])]
         elif (

@@ -1,4 +1,7 @@
-"""LearnedMap: x⁺ = F(x, u, θ) of a predictor that is lifted afresh each step, its matrices θ being arguments."""
+"""LearnedMap: x⁺ = F(x, u, θ) of a predictor that is lifted afresh each step, its matrices θ being arguments.
+
+Under an embedding x is the point ζ of the plant's state and its past, that state first.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plant.buffered import Buffered
 from koopmpc.plant.step_map import StepMap
@@ -15,14 +19,15 @@ from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 
 Source = BilinearPredictor | LinearPredictor | StepMap
-_KEPT = ("lifting", "dt", "states", "inputs", "disturbances")
+_KEPT = ("lifting", "embedding", "dt", "states", "inputs", "disturbances")
 
 
 @dataclass(frozen=True)
 class LearnedMap:
     """x⁺ = F(x, u, θ) + push w + d: another model of the same lifting is another θ, and no other function.
 
-    Of a predictor F is C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), θ holds C A, C B and C Nᵢ, and push is C E.
+    Of a predictor F is C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), θ holds C A, C B and C Nᵢ, and push is C E; under an
+    embedding F goes on with the shift of the past, and push is zero there.
     """
 
     source: Source
@@ -32,8 +37,18 @@ class LearnedMap:
 
     @property
     def nx(self) -> int:
-        """Number of states."""
+        """Number of entries of x."""
         return self.F.size1_in(0)
+
+    @property
+    def embedding(self) -> Delay | None:
+        """What makes x of the plant's state and its past; None where x is that state."""
+        return None if isinstance(self.source, StepMap) else self.source.embedding
+
+    @property
+    def ny(self) -> int:
+        """Number of the plant's states, the first entries of x."""
+        return len(self.source.states)
 
     @property
     def nu(self) -> int:
@@ -65,6 +80,16 @@ class LearnedMap:
                 )
         return replace(self, source=source, theta=_theta(source), push=_push(source))
 
+    def fixed(self) -> "LearnedMap":
+        """Return the same map with θ inside F."""
+        x, u, none = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu), ca.MX.sym("theta", 0)
+        F = ca.Function("F", [x, u, none], [self.F(x, u, ca.DM(self.theta))])
+        return replace(self, F=F.expand("F") if self.F.is_a("SXFunction") else F, theta=np.zeros(0))
+
+    def held(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nx"]:
+        """Return the x of a plant that has been in y, under u."""
+        return y if self.embedding is None else self.embedding.held(y, u)
+
     def step(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nx"]:
         """Return F(x, u, θ)."""
         return self._buffered(x, u, self.theta)[0]
@@ -84,8 +109,15 @@ class LearnedMap:
         return Buffered(self.F)
 
 
-def learned_map(source: Source) -> LearnedMap:
+def learned_map(source: Source, name: str = "predictor") -> LearnedMap:
     """Return the map of a predictor, or of a StepMap, which has no θ.
+
+    Parameters
+    ----------
+    source
+        The model.
+    name
+        What an error calls it.
 
     Raises
     ------
@@ -93,7 +125,7 @@ def learned_map(source: Source) -> LearnedMap:
         It is something else.
     """
     kinds = (BilinearPredictor, LinearPredictor, StepMap)
-    checks.kind(source, "predictor", kinds, "fit one with bilinear_edmd or edmd, or pass a StepMap")
+    checks.kind(source, name, kinds, "fit one with bilinear_edmd or edmd, or pass a StepMap")
     return LearnedMap(source, _function(source), _theta(source), _push(source))
 
 
@@ -103,14 +135,16 @@ def _function(source: Source) -> ca.Function:
         F = ca.Function("F", [x, u, none], [ca.densify(source.F(x, u))])
         return F.expand("F") if source.F.is_a("SXFunction") else F
     nx, nu, nz = source.nx, source.nu, source.nz
-    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
+    x, u = ca.SX.sym("x", len(source.point_names)), ca.SX.sym("u", nu)
     A, B = ca.SX.sym("CA", nx, nz), ca.SX.sym("CB", nx, nu)
     theta, z = [A, B], source.lifting.symbolic(x)
     for i in range(nu if isinstance(source, BilinearPredictor) else 0):
         theta.append(ca.SX.sym(f"CN{i}", nx, nz))
         A = A + u[i] * theta[-1]
-    x_next = ca.densify(A @ z + B @ u)
-    return ca.Function("F", [x, u, ca.vertcat(*map(ca.vec, theta))], [x_next], {"cse": True})
+    x_next = A @ z + B @ u
+    if source.embedding is not None:
+        x_next = source.embedding.symbolic(x, u, x_next)
+    return ca.Function("F", [x, u, ca.vertcat(*map(ca.vec, theta))], [ca.densify(x_next)], {"cse": True})
 
 
 def _theta(source: Source) -> Float[np.ndarray, " nt"]:
@@ -121,6 +155,8 @@ def _theta(source: Source) -> Float[np.ndarray, " nt"]:
 
 
 def _push(source: Source) -> Float[np.ndarray, "nx nw"]:
-    if isinstance(source, LinearPredictor):
-        return source.C @ source.E
-    return np.zeros((source.nx, 0))
+    if not isinstance(source, LinearPredictor):
+        return np.zeros((source.nx if isinstance(source, StepMap) else len(source.point_names), 0))
+    push = np.zeros((len(source.point_names), source.nw))
+    push[: source.nx] = source.C @ source.E
+    return push

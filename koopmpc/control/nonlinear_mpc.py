@@ -13,7 +13,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.equilibrium import Equilibria
 from koopmpc.control.fallback import PlanMemory, admitted, hard
 from koopmpc.control.horizon import blocked
-from koopmpc.control.learned_map import learned_map
+from koopmpc.control.learned_map import Source, learned_map
 from koopmpc.control.lifted import reference_rows
 from koopmpc.control.limits import Box, Limits, softened
 from koopmpc.control.move import Move, Plan, Status
@@ -42,7 +42,8 @@ class NonlinearMPC(Receding):
     Parameters
     ----------
     step_map
-        The model.
+        The model; a predictor stands for its re-lifted `step_map()`, and where it has an embedding y is the plant's
+        state and the controller keeps the past.
     cost, limits
         As for KoopmanMPC; the observables are taken from their own liftings.
     horizon
@@ -74,7 +75,7 @@ class NonlinearMPC(Receding):
 
     def __init__(
         self,
-        step_map: StepMap,
+        step_map: Source,
         cost: Cost,
         limits: Limits | None = None,
         horizon: int = 20,
@@ -86,15 +87,13 @@ class NonlinearMPC(Receding):
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,
     ) -> None:
-        checks.kind(
-            step_map, "step_map", StepMap, "discretize a Dynamics, or take the step_map() of a predictor"
-        )
-        super().__init__(step_map.dt, step_map.nu, cost, limits, horizon, latency, time_limit)
+        model = learned_map(step_map, "step_map").fixed()
+        super().__init__(step_map.dt, model.nu, cost, limits, horizon, latency, time_limit)
         if solver not in ("ipopt", "fatrop", "sqpmethod"):
             raise DataError(f'solver is {solver!r}; pass "ipopt", "fatrop" or "sqpmethod"')
-        self.step_map = step_map
-        model, blocks = learned_map(step_map), blocked(moves, self._N)
-        self._outputs = o = outputs(step_map.states, step_map.nu, self.cost, self.limits)
+        self.step_map = step_map if isinstance(step_map, StepMap) else step_map.step_map()
+        self._ny, blocks = model.ny, blocked(moves, self._N)
+        self._outputs = o = outputs(step_map.states, model.nu, self.cost, self.limits, model.nx)
         rated = o.rated or len(blocks) < self._N
         self._staged = Changes(model.F, o, blocks) if rated else Direct(model.F, o, blocks)
         problem = self._staged.problem
@@ -108,8 +107,16 @@ class NonlinearMPC(Receding):
         self._starts = checks.count(starts, "starts")
         self._memory = PlanMemory(o.inputs, self._N, o.rates)
         self._hard_rates = hard(o.rates, o.rate_softness.linear)
-        observer, sizes = MeasuredState(model.nx), Sizes(model.nx, self._nu, 0, self._N)
-        self._origin = Origin(model, observer, sizes, self._latency, rated=rated, estimated=False)
+        observer, sizes = MeasuredState(model), Sizes(model.nx, self._nu, 0, self._N)
+        self._origin = Origin(
+            model,
+            observer,
+            sizes,
+            self._latency,
+            rated=rated,
+            estimated=False,
+            remembers=model.embedding is not None,
+        )
         self._warm: Start | None = None
         self._plan: Plan | None = None
 
@@ -151,7 +158,7 @@ class NonlinearMPC(Receding):
         if self._hard_rates is not None:
             U[0] = admitted(U[0], self._outputs.inputs, self._hard_rates, u_prev)
         self._memory.keep(U.ravel())
-        self._plan = Plan(X.copy(), U.copy())
+        self._plan = Plan(X[:, : self._ny].copy(), U.copy())
         soft = conflict or softened(found.slacks, self._soft)
         return self._move(U[0].copy(), Status.SOFTENED if soft else Status.OPTIMAL, iterations, start)
 

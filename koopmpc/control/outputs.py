@@ -34,10 +34,14 @@ class Outputs(NamedTuple):
         return self.R_delta is not None or self.rates is not None
 
 
-def outputs(states: tuple[str, ...], nu: int, cost: Cost, limits: Limits) -> Outputs:
-    """Return what `cost` tracks and `limits` bound, of these states and of `nu` inputs; rows without limit go."""
+def outputs(states: tuple[str, ...], nu: int, cost: Cost, limits: Limits, size: int | None = None) -> Outputs:
+    """Return what `cost` tracks and `limits` bound, of these states and of `nu` inputs; rows without limit go.
+
+    The functions take `size` values, the states first; by default the states alone.
+    """
     nx = len(states)
-    x = ca.SX.sym("x", nx)
+    point = ca.SX.sym("x", nx if size is None else size)
+    x = point[:nx]
     of = cost.of.bind(states)
     Q, R = cost.matrices(of.nz, nu)
     bound = None if limits.of is None else limits.of.bind(states)
@@ -45,8 +49,8 @@ def outputs(states: tuple[str, ...], nu: int, cost: Cost, limits: Limits) -> Out
     rows = limits.rows(nx, 0 if bound is None else bound.nz)
     kept = np.flatnonzero(rows.kept).tolist()
     return Outputs(
-        ca.Function("tracked", [x], [ca.densify(of.symbolic(x))]),
-        ca.Function("limited", [x], [ca.densify(values[kept, 0])]),
+        ca.Function("tracked", [point], [ca.densify(of.symbolic(x))]),
+        ca.Function("limited", [point], [ca.densify(values[kept, 0])]),
         Q,
         R,
         limits.inputs(nu),

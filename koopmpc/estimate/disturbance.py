@@ -47,9 +47,9 @@ class LiftedDisturbance(Value):
         """Return the observer of one controller."""
         return Relifted(self, predictor)
 
-    def watch(self, model: Map, nx: int) -> FilteredState:
+    def watch(self, model: Map) -> FilteredState:
         """Return the observer of one controller on x⁺ = F(x, u) + d, whose states have the disturbances."""
-        return FilteredState(self.gain, model, nx)
+        return FilteredState(self.gain, model)
 
 
 class Relifted:

@@ -1,4 +1,7 @@
-"""Observers of a controller on x⁺ = F(x, u) + d: x is measured, and d is zero or filtered from what F misses."""
+"""Observers of a controller on x⁺ = F(x, u) + d: x is measured, and d is zero or filtered from what F misses.
+
+Under an embedding the plant's state y is measured, z is the point ζ of y and its past, and d acts on y alone.
+"""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -6,10 +9,28 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc.data.delay import Delay
+from koopmpc.estimate.history import history_of
+
 
 @runtime_checkable
 class Map(Protocol):
-    """What an observer asks of a model."""
+    """What an observer asks of a model: nx entries of x, of which the first ny are the plant's states."""
+
+    @property
+    def nx(self) -> int:
+        """Number of entries of x."""
+        ...
+
+    @property
+    def ny(self) -> int:
+        """Number of the plant's states."""
+        ...
+
+    @property
+    def embedding(self) -> Delay | None:
+        """What makes x of the plant's state and its past."""
+        ...
 
     def advance(
         self,
@@ -23,15 +44,18 @@ class Map(Protocol):
 
 
 class MeasuredState:
-    """The observer of a controller without an estimator: z is y, d zero."""
+    """The observer of a controller without an estimator: z is y, or its ζ, d zero."""
 
-    def __init__(self, nx: int) -> None:
-        self.ny = nx
-        self.z: Float[np.ndarray, " nx"] = np.zeros(nx)
-        self.d: Float[np.ndarray, " nx"] = np.zeros(nx)
+    def __init__(self, model: Map) -> None:
+        self.ny = model.ny
+        self._history = history_of(model.embedding)
+        self.z: Float[np.ndarray, " nx"] = np.zeros(model.nx)
+        self.d: Float[np.ndarray, " nx"] = np.zeros(model.nx)
 
     def reset(self, x0: ArrayLike | None = None) -> None:
-        """There is nothing to forget."""
+        """Forget the past."""
+        if self._history is not None:
+            self._history.reset()
 
     def adopt(self, predictor: Any) -> None:
         """Y is the state of any model."""
@@ -40,24 +64,27 @@ class MeasuredState:
         self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
     ) -> bool:
         """Take y as it is; a bad one shows in the plan."""
-        self.z = y
+        self.z = y if self._history is None else self._history.take(y, u)
         return True
 
 
 class FilteredState:
-    """z = y, d ← d + gain (y − F(x, u) − E w − d); a missed sample leaves d as it is."""
+    """z = y, or its ζ; d ← d + gain (y − F(x, u) − E w − d); a missed sample leaves d as it is."""
 
-    def __init__(self, gain: float, model: Map, nx: int) -> None:
+    def __init__(self, gain: float, model: Map) -> None:
         self._gain, self._model = gain, model
-        self.ny = nx
-        self.z: Float[np.ndarray, " nx"] = np.zeros(nx)
-        self.d: Float[np.ndarray, " nx"] = np.zeros(nx)
+        self.ny = model.ny
+        self._history = history_of(model.embedding)
+        self.z: Float[np.ndarray, " nx"] = np.zeros(model.nx)
+        self.d: Float[np.ndarray, " nx"] = np.zeros(model.nx)
         self._measured = False
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget the last state and d; x0 will come as the first measurement."""
         self.d[:] = 0.0
         self._measured = False
+        if self._history is not None:
+            self._history.reset()
 
     def adopt(self, predictor: Any) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
@@ -67,13 +94,14 @@ class FilteredState:
         self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
     ) -> bool:
         """Take y, and move d towards the misfit of the step that led here."""
-        if not np.isfinite(y).all():
+        x = y if self._history is None else self._history.take(y, u)
+        if not np.isfinite(x).all():
             self._measured = False
             return False
         if self._measured:
-            misfit = y - self._model.advance(self.z, u, w, self.d)
+            misfit = y - self._model.advance(self.z, u, w, self.d)[: self.ny]
             if np.isfinite(misfit).all():
-                self.d += self._gain * misfit
-        self.z[:] = y
+                self.d[: self.ny] += self._gain * misfit
+        self.z[:] = x
         self._measured = True
         return True

@@ -351,7 +351,7 @@ show(lambda: mpc("fast", [0, 0]))
 show(lambda: mpc(None, [0, 0]))
 show(lambda: mpc([0, 0], "up"))
 show(lambda: km.NonlinearMPC(plant, cost, limits, 5, settings={"tol": 1}))
-show(lambda: km.NonlinearMPC(flat, cost, limits, 5))
+show(lambda: km.NonlinearMPC("flat", cost, limits, 5))
 show(lambda: BilinearMPC(still, cost, limits, 5))
 show(lambda: BilinearMPC(plant, limits, cost, 5))
 show(lambda: BilinearMPC("model", cost, limits, 5))
@@ -368,7 +368,7 @@ show(lambda: BilinearMPC(flat, cost, limits, 5)("now", [0, 0]))
         "DataError y is not an array of numbers: got NoneType",
         "DataError reference is not an array of numbers: got str",
         "DataError ipopt was not built with settings {'tol': 1}",
-        "DataError step_map is a LinearPredictor, expected a StepMap",
+        "DataError step_map is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
         "DataError the model has no inputs",
         "DataError cost is a Limits",
         "DataError predictor is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
