@@ -19,6 +19,7 @@ from jaxtyping import Float
 from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, Bounds, QPSolution, check_start
+from koopmpc.control.solvers.feasible import empty
 from koopmpc.errors import DataError
 
 # sigma: on plans of an unstable plant that saturate for many steps, half the iterations of OSQP's own 1e-6.
@@ -164,7 +165,13 @@ class OSQP:
         status = _STATUS.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
             status = Status.TIME_LIMIT
+        if status is Status.MAX_ITERATIONS and time_limit is None and self._nothing_fits():
+            status = Status.INFEASIBLE
         return QPSolution(np.array(solution.x), np.array(solution.y), status, int(info.iter))
+
+    def _nothing_fits(self) -> bool:
+        """Return whether no v meets the limits: OSQP's certificate of that may take longer than its iterations."""
+        return empty(self._qp.A, self._bounds.low, self._bounds.high)
 
     def _allow(self, seconds: float) -> None:
         """Set the time limit of the next solve: OSQP counts the setup, or the last updates, as a part of it."""
