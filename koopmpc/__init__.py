@@ -3,6 +3,8 @@
 This file is the table of contents; see README.md for ten lines that use it.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from koopmpc.bench.library import list_problems, load_problem
 from koopmpc.bench.problem import Case, Problem, Training
 from koopmpc.bench.sweep import sweep
@@ -44,6 +46,7 @@ from koopmpc.figures.series import plot_rollout, plot_run
 from koopmpc.figures.spectrum import plot_spectrum
 from koopmpc.figures.style import save as save_figure
 from koopmpc.identify.bilinear import bilinear_edmd
+from koopmpc.identify.candidates import Candidate
 from koopmpc.identify.constrained import constrained_edmd
 from koopmpc.identify.coverage import Coverage, coverage
 from koopmpc.identify.dmd import dmd, dmdc
@@ -54,6 +57,8 @@ from koopmpc.identify.moments import Moments, moments
 from koopmpc.identify.online import OnlineEDMD
 from koopmpc.identify.prior import Combination, Prior, Storage
 from koopmpc.identify.residual_dmd import ResidualDMD, residual_dmd
+from koopmpc.identify.select import select
+from koopmpc.identify.selection import Selection
 from koopmpc.identify.sparse import sparse_edmd
 from koopmpc.identify.stable import stable_edmd
 from koopmpc.identify.trust import TrustReport, trust
@@ -98,6 +103,9 @@ from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.scene import Box, Disk, Line
 from koopmpc.recording.viewer import view
 
+if TYPE_CHECKING:
+    from koopmpc.identify.regressor import KoopmanRegressor as KoopmanRegressor
+
 __all__ = [
     "CVODES",
     "LQR",
@@ -109,6 +117,7 @@ __all__ = [
     "BilinearMPC",
     "BilinearPredictor",
     "Box",
+    "Candidate",
     "Case",
     "Chirp",
     "Collocation",
@@ -174,6 +183,7 @@ __all__ = [
     "ResidualDMD",
     "Run",
     "Score",
+    "Selection",
     "SensorDelay",
     "ShapeError",
     "SimulatedPlant",
@@ -231,6 +241,7 @@ __all__ = [
     "run_episodes",
     "save_figure",
     "score",
+    "select",
     "simulate",
     "sparse_edmd",
     "stable_edmd",
@@ -238,3 +249,12 @@ __all__ = [
     "trust",
     "view",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return KoopmanRegressor when it is asked for: scikit-learn is an extra, and slow to import."""
+    if name == "KoopmanRegressor":
+        from koopmpc.identify.regressor import KoopmanRegressor
+
+        return KoopmanRegressor
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

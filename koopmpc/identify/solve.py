@@ -1,5 +1,6 @@
 """Least squares min ‖T − P K‖ on a few rows that stand for all snapshots."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,18 +73,27 @@ def solve(rows: Rows, *, ridge: Ridge = 0.0, scaled: bool = True) -> Solution:
     takes norm and cut on columns of unit norm, where units of the data mean nothing. "gcv" chooses the ridge by
     generalised cross-validation.
     """
+    return path(rows, (ridge,), scaled=scaled)[0]
+
+
+def path(rows: Rows, ridges: Sequence[Ridge], *, scaled: bool = True) -> list[Solution]:
+    """Return the solution for each ridge, of one decomposition."""
     size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
     size[size == 0] = 1.0
     U, s, Vt = np.linalg.svd(rows.P / size, full_matrices=False)
     cut = cutoff(rows)
     held = s > cut * s.max(initial=0.0)
     shares = U.T @ rows.T
-    if ridge == "gcv":
-        outside = np.sum((rows.T - U @ shares) ** 2, axis=0) + rows.rest
-        ridge = cross_validated(s, shares, outside, rows.samples, cut)
-    gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
-    K = (Vt.T * gain) @ shares / size[:, None]
-    return Solution(K, int(held.sum()), ridge)
+    found: list[Solution] = []
+    for each in ridges:
+        ridge = each
+        if ridge == "gcv":
+            outside = np.sum((rows.T - U @ shares) ** 2, axis=0) + rows.rest
+            ridge = cross_validated(s, shares, outside, rows.samples, cut)
+        gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
+        K = (Vt.T * gain) @ shares / size[:, None]
+        found.append(Solution(K, int(held.sum()), ridge))
+    return found
 
 
 def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
