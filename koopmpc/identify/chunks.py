@@ -26,51 +26,81 @@ def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
     result: list[list[Piece]] = [[]]
     room = rows
     for i, episode in enumerate(episodes):
-        first = 0
-        while first < len(episode):
+        first, length = 0, len(episode)
+        while first < length:
             if room == 0:
                 result.append([])
                 room = rows
-            last = min(first + room, len(episode))
+            last = min(first + room, length)
             result[-1].append(Piece(i, first, last))
             room -= last - first
             first = last
     return result
 
 
-def table(
+class Lifted(NamedTuple):
+    """A chunk, each state lifted once: rows p = [ψ(x) u u⊗ψ(x)]; the last state of a piece has u = 0.
+
+    Attributes
+    ----------
+    P
+        The rows, of one piece after the other.
+    first, last
+        Where the pieces begin and end: rows that belong to one pair, where all others belong to two.
+    nz
+        Number of observables.
+    """
+
+    P: Float[np.ndarray, "m n"]
+    first: Int[np.ndarray, " k"]
+    last: Int[np.ndarray, " k"]
+    nz: int
+
+    def pairs(self, weights: Float[np.ndarray, " M"] | None = None) -> Float[np.ndarray, "M nd"]:
+        """Return the rows [p ψ(x⁺)] of the pairs, each times the root of its weight."""
+        n = self.P.shape[1]
+        D = np.empty((len(self.P) - len(self.last), n + self.nz))
+        D[:, :n] = _without(self.P, self.last)
+        D[:, n:] = _without(self.P[:, : self.nz], self.first)
+        if weights is not None:
+            D *= np.sqrt(weights)[:, None]
+        return D
+
+
+def lifted(
     episodes: Episodes,
     lifting: Lifting,
     chunk: list[Piece],
     products: Int[np.ndarray, " np"] = _NONE,
-    space: Float[np.ndarray, "_ nd"] | None = None,
-) -> Float[np.ndarray, "M nd"]:
-    """Return the rows [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one chunk; each state is lifted once.
+    space: Float[np.ndarray, "_ n"] | None = None,
+) -> Lifted:
+    """Return the lifted states of one chunk.
 
-    `products` are the observables that u is multiplied with; without them the rows are [ψ(x) u ψ(x⁺)]. They are
-    written into `space`, of one row more at least, where it is given: fresh memory costs as much as the rows.
+    `products` are the observables that u is multiplied with. The rows are written into `space`, long enough for
+    twice the pairs, where it is given: fresh memory costs as much as the rows.
     """
-    of = episodes.episodes
-    nz, nu, cuts = lifting.nz, episodes.nu, len(chunk)
-    last = nz + nu + nu * len(products)
-    rows = sum(end - first for _, first, end in chunk)
-    D = np.empty((rows + 1, last + nz)) if space is None else space[: rows + 1]
-    if cuts == 1:
-        i, first, end = chunk[0]
-        lifting._lift(of[i].X[first : end + 1], D[:, :nz])
-        D[:-1, last:] = D[1:, :nz]
-        D = D[:-1]
-    else:
-        D = D[:-1]
-        X = np.concatenate([of[i].X[first : end + 1] for i, first, end in chunk])
-        Z = np.empty((len(X), nz))
-        lifting._lift(X, Z)
-        now = np.ones(len(X), dtype=bool)
-        now[np.cumsum([end - first + 1 for _, first, end in chunk]) - 1] = False
-        D[:, :nz], D[:, last:] = Z[now], Z[1:][now[:-1]]
+    of, nz, nu = episodes.episodes, lifting.nz, episodes.nu
+    last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
+    first = np.concatenate([[0], last[:-1] + 1])
+    count = int(last[-1]) + 1
+    P = np.empty((count, nz + nu + nu * len(products))) if space is None else space[:count]
+    lifting._lift(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
     if nu:
-        U = D[:, nz : nz + nu]
-        U[:] = np.concatenate([of[i].U[first:end] for i, first, end in chunk])
-        for i, first in enumerate(range(nz + nu, last, max(len(products), 1))):
-            np.multiply(U[:, i : i + 1], D[:, products], out=D[:, first : first + len(products)])
-    return D
+        U = P[:, nz : nz + nu]
+        U[:] = np.insert(
+            _joined([of[i].U[start:end] for i, start, end in chunk]), last - np.arange(len(last)), 0.0, axis=0
+        )
+        for i, start in enumerate(range(nz + nu, P.shape[1], max(len(products), 1))):
+            np.multiply(U[:, i : i + 1], P[:, products], out=P[:, start : start + len(products)])
+    return Lifted(P, first, last, nz)
+
+
+def _joined(parts: list[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _without(P: Float[np.ndarray, "m n"], rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, "M n"]:
+    """Return P without these rows, one at each piece's same end; a view where the piece is one."""
+    if len(rows) > 1:
+        return np.delete(P, rows, axis=0)
+    return P[1:] if rows[0] == 0 else P[:-1]

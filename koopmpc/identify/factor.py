@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg.lapack import dtpqrt
 
-_PANEL = 4  # columns that dtpqrt eliminates at once: fastest for few rows
+_PANEL = 4, 16  # columns that dtpqrt eliminates at once: fastest for few rows, for many
+_MANY = 256
 
 Triangle = Float[np.ndarray, "nd nd"]
 Table = Float[np.ndarray, "m nd"]
@@ -15,7 +16,8 @@ Table = Float[np.ndarray, "m nd"]
 def absorb(R: Triangle, rows: Table) -> None:
     """Turn R into the triangular factor of [R; rows], in place; R is in Fortran's order."""
     if len(rows):
-        info = dtpqrt(0, min(_PANEL, len(R)), R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
+        panel = min(_PANEL[len(rows) >= _MANY], len(R))
+        info = dtpqrt(0, panel, R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
         assert info == 0, f"dtpqrt refused argument {-info}"
 
 

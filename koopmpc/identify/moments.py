@@ -15,7 +15,8 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Part, Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.chunks import ROWS
-from koopmpc.identify.reading import Reading, Route, Sums, absorbed, read, spread
+from koopmpc.identify.factor import absorb
+from koopmpc.identify.reading import Reading, Route, Sums, read, spread
 from koopmpc.identify.solve import Rows, norms
 from koopmpc.identify.weights import Weights
 from koopmpc.lifting.base import Lifting, lifting_of
@@ -121,7 +122,8 @@ class Moments(Value):
             )
         both = replace(self, samples=self.samples + other.samples, weight=self.weight + other.weight)
         if self.route == other.route == "qr":
-            R = absorbed(self.sums.copy(order="F"), other.sums.copy(order="F"))
+            R = self.sums.copy(order="F")
+            absorb(R, other.sums)
             return replace(both, sums=np.ascontiguousarray(R))
         if self.route != other.route:
             warnings.warn(

@@ -5,17 +5,16 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg.lapack import dtpqrt
 
 from koopmpc.data.source import Part
 from koopmpc.errors import DataError
-from koopmpc.identify.chunks import ROWS, chunks, table
+from koopmpc.identify.chunks import ROWS, chunks, lifted
+from koopmpc.identify.sums import Factor, Gram
 from koopmpc.identify.weights import Weights, weights_of
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Arrays, from_data, to_data
 
 Route = Literal["gram", "qr"]
-_PANEL = 16  # columns that dtpqrt eliminates at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,38 +68,25 @@ class Sums:
 
 def read(task: Reading) -> Sums:
     """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten."""
-    episodes, full, gram = task.part.load(), task.lifting, task.route == "gram"
+    episodes = task.part.load()
     pieces = chunks(episodes)
     which = range(len(pieces)) if task.limit is None else spread(len(pieces), task.limit)
     steps = None if task.weights is None else weights_of(task.weights, episodes)
-    nd = len(task.names)
-    sums, samples, weight = np.zeros((nd, nd), order="C" if gram else "F"), 0, 0.0
-    space = np.empty((ROWS + 1, nd))
+    nz = task.lifting.nz
+    n = len(task.names) - nz
+    total = Gram(n, nz) if task.route == "gram" else Factor(n, nz)
+    samples, weight = 0, 0.0
+    space = np.empty((2 * ROWS, n))
     for i in which:
-        D = table(episodes, full, pieces[i], task.products, space)
-        if steps is None:
-            samples, weight = samples + len(D), weight + len(D)
-        else:
-            w = np.concatenate([steps[e][first:last] for e, first, last in pieces[i]])
-            D *= np.sqrt(w)[:, None]
-            samples, weight = samples + int(np.count_nonzero(w)), weight + float(w.sum())
+        chunk = lifted(episodes, task.lifting, pieces[i], task.products, space)
+        count = len(chunk.P) - len(chunk.last)
+        w = None if steps is None else np.concatenate([steps[e][first:last] for e, first, last in pieces[i]])
+        samples += count if w is None else int(np.count_nonzero(w))
+        weight += count if w is None else float(w.sum())
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
-            if gram:
-                sums += D.T @ D
-                size = sums.diagonal()
-            else:
-                size = np.abs(D).max(axis=0)
-        _require_finite(size, task)
-        if not gram:
-            sums = absorbed(sums, D)
-    return Sums(np.ascontiguousarray(sums), samples, weight, len(which) == len(pieces))
-
-
-def absorbed(R: Float[np.ndarray, "nd nd"], rows: Float[np.ndarray, "m nd"]) -> Float[np.ndarray, "nd nd"]:
-    """Return the triangular factor of [R; rows]; an R in Fortran's order is overwritten, and so are the rows."""
-    result, _, _, info = dtpqrt(0, min(_PANEL, len(R)), R, rows, overwrite_a=True, overwrite_b=True)
-    assert info == 0, f"dtpqrt refused argument {-info}"
-    return result
+            total.add(chunk, w)
+        _require_finite(total.size, task)
+    return Sums(total.sums, samples, weight, len(which) == len(pieces))
 
 
 def spread(total: int, wanted: int) -> list[int]:

@@ -23,7 +23,7 @@ from koopmpc.plant.graph import Graph
 from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
-_BLOCK = 1024  # rows evaluated at once: a block of observables stays in the cache
+_BLOCK = 1024  # rows evaluated at once, about: a block of observables stays in the cache
 
 
 def short(state: str) -> str:
@@ -143,8 +143,9 @@ class Lifting(Value, ABC):
 
     def _lift(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
         """Write ψ of the rows of X into the rows of Z, a block at a time."""
-        for first in range(0, len(X), _BLOCK):
-            block = slice(first, first + _BLOCK)
+        rows = -(-len(X) // max(round(len(X) / _BLOCK), 1))
+        for first in range(0, len(X), max(rows, 1)):
+            block = slice(first, first + rows)
             self._fill(np.ascontiguousarray(X[block].T), Z[block])
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:

@@ -46,7 +46,9 @@ class Gaussian(Lifting):
         return ca.vertcat(*(ca.exp(self._rate * r2) for r2 in symbolic_squared_distances(x, self.centers)))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        np.exp(self._rate * squared_distances(x, self.centers), out=Z)
+        squared_distances(x, self.centers, Z)
+        np.multiply(Z, self._rate, out=Z)
+        np.exp(Z, out=Z)
 
     @property
     def _rate(self) -> float:

@@ -45,5 +45,7 @@ class ThinPlate(Lifting):
         )
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        r2 = squared_distances(x, self.centers)
-        np.multiply(0.5 * r2, np.log(r2 + _TINY), out=Z)
+        squared_distances(x, self.centers, Z)
+        logarithm = np.log(Z + _TINY)
+        np.multiply(Z, 0.5, out=Z)
+        np.multiply(Z, logarithm, out=Z)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.chunks import chunks, table
+from koopmpc.identify.chunks import chunks, lifted
 from koopmpc.identify.moments import Moments, moments
 from koopmpc.identify.solve import solve
 from koopmpc.lifting.constant import Constant
@@ -52,7 +52,7 @@ def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed
     assert all(sum(p.last - p.first for p in chunk) == rows for chunk in pieces[:-1])
     lifting = State().bind(data.states)
     assert np.array_equal(
-        np.vstack([table(data, lifting, chunk) for chunk in pieces]), brute_force(data, lifting)
+        np.vstack([lifted(data, lifting, chunk).pairs() for chunk in pieces]), brute_force(data, lifting)
     )
 
 
@@ -82,6 +82,23 @@ def test_a_long_episode_in_many_chunks_equals_its_parts() -> None:
         b = moments(Episodes(parts, data.dt), LIFTING, route=route)
         assert a.samples == b.samples == 5000
         assert close(gram(a), gram(b))
+
+
+def test_a_huge_last_state_takes_no_digits_from_the_others() -> None:
+    huge = np.append(np.ones(50), 1e9)[:, None]
+    given = random_episodes(0, [50] * 20, 2, 1)
+    data = Episodes([Episode(X=e.X * huge, U=e.U) for e in given], given.dt)
+    m = moments(data, State(), route="gram")
+    now = np.vstack([np.hstack([e.X[:-1], e.U]) for e in data])
+    assert close(m.sums[np.ix_(m.regressors, m.regressors)], now.T @ now)
+
+
+def test_weights_of_one_are_no_weights() -> None:
+    data = random_episodes(1, [1, 30, 1, 1, 500, 2, 900, 1], 2, 1)
+    for bilinear in (False, True):
+        plain = moments(data, LIFTING, route="gram", bilinear=bilinear)
+        weighted = moments(data, LIFTING, route="gram", bilinear=bilinear, weights=[1.0] * len(data))
+        assert close(plain.sums, weighted.sums)
 
 
 def test_one_source_gives_the_same_bits_each_time() -> None:
