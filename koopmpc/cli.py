@@ -105,6 +105,76 @@ def bench(
 
 
 @app.command()
+def fit(
+    data: Annotated[
+        list[Path], typer.Argument(help="A folder of .npz, .parquet, .csv and .rrd files, or files.")
+    ],
+    states: Annotated[
+        str | None, typer.Option("--states", help="Columns of a table that are states: a,b,…")
+    ] = None,
+    inputs: Annotated[str | None, typer.Option("--inputs", help="Columns that are inputs: u,v,…")] = None,
+    dt: Annotated[
+        float | None, typer.Option("--dt", help="Sample time [s], where no column tells it.")
+    ] = None,
+    resample: Annotated[
+        float | None, typer.Option("--resample", help="Sample time [s] to bring unequal steps to.")
+    ] = None,
+    horizon: Annotated[
+        int | None, typer.Option("--horizon", help="Steps ahead that the model is chosen and judged by.")
+    ] = None,
+    linear: Annotated[bool, typer.Option("--linear", help="Try linear models only.")] = False,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Local processes, or those of --scheduler local.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help='tcp://host:port of a Dask cluster, or "local".')
+    ] = None,
+    logs: Logs = Path("logs"),
+    name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "fit",
+) -> None:
+    """Choose a model for logged data, fit it, and say whether to trust it; no option is needed."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from koopmpc.bench.fit import fit_data
+
+    out, err = _console(), Console(stderr=True)
+    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with _friendly():
+        folder = _new_folder(logs, name)
+        try:
+            with Progress(*columns, console=err, transient=True) as bar:
+                task = bar.add_task("reading", total=None)
+                done = fit_data(
+                    data[0] if len(data) == 1 else data,
+                    folder,
+                    dt=dt,
+                    states=None if states is None else _split(states),
+                    inputs=None if inputs is None else _split(inputs),
+                    resample=resample,
+                    horizon=horizon,
+                    bilinear=not linear,
+                    workers=workers,
+                    scheduler=scheduler,
+                    say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
+                    progress=lambda what, done, total: bar.update(
+                        task, description=what[:40], completed=done, total=total
+                    ),
+                )
+        except KoopmpcError:
+            if not any(folder.iterdir()):
+                folder.rmdir()
+            raise
+    for failure in done.failures:
+        err.print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
+    out.print(Text(f"model, report and pictures: {folder}"), soft_wrap=True)
+    if done.recording is not None:
+        out.print(
+            Text(f"look at it: {shlex.join([*_program(), 'view', str(done.recording)])}"), soft_wrap=True
+        )
+    out.print(Text(f"use it:\n{done.usage}"), soft_wrap=True)
+
+
+@app.command()
 def inspect(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
     """Recompute the metrics of runs from their logs alone."""
     from koopmpc.loop.metrics import metrics
@@ -191,6 +261,11 @@ def _sweep(
         out.print(Text(f"look at a run: {shlex.join([*_program(), 'view', str(shown.log)])}"), soft_wrap=True)
     if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
+
+
+def _split(names: str) -> list[str]:
+    """Return the names of ``"a, b"``; none of an empty text."""
+    return [name.strip() for name in names.split(",") if name.strip()]
 
 
 def _program() -> list[str]:
