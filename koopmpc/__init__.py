@@ -52,8 +52,9 @@ from koopmpc.identify.coverage import Coverage, coverage
 from koopmpc.identify.dmd import dmd, dmdc
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.excitation import Persistency, feedback_share, persistency
+from koopmpc.identify.gather import moments
 from koopmpc.identify.invariance import Invariance, invariance
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.moments import Moments
 from koopmpc.identify.online import OnlineEDMD
 from koopmpc.identify.prior import Combination, Prior, Storage
 from koopmpc.identify.residual_dmd import ResidualDMD, residual_dmd

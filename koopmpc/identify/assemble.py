@@ -1,40 +1,136 @@
-"""A LinearPredictor and its report from coefficients that were found under priors, limits or penalties."""
+"""From the coefficients of a regression to a predictor and its report, whatever found them."""
 
 import warnings
 from collections.abc import Sequence
-from typing import Unpack
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
-from koopmpc import checks
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
-from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.fit import Regression
-from koopmpc.identify.moments import How, Moments, moments
+from koopmpc.errors import FitWarning
+from koopmpc.identify.regression import Regression
 from koopmpc.identify.solve import Rows, scaled_rank
 from koopmpc.lifting.base import Lifting
+from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.report import FitReport
 
-
-def read(
-    episodes: Episodes | Source, lifting: Lifting, embedding: Delay | None, **how: Unpack[How]
-) -> tuple[Moments, tuple[str, ...]]:
-    """Return the moments of the rows [ψ(x) u w ψ(x⁺)], and the names of w."""
-    source = source_of(episodes)
-    sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
-    return moments(source.driven(), lifting, embedding=sized, **how), source.disturbances
+Model = TypeVar("Model", LinearPredictor, BilinearPredictor)
 
 
-def tikhonov(ridge: float) -> float:
-    """Return the ridge, or raise where it is negative."""
-    value = float(checks.array(ridge, "ridge", ()))
-    if value < 0:
-        raise DataError(f"ridge is {value:g}; it must be 0 or above")
-    return value
+class Found(NamedTuple):
+    """What a method found: z⁺ = A z + B u, B with the columns of w, and what it says of it.
+
+    Attributes
+    ----------
+    rule
+        What solved it, in words.
+    doubts, changes
+        Sentences of the report: its warnings, and what a prior or a limit changed.
+    """
+
+    A: Float[np.ndarray, "nz nz"]
+    B: Float[np.ndarray, "nz nu"]
+    C: Float[np.ndarray, "nx nz"]
+    lifting: Lifting
+    residual: Float[np.ndarray, " nx"]
+    state_residual: Float[np.ndarray, " nx"]
+    rank: int
+    condition: float
+    rule: str
+    ridge: float = 0.0
+    doubts: Sequence[str] = ()
+    changes: Sequence[str] = ()
+    modes: Complex[np.ndarray, "nl nz"] | None = None
+
+
+def whole(
+    task: Regression,
+    K: Float[np.ndarray, "n nz"],
+    *,
+    rank: int,
+    condition: float,
+    rule: str,
+    ridge: float = 0.0,
+    doubts: Sequence[str] = (),
+    changes: Sequence[str] = (),
+) -> Found:
+    """Return what K = [A B]ᵀ is, in the lifting of the task."""
+    nz = task.lifting.nz
+    return Found(
+        A=K[:nz].T,
+        B=K[nz:].T,
+        C=np.eye(nz) if task.C is None else task.C,
+        lifting=task.lifting,
+        residual=task.rows.residual(task.x_next, task.decoded(K)),
+        state_residual=task.state_residual,
+        rank=rank,
+        condition=condition,
+        rule=rule,
+        ridge=ridge,
+        doubts=doubts,
+        changes=changes,
+    )
+
+
+def report(task: Regression, found: Found) -> FitReport:
+    """Return the report of what was found."""
+    return FitReport(
+        method=task.method,
+        route=f"{task.route}, {found.rule}",
+        samples=task.rows.samples,
+        condition=found.condition,
+        rank=found.rank,
+        columns=task.columns,
+        ridge=found.ridge,
+        residual=found.residual,
+        state_residual=found.state_residual,
+        warnings=tuple(found.doubts),
+        changes=tuple(found.changes),
+    )
+
+
+def linear_predictor(task: Regression, found: Found) -> LinearPredictor:
+    """Return z⁺ = A z + B u + E w with its report."""
+    nu = len(task.inputs) - len(task.disturbances)
+    return LinearPredictor(
+        found.A,
+        found.B[:, :nu],
+        found.C,
+        found.lifting,
+        task.dt,
+        task.states,
+        task.inputs[:nu],
+        report(task, found),
+        found.modes,
+        E=found.B[:, nu:],
+        disturbances=task.disturbances,
+        embedding=task.embedding,
+    )
+
+
+def assembled(
+    task: Regression,
+    K: Float[np.ndarray, "n nz"],
+    *,
+    rule: str,
+    ridge: float = 0.0,
+    doubts: Sequence[str] = (),
+    changes: Sequence[str] = (),
+) -> LinearPredictor:
+    """Return z⁺ = A z + B u + E w with [A B E] = Kᵀ, found under priors, limits or penalties."""
+    rank, condition = scaled_rank(task.rows, task.rows.P)
+    found = whole(
+        task, K, rank=rank, condition=condition, rule=rule, ridge=ridge, doubts=doubts, changes=changes
+    )
+    return linear_predictor(task, found)
+
+
+def warned(model: Model) -> Model:
+    """Return the model; each doubt of its report is a FitWarning at the line that called the caller."""
+    for sentence in model.report.warnings if model.report else ():
+        warnings.warn(sentence, FitWarning, stacklevel=3)
+    return model
 
 
 def growth(rows: Rows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
@@ -49,65 +145,3 @@ def relative_misfit(rows: Rows, K: Float[np.ndarray, "n nz"]) -> float:
     energy = (np.sum(rows.T[:, which] ** 2, axis=0) + rows.rest[which]) / rows.samples
     error = rows.residual(which, K) ** 2
     return float(np.sqrt(np.mean(error / np.where(energy > 0, energy, 1.0))))
-
-
-def assembled(
-    task: Regression,
-    K: Float[np.ndarray, "n nz"],
-    disturbances: Sequence[str],
-    *,
-    rule: str,
-    ridge: float = 0.0,
-    sentences: Sequence[str] = (),
-    changes: Sequence[str] = (),
-    warn: bool = True,
-) -> LinearPredictor:
-    """Return z⁺ = A z + B u + E w with [A B E] = Kᵀ; each sentence of doubt warns once.
-
-    Parameters
-    ----------
-    task
-        The regression that K solves.
-    K
-        Coefficients of ψ(x⁺) on [ψ(x) u w].
-    disturbances
-        Names of w, the last of the task's inputs.
-    rule
-        What solved it, in words.
-    ridge, sentences, changes
-        For the report.
-    warn
-        Warn; online fits only report.
-    """
-    rows, nz = task.rows, task.lifting.nz
-    C = np.eye(nz) if task.C is None else task.C
-    rank, condition = scaled_rank(rows, rows.P)
-    report = FitReport(
-        method=task.method,
-        route=f"{task.route}, {rule}",
-        samples=rows.samples,
-        condition=condition,
-        rank=rank,
-        columns=rows.P.shape[1],
-        ridge=ridge,
-        residual=rows.residual(task.x_next, K @ C.T),
-        state_residual=task.state_residual,
-        warnings=tuple(sentences),
-        changes=tuple(changes),
-    )
-    for sentence in sentences if warn else ():
-        warnings.warn(sentence, FitWarning, stacklevel=3)
-    nu = len(task.inputs) - len(disturbances)
-    return LinearPredictor(
-        K[:nz].T,
-        K[nz : nz + nu].T,
-        C,
-        task.lifting,
-        task.dt,
-        task.states,
-        task.inputs[:nu],
-        report,
-        E=K[nz + nu :].T,
-        disturbances=disturbances,
-        embedding=task.embedding,
-    )

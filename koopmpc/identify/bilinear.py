@@ -1,7 +1,7 @@
 """Bilinear extended dynamic mode decomposition: z⁺ = A z + B u + Σ uᵢ Nᵢ z on z = ψ(x)."""
 
-import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -10,18 +10,19 @@ from jaxtyping import Float, Int
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, FitWarning, ObservableError
+from koopmpc.errors import DataError, ObservableError
+from koopmpc.identify.assemble import Found, report, warned
 from koopmpc.identify.doubts import doubts
-from koopmpc.identify.edmd import regression
 from koopmpc.identify.fit import rule
-from koopmpc.identify.moments import How, Moments, moments, product_names
+from koopmpc.identify.gather import How, moments
+from koopmpc.identify.moments import Moments, product_names
 from koopmpc.identify.rank import Rank, leading, lost
+from koopmpc.identify.regression import regression
 from koopmpc.identify.ridge import Ridge, ridge_of
 from koopmpc.identify.solve import Rows, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.projected import Projected
 from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.report import FitReport
 
 
 def bilinear_edmd(
@@ -112,24 +113,34 @@ def bilinear_edmd(
     K = (solution.K + start) @ basis
     N = np.zeros((nu, r, r))
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
-    seen = Rows(P, given.T, given.rest, given.samples)
-    solved = rule(seen, ridge, solution.ridge)
-    report = FitReport(
-        method="bilinear_edmd",
-        route=f"{task.route}, {words}, {solved}" if words else f"{task.route}, {solved}",
-        samples=given.samples,
-        condition=condition,
-        rank=solution.rank,
-        columns=P.shape[1],
-        ridge=solution.ridge,
-        residual=seen.residual(task.x_next, K @ C.T),
+    task = replace(task, rows=Rows(P, given.T, given.rest, given.samples))
+    solved = rule(task.rows, ridge, solution.ridge)
+    found = Found(
+        A=K[:r].T,
+        B=K[r : r + nu].T,
+        C=C,
+        lifting=bound,
+        residual=task.rows.residual(task.x_next, K @ C.T),
         state_residual=state_residual,
-        warnings=tuple(sentences),
+        rank=solution.rank,
+        condition=condition,
+        rule=f"{words}, {solved}" if words else solved,
+        ridge=solution.ridge,
+        doubts=sentences,
     )
-    for sentence in sentences:
-        warnings.warn(sentence, FitWarning, stacklevel=2)
-    A, B = K[:r].T, K[r : r + nu].T
-    return BilinearPredictor(A, B, N, C, bound, task.dt, task.states, task.inputs, report, task.embedding)
+    model = BilinearPredictor(
+        found.A,
+        found.B,
+        N,
+        C,
+        bound,
+        task.dt,
+        task.states,
+        task.inputs,
+        report(task, found),
+        task.embedding,
+    )
+    return warned(model)
 
 
 def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:

@@ -8,12 +8,14 @@ from jaxtyping import Float
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.assemble import assembled, growth, read, tikhonov
+from koopmpc.identify.assemble import assembled, growth, warned
 from koopmpc.identify.doubts import doubts
-from koopmpc.identify.edmd import regression
-from koopmpc.identify.moments import How
+from koopmpc.identify.fit import rule
+from koopmpc.identify.gather import How
 from koopmpc.identify.prior import Entries, Prior
 from koopmpc.identify.program import optimum, violation
+from koopmpc.identify.regression import read
+from koopmpc.identify.ridge import Ridge, ridge_of
 from koopmpc.identify.solve import Rows, norms, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.linear import LinearPredictor
@@ -27,7 +29,7 @@ def constrained_edmd(
     *,
     embedding: Delay | None = None,
     prior: Prior,
-    ridge: float = 0.0,
+    ridge: Ridge = 0.0,
     **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares among the A, B, E that agree with what is known of them.
@@ -48,7 +50,7 @@ def constrained_edmd(
     prior
         What is known; its shapes and names are those of the lifting's observables and of the inputs.
     ridge
-        Tikhonov weight on unit-norm columns of what is free.
+        Tikhonov weight on unit-norm columns of what is free; "gcv" chooses it for the fit without the prior.
     **how
         ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
 
@@ -62,15 +64,14 @@ def constrained_edmd(
     FitWarning
         The free columns are dependent or ill-conditioned, or the solver met its tolerance only roughly.
     """
-    ridge = tikhonov(ridge)
-    total, disturbances = read(episodes, lifting, embedding, **how)
-    task = regression(total, "constrained_edmd")
+    asked = ridge_of(ridge)
+    task = read(episodes, lifting, embedding, "constrained_edmd", **how)
     nz, names = task.lifting.nz, task.lifting.names
     entries = prior.entries(names, task.inputs)
-    rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
-    sentences = _doubts(rows, entries, names, task.inputs, regular=ridge > 0)
-    plain = linear(rows, entries, ridge)
-    K, statuses = _bounded(rows, entries, plain, ridge, prior)
+    rows = task.rows.leading(nz)
+    sentences = _doubts(rows, entries, names, task.inputs, regular=asked != 0)
+    without = solve(rows, ridge=asked)
+    K, statuses = _bounded(rows, entries, linear(rows, entries, without.ridge), without.ridge, prior)
     sentences += [
         f"the solver met its tolerance only roughly (status {status!r}); check the priors and the scales of the data"
         for status in sorted(statuses - {"optimal"})
@@ -80,16 +81,9 @@ def constrained_edmd(
     changes = [f"{int((~free).sum())} of {free.size} entries of [A B] are known"] * bool((~free).any())
     changes += [f"{int(active.sum())} entries stand at a bound"] * bool(active.any())
     changes += [word for word, held in _COUPLINGS.items() if getattr(prior, held)]
-    changes.append(growth(rows, K, solve(rows, ridge=ridge).K))
-    return assembled(
-        task,
-        K,
-        disturbances,
-        rule=f"{'Clarabel' if statuses else 'linear algebra'} under priors, ridge {ridge:g}",
-        ridge=ridge,
-        sentences=sentences,
-        changes=changes,
-    )
+    changes.append(growth(rows, K, without.K))
+    said = f"{'Clarabel' if statuses else 'linear algebra'} under priors, {rule(rows, asked, without.ridge)}"
+    return warned(assembled(task, K, rule=said, ridge=without.ridge, doubts=sentences, changes=changes))
 
 
 _COUPLINGS = {

@@ -11,8 +11,9 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.candidates import Candidate
-from koopmpc.identify.edmd import regression
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.gather import moments
+from koopmpc.identify.moments import Moments
+from koopmpc.identify.regression import regression
 from koopmpc.identify.solve import Rows, path
 from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor

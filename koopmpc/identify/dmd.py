@@ -11,11 +11,12 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
-from koopmpc.identify.fit import Method, Regression, fit
-from koopmpc.identify.moments import How, moments
+from koopmpc.identify.assemble import warned
+from koopmpc.identify.fit import Method, fit
+from koopmpc.identify.gather import How, moments
 from koopmpc.identify.rank import Rank
+from koopmpc.identify.regression import Regression
 from koopmpc.identify.solve import Rows
-from koopmpc.identify.total import complete
 from koopmpc.lifting.state import State
 from koopmpc.predict.linear import LinearPredictor
 
@@ -60,7 +61,7 @@ def dmd(
     decomposition", Exp. Fluids 57, 2016.
     """
     task = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", how=how)
-    return fit(task, rank=rank, method=method)
+    return warned(fit(task, rank=rank, method=method))
 
 
 def dmdc(
@@ -109,7 +110,7 @@ def dmdc(
         )
     known = None if B is None else checks.array(B, "B", (source.nx, source.nu))
     task = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", how=how)
-    return fit(task, rank=rank, method=method)
+    return warned(fit(task, rank=rank, method=method))
 
 
 def _regression(
@@ -133,7 +134,7 @@ def _regression(
     else:
         total = moments(source, lifting, route="qr", **how)
         columns = total.regressors[: nx + nu]
-        rows = complete(total, columns) if noisy else total.rows(columns, total.targets)
+        rows = (total.complete if noisy else total.rows)(columns, total.targets)
     return Regression(
         method=method,
         route="svd",

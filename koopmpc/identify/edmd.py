@@ -2,18 +2,15 @@
 
 from typing import Unpack
 
-import numpy as np
-from jaxtyping import Float
-
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.source import Source, source_of
-from koopmpc.identify.fit import Method, Regression, fit
-from koopmpc.identify.moments import How, Moments, moments
+from koopmpc.data.source import Source
+from koopmpc.identify.assemble import warned
+from koopmpc.identify.fit import Method, fit
+from koopmpc.identify.gather import How
 from koopmpc.identify.rank import Rank
+from koopmpc.identify.regression import read
 from koopmpc.identify.ridge import Ridge
-from koopmpc.identify.solve import solve
-from koopmpc.identify.total import complete
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.linear import LinearPredictor
 
@@ -73,64 +70,5 @@ def edmd(
     Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
     25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
     """
-    source = source_of(episodes)
-    sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
-    total = moments(source.driven(), lifting, embedding=sized, **how)
-    task = regression(total, "edmd", noisy=method != "ls")
-    fitted = fit(task, ridge=ridge, rank=rank, method=method)
-    if not source.nw:
-        return fitted
-    B, E = np.split(fitted.B, [source.nu], axis=1)
-    return LinearPredictor(
-        fitted.A,
-        B,
-        fitted.C,
-        fitted.lifting,
-        fitted.dt,
-        fitted.states,
-        source.inputs,
-        fitted.report,
-        fitted.exact_modes,
-        E,
-        source.disturbances,
-        fitted.embedding,
-    )
-
-
-def regression(total: Moments, method: str, *, noisy: bool = False) -> Regression:
-    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included; `noisy` keeps all of T."""
-    states = total.states
-    place = {name: i for i, name in enumerate(total.full.names)}
-    where = np.array([place[name] for name in states])
-    C, residual = _decoder(total, where)
-    regressors = total.regressors
-    return Regression(
-        method=method,
-        route=total.route,
-        rows=complete(total, regressors) if noisy else total.rows(regressors, total.targets),
-        x_next=where,
-        lifting=total.lifting,
-        states=states,
-        inputs=total.inputs,
-        dt=total.dt,
-        C=C,
-        state_residual=residual,
-        embedding=total.embedding,
-    )
-
-
-def _decoder(
-    total: Moments, where: np.ndarray
-) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
-    """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked."""
-    nz = total.nz
-    C = np.zeros((len(where), nz))
-    residual = np.zeros(len(where))
-    held = where < nz
-    C[held, where[held]] = 1.0
-    if not held.all():
-        rows = total.rows(np.arange(nz), where[~held])
-        K = solve(rows).K
-        C[~held] = K.T
-        residual[~held] = rows.residual(np.arange(len(rows.rest)), K)
-    return C, residual
+    task = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **how)
+    return warned(fit(task, ridge=ridge, rank=rank, method=method))

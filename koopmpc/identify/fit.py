@@ -1,71 +1,28 @@
 """From the rows of a regression to a LinearPredictor and its report."""
 
-import warnings
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
 
-from koopmpc.data.delay import Delay
-from koopmpc.errors import DataError, FitWarning
+from koopmpc.errors import DataError
+from koopmpc.identify.assemble import Found, linear_predictor, whole
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.forward_backward import forward_backward
 from koopmpc.identify.rank import Rank, leading, lost
+from koopmpc.identify.regression import Regression
 from koopmpc.identify.ridge import Ridge, ridge_of
 from koopmpc.identify.solve import Rows, cutoff, solve
 from koopmpc.identify.total import denoised
-from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.projected import Projected
 from koopmpc.predict.linear import LinearPredictor, eigen
-from koopmpc.predict.report import FitReport
 
 Method = Literal["ls", "tls", "fb"]
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
-@dataclass(frozen=True, eq=False)
-class Regression:
-    """ψ(x⁺) on [ψ(x) u], ready to be solved.
-
-    Attributes
-    ----------
-    method, route
-        For the report.
-    rows
-        P = [ψ(x) u]; T begins with ψ(x⁺).
-    x_next
-        The columns of T that hold x⁺.
-    lifting, states, inputs, dt
-        As in the predictor.
-    C, state_residual
-        (nx, nz), None where ψ(x) is x; and the root-mean-square of x − C ψ(x).
-    B
-        (nz, nu) where it is known.
-    scaled
-        Solve on columns of unit norm.
-    embedding
-        As in the predictor.
-    """
-
-    method: str
-    route: str
-    rows: Rows
-    x_next: Int[np.ndarray, " nx"]
-    lifting: Lifting
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    dt: float
-    C: Float[np.ndarray, "nx nz"] | None
-    state_residual: Float[np.ndarray, " nx"]
-    B: Float[np.ndarray, "nz nu"] | None = None
-    scaled: bool = True
-    embedding: Delay | None = None
-
-
 def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
-    """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖² and report; a doubtful fit warns once, with FitWarning.
+    """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖² and report.
 
     Parameters
     ----------
@@ -91,85 +48,40 @@ def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Meth
         rows = Rows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
     free = task.inputs if task.B is None else ()
     sentences, condition = doubts(rows, task.lifting.names, free, regular=ridge != 0 or rank is not None)
-    found = (
-        _whole(task, rows, ridge, method)
-        if rank is None
-        else _reduced(task, rows, ridge, rank, method, sentences)
-    )
-    report = FitReport(
-        method=task.method,
-        route=f"{task.route}, {_WORDS[method]}{found.rule}",
-        samples=rows.samples,
-        condition=condition,
-        rank=found.rank,
-        columns=rows.P.shape[1],
-        ridge=found.ridge,
-        residual=found.residual,
-        state_residual=found.state_residual,
-        warnings=tuple(sentences),
-    )
-    for sentence in sentences:
-        warnings.warn(sentence, FitWarning, stacklevel=3)
-    return LinearPredictor(
-        found.A,
-        found.B,
-        found.C,
-        found.lifting,
-        task.dt,
-        task.states,
-        task.inputs,
-        report,
-        found.modes,
-        embedding=task.embedding,
-    )
+    if rank is None:
+        found = _whole(task, rows, ridge, method, condition)
+    else:
+        found = _reduced(task, rows, ridge, rank, method, condition, sentences)
+    return linear_predictor(task, found._replace(rule=_WORDS[method] + found.rule, doubts=sentences))
 
 
-class _Found(NamedTuple):
-    A: Float[np.ndarray, "nz nz"]
-    B: Float[np.ndarray, "nz nu"]
-    C: Float[np.ndarray, "nx nz"]
-    lifting: Lifting
-    residual: Float[np.ndarray, " nx"]
-    state_residual: Float[np.ndarray, " nx"]
-    modes: Complex[np.ndarray, "nl nz"] | None
-    rank: int
-    ridge: float
-    rule: str
-
-
-def _whole(task: Regression, rows: Rows, ridge: Ridge, method: Method) -> _Found:
+def _whole(task: Regression, rows: Rows, ridge: Ridge, method: Method, condition: float) -> Found:
     nz = task.lifting.nz
-    given = Rows(rows.P, rows.T[:, :nz], rows.rest[:nz], rows.samples)
+    given = rows.leading(nz)
     if method == "tls":
         given = _denoised(task, given, nz)
     solution = (
         forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=task.scaled)
     )
-    K = solution.K
-    B = K[nz:].T if task.B is None else task.B
-    C = np.eye(nz) if task.C is None else task.C
-    return _Found(
-        A=K[:nz].T,
-        B=B,
-        C=C,
-        lifting=task.lifting,
-        residual=rows.residual(task.x_next, K @ C.T),
-        state_residual=task.state_residual,
-        modes=None,
-        rank=solution.rank,
-        ridge=solution.ridge,
-        rule=rule(rows, ridge, solution.ridge, scaled=task.scaled),
-    )
+    K = solution.K if task.B is None else np.vstack([solution.K, task.B.T])
+    said = rule(rows, ridge, solution.ridge, scaled=task.scaled)
+    return whole(task, K, rank=solution.rank, condition=condition, rule=said, ridge=solution.ridge)
 
 
 def _reduced(
-    task: Regression, rows: Rows, ridge: Ridge, rank: Rank, method: Method, sentences: list[str]
-) -> _Found:
+    task: Regression,
+    rows: Rows,
+    ridge: Ridge,
+    rank: Rank,
+    method: Method,
+    condition: float,
+    sentences: list[str],
+) -> Found:
     """Regress on [U_rᵀψ(x) u]; Ã = U_rᵀ X′ V_r Σ_r⁻¹ without input (Tu et al. 2014)."""
     nz = task.lifting.nz
     basis, words = leading(rows, nz, rank, sentences)
     r = len(basis.T)
-    given = Rows(rows.P, rows.T[:, :nz], rows.rest[:nz], rows.samples)
+    given = rows.leading(nz)
     if method == "tls":
         given = _denoised(task, given, r)
         basis = leading(given, nz, r, [])[0]
@@ -185,17 +97,18 @@ def _reduced(
     C = basis if task.C is None else task.C @ basis
     Z = rows.P[:, :nz]
     seen = Rows(np.hstack([Z @ basis, task.rows.P[:, nz:]]), task.rows.T, rows.rest, rows.samples)
-    return _Found(
+    return Found(
         A=A,
         B=B,
         C=C,
         lifting=Projected(task.lifting, basis),
         residual=seen.residual(task.x_next, np.vstack([A.T, B.T]) @ C.T),
         state_residual=np.hypot(task.state_residual, lost(Z, basis, task.C, rows.samples)),
-        modes=forward @ eigen(A)[1],
         rank=r,
-        ridge=solution.ridge,
+        condition=condition,
         rule=words if ridge == 0 else f"{words}, {rule(seen, ridge, solution.ridge)}",
+        ridge=solution.ridge,
+        modes=forward @ eigen(A)[1],
     )
 
 

@@ -9,12 +9,14 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.assemble import assembled, tikhonov
+from koopmpc.identify.assemble import assembled
 from koopmpc.identify.doubts import doubts
-from koopmpc.identify.edmd import regression
 from koopmpc.identify.factor import Forgetting, Window
-from koopmpc.identify.moments import Moments, _with_states
-from koopmpc.identify.solve import Rows, solve
+from koopmpc.identify.fit import rule
+from koopmpc.identify.moments import Moments, with_states
+from koopmpc.identify.regression import regression
+from koopmpc.identify.ridge import Ridge, ridge_of
+from koopmpc.identify.solve import solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.predict.linear import LinearPredictor
 
@@ -41,7 +43,7 @@ class OnlineEDMD:
     window
         Number of pairs that count; None for all.
     ridge
-        Tikhonov weight on unit-norm columns.
+        Tikhonov weight on unit-norm columns; "gcv" chooses it anew for each predictor.
     keep
         In (0, 1): no direction's information is forgotten below this share of the most it ever was, so that a plant
         at rest does not unlearn. Lower it where the later signals are more than 1/√keep times smaller than the first.
@@ -67,13 +69,14 @@ class OnlineEDMD:
         disturbances: Sequence[str] = (),
         forgetting: float = 1.0,
         window: int | None = None,
-        ridge: float = 0.0,
+        ridge: Ridge = 0.0,
         keep: float = 1e-6,
     ) -> None:
         self._lifting = lifting_of(lifting).bind(tuple(states))
-        self._full = _with_states(self._lifting)
+        self._full = with_states(self._lifting)
         self._inputs, self._disturbances = tuple(inputs), tuple(disturbances)
-        self._dt, self._ridge = checks.positive(dt, "dt", "s"), tikhonov(ridge)
+        self._dt = checks.positive(dt, "dt", "s")
+        self._ridge: Ridge = ridge_of(ridge)
         factor = checks.positive(forgetting, "forgetting")
         if factor > 1:
             raise DataError(f"forgetting is {factor:g}; it must lie in (0, 1], 1 forgets nothing")
@@ -100,7 +103,7 @@ class OnlineEDMD:
         *,
         forgetting: float = 1.0,
         window: int | None = None,
-        ridge: float = 0.0,
+        ridge: Ridge = 0.0,
         keep: float = 1e-6,
     ) -> "OnlineEDMD":
         """Return one that has learned from these episodes, in their order, and has their names and dt."""
@@ -176,19 +179,17 @@ class OnlineEDMD:
         if self.pairs == 0:
             raise DataError("nothing was learned yet; call update first")
         R, weight = self._memory.factor(self._rows[: self._waiting])
-        task = regression(self._moments(R, weight), "online_edmd")
-        nz = self._lifting.nz
-        rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
-        sentences = doubts(rows, task.lifting.names, task.inputs, regular=self._ridge > 0)[0]
+        task = regression(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
+        rows = task.rows.leading(self._lifting.nz)
+        sentences = doubts(rows, task.lifting.names, task.inputs, regular=self._ridge != 0)[0]
         solution = solve(rows, ridge=self._ridge)
         return assembled(
             task,
             solution.K,
-            self._disturbances,
-            rule=f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, ridge {self._ridge:g}",
-            ridge=self._ridge,
-            sentences=sentences,
-            warn=False,
+            rule=f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
+            + rule(rows, self._ridge, solution.ridge),
+            ridge=solution.ridge,
+            doubts=sentences,
         )
 
     def _write(

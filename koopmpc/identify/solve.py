@@ -40,6 +40,10 @@ class Rows:
         np.subtract(self.T[:, columns], error, out=error)
         return np.sqrt((np.einsum("ij,ij->j", error, error) + self.rest[columns]) / self.samples)
 
+    def leading(self, targets: int) -> "Rows":
+        """Return these rows with the first targets only."""
+        return Rows(self.P, self.T[:, :targets], self.rest[:targets], self.samples)
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:

@@ -11,13 +11,13 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.assemble import assembled, growth, read
+from koopmpc.identify.assemble import assembled, growth, warned
 from koopmpc.identify.constrained import linear
 from koopmpc.identify.doubts import doubts
-from koopmpc.identify.edmd import regression
+from koopmpc.identify.gather import How
 from koopmpc.identify.lasso import lasso
-from koopmpc.identify.moments import How
 from koopmpc.identify.prior import Entries
+from koopmpc.identify.regression import read
 from koopmpc.identify.solve import Rows, norms, onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
@@ -80,13 +80,12 @@ def sparse_edmd(
     penalty = checks.positive(penalty, "penalty")
     if over not in ("observables", "entries"):
         raise DataError(f'over is {over!r}; pass "observables" or "entries"')
-    total, disturbances = read(episodes, lifting, embedding, **how)
-    task = regression(total, "sparse_edmd")
+    task = read(episodes, lifting, embedding, "sparse_edmd", **how)
     names, nz = task.lifting.names, task.lifting.nz
     missing = [state for state in task.states if state not in names]
     if missing:
         raise DataError(f"the lifting lacks the state {missing[0]!r}; add State() to it")
-    rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
+    rows = task.rows.leading(nz)
     one = Constant().bind(task.states).names[0]
     kept = np.array([name in task.states or name == one for name in names])
     used, missed = _closed(rows, kept, penalty, over == "entries", adaptive)
@@ -114,7 +113,7 @@ def sparse_edmd(
     where = np.array([place[state] for state in task.states])
     part = replace(task, rows=few, lifting=picked, C=task.C[:, stay], x_next=where)
     rule = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
-    return assembled(part, K, disturbances, rule=rule, sentences=sentences, changes=changes)
+    return warned(assembled(part, K, rule=rule, doubts=sentences, changes=changes))
 
 
 def _closed(

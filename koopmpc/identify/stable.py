@@ -9,13 +9,14 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.assemble import assembled, growth, read, tikhonov
+from koopmpc.identify.assemble import assembled, growth, warned
 from koopmpc.identify.contraction import Misfit, clipped, inside, nearest, radius_of
 from koopmpc.identify.doubts import doubts
-from koopmpc.identify.edmd import regression
-from koopmpc.identify.fit import Regression
+from koopmpc.identify.fit import rule
+from koopmpc.identify.gather import How
 from koopmpc.identify.lyapunov import lyapunov_fit
-from koopmpc.identify.moments import How
+from koopmpc.identify.regression import Regression, read
+from koopmpc.identify.ridge import Ridge, ridge_of
 from koopmpc.identify.solve import Rows, norms, onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
@@ -31,7 +32,7 @@ def stable_edmd(
     *,
     embedding: Delay | None = None,
     radius: float = 1.0,
-    ridge: float = 0.0,
+    ridge: Ridge = 0.0,
     **how: Unpack[How],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares with every eigenvalue |λ(A)| ≤ radius.
@@ -55,7 +56,7 @@ def stable_edmd(
     radius
         ρ > 0; below 1 it asks for a rate of decay.
     ridge
-        Tikhonov weight on unit-norm columns.
+        Tikhonov weight on unit-norm columns; "gcv" chooses it for the plain fit.
     **how
         ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
 
@@ -70,36 +71,35 @@ def stable_edmd(
         As `edmd`. ``report.changes`` tells the spectral radius, the misfit and each state's residual before and
         after: small residuals may grow much, for each observable counts relative to its own size.
     """
-    rho, ridge = checks.positive(radius, "radius"), tikhonov(ridge)
-    total, disturbances = read(episodes, lifting, embedding, **how)
-    task = regression(total, "stable_edmd")
+    rho, asked = checks.positive(radius, "radius"), ridge_of(ridge)
+    task = read(episodes, lifting, embedding, "stable_edmd", **how)
     nz, names = task.lifting.nz, task.lifting.names
-    rows = Rows(task.rows.P, task.rows.T[:, :nz], task.rows.rest[:nz], task.rows.samples)
-    sentences = doubts(rows, names, task.inputs, regular=ridge > 0)[0]
-    K = solve(rows, ridge=ridge).K
+    rows = task.rows.leading(nz)
+    sentences = doubts(rows, names, task.inputs, regular=asked != 0)[0]
+    plain = solve(rows, ridge=asked)
+    K, weight = plain.K, plain.ridge
     one = Constant().bind(task.states).names[0]
     moving = np.array([i for i, name in enumerate(names) if name != one], dtype=np.intp)
     if one in names:
         K[:, names.index(one)] = np.eye(len(K))[names.index(one)]
     before = radius_of(K[np.ix_(moving, moving)].T)
     changes = [f"spectral radius {before:.6g}, not above {rho:g}: the plain fit stays"]
-    rule = f"ridge {ridge:g}"
+    said = rule(rows, asked, weight)
     if before > rho + _ROUNDING:
-        stable = _stabilised(rows, K, moving, rho, ridge)
+        stable = _stabilised(rows, K, moving, rho, weight)
         after = radius_of(stable[np.ix_(moving, moving)].T)
-        rule = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, ridge {ridge:g}"
+        said = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, {said}"
         changes = [f"spectral radius {before:.6g} before, {after:.6g} after", growth(rows, stable, K)]
         changes += _losses(task, K, stable)
         K = stable
-    return assembled(task, K, disturbances, rule=rule, ridge=ridge, sentences=sentences, changes=changes)
+    return warned(assembled(task, K, rule=said, ridge=weight, doubts=sentences, changes=changes))
 
 
 def _losses(
     task: Regression, plain: Float[np.ndarray, "n nz"], stable: Float[np.ndarray, "n nz"]
 ) -> list[str]:
     """Return for each state what stability costs its one-step residual, in words."""
-    C = np.eye(task.lifting.nz) if task.C is None else task.C
-    pairs = zip(*(task.rows.residual(task.x_next, K @ C.T) for K in (plain, stable)), strict=True)
+    pairs = zip(*(task.rows.residual(task.x_next, task.decoded(K)) for K in (plain, stable)), strict=True)
     return [
         f"one-step residual of {name!r}: {before:.3g} before, {after:.3g} after"
         for name, (before, after) in zip(task.states, pairs, strict=True)

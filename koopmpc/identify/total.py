@@ -4,15 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.errors import DataError
-from koopmpc.identify.moments import Moments
 from koopmpc.identify.solve import Rows
-
-
-def complete(total: Moments, regressors: Int[np.ndarray, " n"]) -> Rows:
-    """Return rows [P T] that hold all of T, for methods that need the moments of ψ(x⁺) with itself."""
-    n, columns = len(regressors), np.concatenate([regressors, total.targets])
-    every = total.rows(columns, total.targets[:0]).P
-    return Rows(every[:, :n], every[:, n:], np.zeros(len(total.targets)), total.samples)
 
 
 def denoised(rows: Rows, exact: Int[np.ndarray, " e"], nz: int, directions: int, *, scaled: bool) -> Rows:

@@ -12,8 +12,9 @@ from koopmpc.errors import DataError
 from koopmpc.identify.coverage import Coverage, coverage
 from koopmpc.identify.evidence import Evidence
 from koopmpc.identify.excitation import feedback_share, persistency
+from koopmpc.identify.gather import moments
 from koopmpc.identify.invariance import invariance
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.moments import Moments
 from koopmpc.identify.residual_dmd import residual_dmd
 from koopmpc.identify.trust_text import written
 from koopmpc.identify.verdict import Finding, findings

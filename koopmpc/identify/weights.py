@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Changed, Held, Source
 from koopmpc.errors import DataError, ShapeError
 
 Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
@@ -42,3 +43,23 @@ def weights_of(weights: Weights, episodes: Episodes) -> Steps:
         if own.min() < 0:
             raise DataError(f"the weight of episode {i} is {own.min():g}; weights are 0 or above")
     return steps
+
+
+def changed(weights: Weights | None, source: Source) -> Weights | None:
+    """Return the weights that belong to the episodes as `source` changes them: an embedding drops their first steps.
+
+    Raises
+    ------
+    DataError
+        They are a list, and the source is not made from Episodes, which alone have an order that is known.
+    """
+    if weights is None or callable(weights):
+        return weights
+    dropped, inner = 0, source
+    while isinstance(inner, Changed):
+        dropped, inner = dropped + inner.history, inner.source
+    if not isinstance(inner, Held):
+        raise DataError(
+            "weights are a list, which only Episodes have an order for; pass a function of an Episode"
+        )
+    return [own[dropped:] for own in weights_of(weights, inner.episodes) if len(own) > dropped]

@@ -12,7 +12,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.folder import Files
 from koopmpc.data.ranges import RangePart, ranges
 from koopmpc.errors import DataError, LogError
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.lifting.state import State
 from tests.identify.plants import brute_force, random_episodes
 

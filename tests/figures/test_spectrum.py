@@ -5,7 +5,7 @@ import pytest
 
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.figures.spectrum import plot_spectrum
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.identify.residual_dmd import residual_dmd
 from koopmpc.lifting.state import State
 from koopmpc.predict.bilinear import BilinearPredictor

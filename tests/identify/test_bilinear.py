@@ -11,7 +11,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.edmd import edmd
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.fourier import Fourier

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.excitation import feedback_share, persistency
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import State

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import subspace_angles
 
+from koopmpc.identify.gather import moments
 from koopmpc.identify.invariance import invariance
-from koopmpc.identify.moments import moments
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.chunks import chunks, lifted
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.gather import moments
+from koopmpc.identify.moments import Moments
 from koopmpc.identify.solve import solve
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.stream import Stream
 from koopmpc.identify.edmd import edmd
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.identify.solve import solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.constant import Constant

@@ -16,7 +16,8 @@ from koopmpc.errors import DataError, KoopmpcError, ShapeError
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.dmd import dmdc
 from koopmpc.identify.edmd import edmd
-from koopmpc.identify.moments import Moments, moments
+from koopmpc.identify.gather import moments
+from koopmpc.identify.moments import Moments
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.monomials import Monomials

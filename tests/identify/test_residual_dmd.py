@@ -9,7 +9,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.edmd import edmd
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.identify.residual_dmd import residual_dmd
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions

@@ -12,8 +12,8 @@ from koopmpc.errors import DataError
 from koopmpc.identify.constrained import constrained_edmd
 from koopmpc.identify.contraction import Misfit, clipped, nearest, radius_of
 from koopmpc.identify.edmd import edmd
+from koopmpc.identify.gather import moments
 from koopmpc.identify.lyapunov import lyapunov_fit
-from koopmpc.identify.moments import moments
 from koopmpc.identify.prior import Prior
 from koopmpc.identify.sparse import sparse_edmd
 from koopmpc.identify.stable import stable_edmd

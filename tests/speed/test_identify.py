@@ -15,7 +15,7 @@ from koopmpc.data.folder import Files
 from koopmpc.data.stream import Stream
 from koopmpc.identify.chunks import ROWS
 from koopmpc.identify.edmd import edmd
-from koopmpc.identify.moments import moments
+from koopmpc.identify.gather import moments
 from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.state import State
 
