@@ -5,6 +5,7 @@ from typing import Any
 
 from koopmpc.recording.description import About
 from koopmpc.recording.eigenvalues import Model, eigenvalue_views
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.scenes import BACKGROUND, Bounds
 from koopmpc.recording.styles import input_limits
 
@@ -26,7 +27,7 @@ def blueprint(about: About, *, bounds: Bounds | None, model: Model | None) -> An
     )
     inputs = rrb.TimeSeriesView(
         contents=["/control/u", "/control/limits"],
-        name=_title("Input", about.inputs),
+        name=drawable(_title("Input", about.inputs)),
         axis_y=_padded([v for _, v in input_limits(about)]),
         plot_legend=_legend(visible=len(about.inputs) > 1),
     )
@@ -65,7 +66,7 @@ def _states(about: About) -> list[Any]:
     return [
         rrb.TimeSeriesView(
             contents=contents,
-            name=name,
+            name=drawable(name),
             plot_legend=_legend(visible=False),
             overrides={
                 "/state": rr.SeriesLines.from_fields(visible_series=[s == name for s in about.states]),

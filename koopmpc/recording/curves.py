@@ -13,11 +13,9 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.styles import color
 
-_UNDRAWN = str.maketrans(
-    {"ᵀ": "^T", "∣": "/"}
-)  # of what is written here the viewer's font lacks these, and it dies
 _FLUSH = 10.0  # longest wait for the file [s]
 
 
@@ -79,15 +77,17 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
         pass  # Rerun makes no folders, and says nothing of what it cannot write
     rec = rr.RecordingStream(application, recording_id=uuid.uuid4())
     rec.set_sinks(rr.FileSink(str(path)), default_blueprint=_blueprint(tabs, slugs))
-    rec.log("page", rr.TextDocument(page.translate(_UNDRAWN), media_type="text/markdown"), static=True)
+    rec.log("page", rr.TextDocument(drawable(page), media_type="text/markdown"), static=True)
     for tab, slug, curves in zip(tabs, slugs, tables, strict=True):
         for j, column in enumerate(tab.columns):
             for i, (name, X) in enumerate(curves.items()):
                 k = np.flatnonzero(np.isfinite(X[:, j]))
                 if not len(k):
                     continue  # a timeline without a row ends the viewer
-                entity = f"{slug}/{_slug(column)}/{_slug(name)}"
-                rec.log(entity, rr.SeriesLines(names=name, colors=color(i), widths=2.0), static=True)
+                entity = f"{slug}/{_slug(column)}/{i}_{_slug(name)}"  # drawn in this order: the truth below
+                rec.log(
+                    entity, rr.SeriesLines(names=drawable(name), colors=color(i), widths=2.0), static=True
+                )
                 times = [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=k * tab.dt)]
                 rec.send_columns(entity, times, rr.Scalars.columns(scalars=X[k, j]))
     rec.flush(timeout_sec=_FLUSH)
@@ -107,12 +107,12 @@ def _blueprint(tabs: Sequence[Curves], slugs: Sequence[str]) -> Any:
         views = [
             rrb.TimeSeriesView(
                 origin=f"{slug}/{_slug(column)}",
-                name=column,
+                name=drawable(column),
                 plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=j == 0),
             )
             for j, column in enumerate(tab.columns)
         ]
-        return rrb.Vertical(*views, name=tab.title)
+        return rrb.Vertical(*views, name=drawable(tab.title))
 
     return rrb.Blueprint(
         rrb.Horizontal(

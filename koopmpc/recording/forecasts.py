@@ -7,6 +7,7 @@ import numpy as np
 
 from koopmpc.predict.forecast import Forecast
 from koopmpc.predict.score import Score
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.scene import Color
 from koopmpc.recording.styles import PALETTE
 
@@ -29,7 +30,8 @@ class Series:
 
         names, colors, widths = (list(part) for part in zip(*self.curves, strict=True))
         more: dict[str, Any] = {"interpolation_mode": "StepAfter"} if steps else {}
-        rec.log(entity, rr.SeriesLines(names=names, colors=colors, widths=widths, **more), static=True)
+        drawn = [drawable(name) for name in names]
+        rec.log(entity, rr.SeriesLines(names=drawn, colors=colors, widths=widths, **more), static=True)
         k = self.first + np.arange(len(self.values))
         nanoseconds = np.rint(k * self.dt * 1e9).astype("timedelta64[ns]")
         columns = rr.Scalars.columns(scalars=self.values.ravel()).partition([len(names)] * len(k))

@@ -20,6 +20,7 @@ from koopmpc.predict.plane import Axes, Plane, plane_through
 from koopmpc.predict.score import Predictor, score
 from koopmpc.recording.eigenvalues import draw_eigenvalues, eigenvalue_views
 from koopmpc.recording.forecasts import error_series, forecast_series, input_series
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.planes import draw_eigenfunctions, plane_view
 
 _ESCAPED, _BEFORE = re.compile(r"([|*_`])"), r"\\\1"  # what Markdown would not take as it stands
@@ -94,8 +95,8 @@ def record_model(
         rr.FileSink(str(path)),
         default_blueprint=_blueprint(predictor, ahead, pictures, surface, told=residuals is not None),
     )
-    rec.send_recording_name(f"model of {', '.join(predictor.states)}")
-    text = rr.TextDocument(_page(predictor, report, note), media_type=rr.MediaType.MARKDOWN)
+    rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
+    text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
     rec.log("report", text, static=True)
     drawn = draw_eigenvalues(predictor, residuals)
     for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
@@ -194,7 +195,7 @@ def _blueprint(
 
     def plot(origin: str, name: str, *, legend: bool) -> Any:
         corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
-        return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=corner)
+        return rrb.TimeSeriesView(origin=origin, name=drawable(name), plot_legend=corner)
 
     states = list(enumerate(predictor.states))[:_SHOWN]
     tabs = []

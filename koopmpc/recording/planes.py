@@ -8,6 +8,7 @@ import numpy as np
 
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.plane import Plane, eigenfunctions_on
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.scenes import BACKGROUND
 from koopmpc.recording.shades import circle, sequence
 
@@ -47,7 +48,7 @@ def plane_view(entity: str, title: str, plane: Plane) -> Any:
     n, m = len(plane.across), len(plane.up)
     return rrb.Spatial2DView(
         origin=entity,
-        name=title,
+        name=drawable(title),
         background=list(BACKGROUND),
         visual_bounds=rrb.VisualBounds2D(x_range=[-0.3 * n, 1.1 * n], y_range=[-0.08 * m, 1.25 * m]),
     )
@@ -58,7 +59,7 @@ def _picture(entity: str, shades: np.ndarray, plane: Plane) -> dict[str, Any]:
     import rerun as rr
 
     m, n = shades.shape[:2]
-    (x, y), across, up = plane.names, plane.across, plane.up
+    (x, y), across, up = map(drawable, plane.names), plane.across, plane.up
     words = {
         (0.04 * n, 1.06 * m): f"{across[0]:.3g}",
         (0.5 * n, 1.14 * m): x,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc.recording.description import About
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.rows import Rows
 from koopmpc.recording.scene import Color
 
@@ -33,7 +34,7 @@ def styles(about: About, rows: Rows) -> dict[str, Any]:
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
         "reference": _lines([f"{n} reference" for n in tracked], [_matching(n, about) for n in tracked], 1.0),
         "measurement": rr.SeriesPoints(
-            names=[f"{n} measured" for n in about.outputs],
+            names=[drawable(f"{n} measured") for n in about.outputs],
             colors=[_matching(n, about) for n in about.outputs],
             marker_sizes=[1.5] * len(about.outputs),
         ),
@@ -75,4 +76,6 @@ def _matching(name: str, about: About) -> Color:
 def _lines(names: Sequence[str], colors: Sequence[Color], width: float, **more: Any) -> Any:
     import rerun as rr
 
-    return rr.SeriesLines(names=list(names), colors=list(colors), widths=[width] * len(names), **more)
+    return rr.SeriesLines(
+        names=[drawable(name) for name in names], colors=list(colors), widths=[width] * len(names), **more
+    )

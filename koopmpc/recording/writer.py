@@ -18,6 +18,7 @@ from koopmpc.loop.run import Run
 from koopmpc.recording.blueprint import blueprint
 from koopmpc.recording.description import About, metrics_to_markdown, to_json, to_markdown
 from koopmpc.recording.eigenvalues import Model, draw_eigenvalues
+from koopmpc.recording.glyphs import drawable
 from koopmpc.recording.rows import Rows, blocks
 from koopmpc.recording.scenes import Bounds, Drawing, Names, Scene, draw, draw_ahead, stages
 from koopmpc.recording.styles import input_limits, styles
@@ -126,7 +127,7 @@ class Writer:
                 text = f"The metrics cannot be computed: {error}"
         if not self._opened:
             self._open()
-        document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
         self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
         if self._bounds.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
@@ -141,9 +142,9 @@ class Writer:
         sinks: list[Any] = [] if self._path is None else [rr.FileSink(self._path)]
         sinks += [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
         self._rec.set_sinks(*sinks)
-        self._rec.send_recording_name(self._about.title)
+        self._rec.send_recording_name(drawable(self._about.title))
         self._sum("/description:json", self._json.encode())
-        text = rr.TextDocument(self._page, media_type=rr.MediaType.MARKDOWN)
+        text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
         self._rec.log("description", text, rr.AnyValues(json=self._json), static=True)
         self.flush()  # a log that is cut says what it was
         self._rec.send_blueprint(self._blueprint(), make_active=False)

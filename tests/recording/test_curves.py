@@ -28,10 +28,10 @@ def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
     record_curves([tab], tmp_path / "deep" / "c.rrd", application="koopmpc-test", page="# Uᵀ")
     found = written(tmp_path / "deep" / "c.rrd")
     flat = {entity: [row[0] for row in rows] for entity, rows in found.items()}
-    assert flat["/one_two/x_m/truth"] == truth[:, 0].tolist()
-    assert flat["/one_two/x_m/model_a"] == [0.5, 4.5, 6.5, 8.5]
-    assert flat["/one_two/v_m_s/truth"] == truth[:, 1].tolist()
-    assert "/one_two/v_m_s/model_a" not in flat
+    assert flat["/one_two/x_m/0_truth"] == truth[:, 0].tolist()
+    assert flat["/one_two/x_m/1_model_a"] == [0.5, 4.5, 6.5, 8.5]
+    assert flat["/one_two/v_m_s/0_truth"] == truth[:, 1].tolist()
+    assert "/one_two/v_m_s/1_model_a" not in flat
     assert flat["/page"] == ["# U^T"]
 
 
