@@ -1,7 +1,7 @@
 """Cart-pole: a 2 m shift with the pole held upright, and a recovery from 0.5 rad off.
 
 A cart of 5 kg on a rail without friction, pushed by a force, carries a pole of L = 2 m with a point mass of
-1 kg at its tip: the plant of D. Snyder and C. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using
+1 kg at its tip: the plant of G. Snyder and Z. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using
 Dynamic Mode Decomposition" (2021), after S. Brunton and N. Kutz, "Data-Driven Science and Engineering" (2019),
 section 8.7. θ = π is upright. From rest 0.5 rad off, less than (M + m) g tan 0.5 = 32.2 N cannot turn the pole back:
 it falls, and comes up again only on the other side, by a full turn.

@@ -1,7 +1,7 @@
 """Pendulum: driven upright from π/4, and from hanging with a torque too weak to lift it.
 
-Undamped, m = 1 kg on a massless rod of L = 2 m, driven by a torque at the pivot: the plant of D. Snyder and
-C. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode Decomposition" (2021). θ = 0 is
+Undamped, m = 1 kg on a massless rod of L = 2 m, driven by a torque at the pivot: the plant of G. Snyder and
+Z. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode Decomposition" (2021). θ = 0 is
 upright. Holding the rod level takes m g L = 19.6 N m, so `hang` with its 10 N m has to swing.
 """
 

@@ -1,6 +1,6 @@
 """Pendulum swing-up: from any angle to upright with half the torque that would lift it.
 
-The plant of D. Snyder and C. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode
+The plant of G. Snyder and Z. Song, "Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode
 Decomposition" (2021): undamped, m = 1 kg on a massless rod of L = 2 m, driven by a torque at the pivot, θ = 0 upright.
 Holding the rod level takes m g L = 19.6 N m; the torque is limited to 10 N m. The model is learned from random
 torques, and the cost is on sin θ and cos θ, which together weigh 2 (1 − cos θ): every turn counts the same.
