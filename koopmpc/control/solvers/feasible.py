@@ -1,19 +1,30 @@
+# pyright: basic
 """Whether any v satisfies low ≤ A v ≤ high, by linear programming: exact where a first-order method only creeps."""
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+_FAR = 1e20  # limits beyond it are none
+_INFEASIBLE = 2  # status of SciPy's linprog
+
 
 def empty(A: Float[np.ndarray, "m n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> bool:
-    """Return whether the simplex method finds that no v satisfies low ≤ A v ≤ high; a few milliseconds at 50 × 150.
+    """Return whether the simplex method finds that no v satisfies low ≤ A v ≤ high; some 10 ms at 50 × 150.
+
+    It is the HiGHS of SciPy: that of CasADi crashes in a process that has imported CVXPY.
 
     References
     ----------
     Huangfu & Hall, "Parallelizing the dual revised simplex method", Math. Program. Comput. 10, 2018 (HiGHS).
     """
-    m, n = A.shape
-    structure = {"a": ca.Sparsity.dense(m, n), "h": ca.Sparsity(n, n)}
-    solver = ca.conic("feasible", "highs", structure, {"error_on_fail": False, "highs.output_flag": False})
-    solver(a=A, lba=low, uba=high)
-    return str(solver.stats()["return_status"]) == "Infeasible"
+    from scipy.optimize import linprog
+
+    below, above = low > -_FAR, high < _FAR
+    found = linprog(
+        np.zeros(A.shape[1]),
+        A_ub=np.vstack([A[above], -A[below]]),
+        b_ub=np.concatenate([high[above], -low[below]]),
+        bounds=(None, None),
+        method="highs",
+    )
+    return found.status == _INFEASIBLE
