@@ -4,13 +4,15 @@ In Riccati coordinates, u_j = −K_j ξ_j + v_j f + √unit L_j⁻ᵀ w_j with S
 constant + unit · Σ ‖w_j‖²: w = 0 is the unconstrained optimum, and the Hessian is the identity even where the plant is
 unstable and plain condensing (u as the variable) has lost all its digits. In plain coordinates w is u less its
 unconstrained optimum, and the Hessian is what the Riccati coordinates say of it.
+
+References only add to the cost what is linear in w, −2 Σ (C z_k)ᵀQ r_k and so on, with z_k as w moves it: as the Hessian
+is unit · I, half of that gradient over −unit is the w that they ask for.
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 
 from koopmpc.control.horizon import Horizon
@@ -48,50 +50,74 @@ class Condensed:
 
 def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordinates = "riccati") -> Condensed:
     """Return the maps of a horizon whose blocks follow `law`; "auto" chooses the coordinates by cond(H)."""
-    h, signals = horizon, horizon.signals(targets.Z.shape[1])
+    h, signals = horizon, horizon.signals
     moves, nu, nx = law.K.shape
     nz, ng, nf = len(h.A), len(h.G), signals.size
     n = moves * nu
-    outputs = n * (1 + h.bounded)
     unit = float((law.L[0] ** 2).sum()) / nu
+    spread = np.sqrt(unit) * np.linalg.inv(law.L).transpose(0, 2, 1)
 
-    v = np.empty((outputs + h.N * ng, nx + nf + n))
-    X = np.zeros((nx, nx + nf + n))  # ξ_k as a matrix on [ξ_0; f; w]
+    U = np.empty((moves, nu, nx + nf + n))  # u of each move as a matrix on [ξ_0; f; w], and z of each step
+    Z = np.empty((h.N, nz, nx + nf + n))
+    X = np.zeros((nx, nx + nf + n))
     X[:, :nx] = np.eye(nx)
-    known, k = slice(nx, nx + nf), 0
+    last = X[nz:].copy()
+    k = 0
     for j, b in enumerate(h.blocks):
-        rows = slice(j * nu, (j + 1) * nu)
-        u = -law.K[j] @ X
-        u[:, known] += law.v[j]
-        one = np.sqrt(unit) * np.eye(nu)
-        u[:, nx + nf :][:, rows] += scipy.linalg.solve_triangular(law.L[j], one, lower=True, trans="T")
-        v[rows] = u
-        if h.bounded:
-            v[n + j * nu : n + (j + 1) * nu] = u - X[nz:]
+        u = U[j]
+        np.matmul(-law.K[j], X, out=u)
+        u[:, nx : nx + nf] += law.v[j]
+        u[:, nx + nf + j * nu : nx + nf + (j + 1) * nu] += spread[j]
         if h.rated:
             X[nz:] = u
         Bu = h.B @ u
         for _ in range(b):
-            X[:nz] = h.A @ X[:nz] + Bu
-            push = h.push(signals, k)
-            if push is not None:
-                X[:nz, known] += push
-            v[outputs + k * ng : outputs + (k + 1) * ng] = h.G @ X[:nz]
+            z = Z[k]
+            np.matmul(h.A, X[:nz], out=z)
+            z += Bu
+            z[:, nx:][:, signals.w(k)] += h.E
+            z[:, nx:][:, signals.d] += np.eye(nz, signals.nd)
+            X[:nz] = z
             k += 1
+    rows = [U.reshape(n, -1)]
+    if h.bounded:
+        rows.append((U - np.concatenate([last[None], U[:-1]])).reshape(n, -1))
+    v = np.vstack([*rows, (h.G @ Z).reshape(h.N * ng, Z.shape[2])])
+    W = v[:, nx + nf :]
+    reference, target = _asked(h, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
     most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
-    chosen, deviation, hessian = _coordinates(v[:, nx + nf :], n, coordinates, most)
-    f = v[:, known]
+    chosen, deviation, hessian = _coordinates(W, n, coordinates, most)
     return Condensed(
         v[:, :nx],
-        f[:, signals.references],
-        f[:, signals.targets],
-        f[:, signals.drive],
-        f[:, -1],
+        W @ (reference / unit),
+        W @ (target / unit),
+        v[:, nx : nx + nf - 1],
+        v[:, nx + nf - 1],
         deviation,
         hessian,
         unit,
         chosen,
     )
+
+
+def _asked(
+    h: Horizon, targets: Targets, U: Float[np.ndarray, "moves nu nw"], Z: Float[np.ndarray, "N nz nw"]
+) -> tuple[Float[np.ndarray, "nw nR"], Float[np.ndarray, "nw nT"]]:
+    """Return what the references, and the coordinates of their targets, ask of w, times unit."""
+    nw, nr, na, nz = U.shape[2], len(h.C), targets.Z.shape[1], len(h.A)
+    reference, target = np.zeros((nw, h.N + 1, nr)), np.zeros((nw, h.N + 1, na))
+    reference[:, 1 : h.N] = (Z[:-1].transpose(2, 0, 1) @ h.C.T) @ h.Q
+    target[:, : h.N] = np.repeat(U, h.blocks, axis=0).transpose(2, 0, 1) @ (h.R @ targets.W)
+    if h.CQ_N is not None:
+        reference[:, h.N] = Z[-1].T @ h.CQ_N
+    else:
+        target[:, h.N] = Z[-1].T @ (h.P_N[:nz, :nz] @ targets.Z)
+        if h.rated:
+            both = h.P_N[:nz, nz:] @ targets.W
+            target[:, h.N] += Z[-1].T @ both + U[-1].T @ (
+                h.P_N[nz:, :nz] @ targets.Z + h.P_N[nz:, nz:] @ targets.W
+            )
+    return reference.reshape(nw, -1), target.reshape(nw, -1)
 
 
 def _coordinates(
@@ -101,9 +127,13 @@ def _coordinates(
     if wanted != "riccati":
         back = np.linalg.inv(deviation[:n])  # w of the Riccati coordinates from u less its optimum
         H = back.T @ back
-        least, most = np.linalg.eigvalsh(H)[[0, -1]]
-        if wanted == "plain" or most <= limit * least:
+        if wanted == "plain" or _condition(H) <= limit:
             plain = deviation @ back
             plain[:n] = np.eye(n)
             return "plain", plain, H
     return "riccati", np.ascontiguousarray(deviation), np.eye(n)
+
+
+def _condition(H: Float[np.ndarray, "n n"]) -> float:
+    least, most = np.linalg.eigvalsh(H)[[0, -1]]
+    return float(most / least) if least > 0 else np.inf

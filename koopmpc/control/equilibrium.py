@@ -13,7 +13,7 @@ from koopmpc.control.horizon import one_step
 from koopmpc.control.learned_map import LearnedMap
 from koopmpc.control.limits import Box
 from koopmpc.control.outputs import Outputs
-from koopmpc.control.riccati import stationary
+from koopmpc.control.stationary import stationary
 from koopmpc.control.target import TOLERANCE, root
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State

@@ -1,7 +1,8 @@
 """Horizon: a cost over N steps of a lifted model as stages of linear–quadratic control, one a block of held inputs.
 
-The stages are written in f, all that is known before the step: f = [r_0 … r_N; α_0 … α_N; w_0 … w_{N−1}; d; 1], the
-reference, its targets' coordinates, the preview of measured disturbances, and a constant disturbance of z.
+The stages are written in f = [w_0 … w_{N−1}; d; 1], the preview of measured disturbances and a constant disturbance of
+z: what moves the state. What is only tracked, references and the coordinates of targets, comes in when the horizon is
+condensed.
 """
 
 from collections.abc import Sequence
@@ -18,50 +19,25 @@ from koopmpc.errors import DataError
 
 
 class Signals(NamedTuple):
-    """Where the entries of f stand, for N steps and the sizes of r, α, w and d."""
+    """Where the entries of f stand, for N steps and the sizes of w and d."""
 
     N: int
-    nr: int
-    na: int
     nw: int
     nd: int
 
     @property
-    def references(self) -> slice:
-        """All r."""
-        return slice(0, (self.N + 1) * self.nr)
-
-    @property
-    def targets(self) -> slice:
-        """All α."""
-        return slice(self.references.stop, self.references.stop + (self.N + 1) * self.na)
-
-    @property
-    def drive(self) -> slice:
-        """All w, and d."""
-        return slice(self.targets.stop, self.targets.stop + self.N * self.nw + self.nd)
-
-    @property
     def size(self) -> int:
         """Entries of f."""
-        return self.drive.stop + 1
-
-    def r(self, k: int) -> slice:
-        """r_k."""
-        return slice(k * self.nr, (k + 1) * self.nr)
-
-    def alpha(self, k: int) -> slice:
-        """α_k."""
-        return slice(self.targets.start + k * self.na, self.targets.start + (k + 1) * self.na)
+        return self.N * self.nw + self.nd + 1
 
     def w(self, k: int) -> slice:
         """w_k."""
-        return slice(self.drive.start + k * self.nw, self.drive.start + (k + 1) * self.nw)
+        return slice(k * self.nw, (k + 1) * self.nw)
 
     @property
     def d(self) -> slice:
         """All of d."""
-        return slice(self.drive.stop - self.nd, self.drive.stop)
+        return slice(self.N * self.nw, self.N * self.nw + self.nd)
 
 
 @dataclass(frozen=True)
@@ -97,13 +73,15 @@ class Horizon:
         """Entries of ξ."""
         return len(self.A) + self.B.shape[1] * self.rated
 
-    def signals(self, na: int) -> Signals:
-        """Return the places in f, for targets of `na` coordinates."""
-        return Signals(self.N, len(self.C), na, self.E.shape[1], len(self.A) if self.disturbed else 0)
+    @property
+    def signals(self) -> Signals:
+        """The places in f."""
+        return Signals(self.N, self.E.shape[1], len(self.A) if self.disturbed else 0)
 
-    def push(self, signals: Signals, k: int) -> Float[np.ndarray, "nz nf"] | None:
+    def push(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
         """Return E w_k + d as a matrix on f; None where there is neither."""
-        if signals.drive.start == signals.drive.stop:
+        signals = self.signals
+        if signals.size == 1:
             return None
         e = np.zeros((len(self.A), signals.size))
         e[:, signals.w(k)] = self.E
@@ -151,58 +129,68 @@ def one_step(
 
 def stages(horizon: Horizon, targets: Targets) -> list[Stage]:
     """Return a stage for every block of b steps: A = Aᵇ, B = Σ AⁱB, and the cost of its steps summed."""
-    h, signals = horizon, horizon.signals(targets.Z.shape[1])
-    nz, nu = h.B.shape
-    powers = [(np.eye(nz), np.zeros((nz, nu))), (h.A, h.B)]
-    while len(powers) <= max(h.blocks):
-        powers.append((h.A @ powers[-1][0], h.A @ powers[-1][1] + h.B))
-    weights = {b: _weights(h, powers[:b]) for b in set(h.blocks)}
+    nz, nu = horizon.B.shape
+    powers = [(np.eye(nz), np.zeros((nz, nu))), (horizon.A, horizon.B)]
+    while len(powers) <= max(horizon.blocks):
+        powers.append((horizon.A @ powers[-1][0], horizon.A @ powers[-1][1] + horizon.B))
+    weighed = horizon.R @ _input(horizon, targets)
+    known: dict[tuple[int, int], Stage] = {}
     result: list[Stage] = []
     k = 0
-    for b in h.blocks:
-        q, r = np.zeros((h.size, signals.size)), np.zeros((nu, signals.size))
-        e: Float[np.ndarray, "nz nf"] | None = None
-        for i, (Ai, Bi) in enumerate(powers[:b]):
-            missed = np.zeros((len(h.C), signals.size)) if e is None else h.C @ e
-            missed[:, signals.r(k + i)] -= np.eye(len(h.C))
-            weighed = h.C.T @ (h.Q @ missed)
-            q[:nz] += weighed if i == 0 else Ai.T @ weighed
-            r += Bi.T @ weighed - h.R @ _input(signals, targets, h, k + i)
-            push = h.push(signals, k + i)
-            e = push if e is None or push is None else h.A @ e + push
-        A, B = powers[b]
-        if h.rated:
-            A, B = _stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
-            e = None if e is None else np.vstack([e, np.zeros((nu, signals.size))])
-        result.append(Stage(A, B, *weights[b], e, q, r))
+    for b in horizon.blocks:
+        key = b, k if horizon.signals.nw else 0  # without a preview all blocks of a length are the same
+        if key not in known:
+            known[key] = _stage(horizon, powers[: b + 1], k, -b * weighed)
+        result.append(known[key])
         k += b
     return result
 
 
+def _stage(
+    h: Horizon,
+    powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]],
+    k: int,
+    r: Float[np.ndarray, "nu nf"],
+) -> Stage:
+    """Return the stage of a block from step k on, r what is known of its linear term in u."""
+    nz, nu = h.B.shape
+    (A, B), q, e = powers[-1], None, h.push(k)
+    for i, (Ai, Bi) in enumerate(powers[1:-1], 1):
+        push = h.push(k + i)
+        if e is not None and push is not None:
+            missed = h.C.T @ (h.Q @ (h.C @ e))
+            q = np.zeros((h.size, h.signals.size)) if q is None else q
+            q[:nz] += Ai.T @ missed
+            r = r + Bi.T @ missed
+            e = h.A @ e + push
+    if h.rated:
+        A, B = _stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
+        e = None if e is None else np.vstack([e, np.zeros((nu, h.signals.size))])
+    return Stage(A, B, *_weights(h, powers[:-1]), e, q, r)
+
+
 def end(horizon: Horizon, targets: Targets) -> Float[np.ndarray, "nx nf"]:
     """Return the linear term p_N of the terminal weight, as a matrix on f."""
-    h, signals = horizon, horizon.signals(targets.Z.shape[1])
-    p = np.zeros((h.size, signals.size))
-    nz = len(h.A)
+    h, nz = horizon, len(horizon.A)
+    p = np.zeros((h.size, h.signals.size))
     if h.CQ_N is not None:
-        p[:nz, signals.r(h.N)] = -h.CQ_N
         return p
-    z_r = np.zeros((nz, signals.size))
-    z_r[:, signals.alpha(h.N)], z_r[:, -1] = targets.Z, targets.z0
-    push = h.push(signals, h.N - 1)
+    z_r = np.zeros((nz, h.signals.size))
+    z_r[:, -1] = targets.z0
+    push = h.push(h.N - 1)
     if push is not None:
         z_r += targets.z_push @ push
     p -= h.P_N[:, :nz] @ z_r
     if h.rated:
-        p -= h.P_N[:, nz:] @ _input(signals, targets, h, h.N)
+        p -= h.P_N[:, nz:] @ _input(h, targets)
     return p
 
 
-def _input(signals: Signals, targets: Targets, h: Horizon, k: int) -> Float[np.ndarray, "nu nf"]:
-    """Return u_r of step k; the last disturbance of the preview stays."""
-    u_r = np.zeros((len(targets.u0), signals.size))
-    u_r[:, signals.alpha(k)], u_r[:, -1] = targets.W, targets.u0
-    push = h.push(signals, h.N - 1)
+def _input(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
+    """Return u_r less what the coordinates of the target add; the last disturbance of the preview stays."""
+    u_r = np.zeros((len(targets.u0), h.signals.size))
+    u_r[:, -1] = targets.u0
+    push = h.push(h.N - 1)
     return u_r if push is None else u_r + targets.u_push @ push
 
 

@@ -13,7 +13,7 @@ from koopmpc.control.horizon import one_step
 from koopmpc.control.lifted import reference_rows, tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.control.riccati import stationary
+from koopmpc.control.stationary import stationary
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.measured import Measured
 from koopmpc.lifting.buffered import HUGE

@@ -10,7 +10,8 @@ from koopmpc.control.horizon import Horizon, end, one_step, stages
 from koopmpc.control.lifted import Tracking, tracking
 from koopmpc.control.limits import Box, Limits, Softness
 from koopmpc.control.program import Group, Program, program
-from koopmpc.control.riccati import recursion, stationary
+from koopmpc.control.riccati import recursion
+from koopmpc.control.stationary import stationary
 from koopmpc.control.target import margin
 from koopmpc.control.units import Units, units
 from koopmpc.errors import ShapeError
@@ -63,12 +64,11 @@ class PlanMap:
         self.hard = _program(self.maps, track, horizon, measured, soft_rows=False)
         softens = bool(np.isfinite(self.hard.most).any())
         self.soft = _program(self.maps, track, horizon, measured, soft_rows=True) if softens else None
-        self._signals = horizon.signals(found.Z.shape[1])
 
         low, high = _bounds(track, horizon)
         nv = len(low)
-        last, first = horizon.push(self._signals, horizon.N - 1), np.zeros((nv, 0))
-        self._push = np.zeros((predictor.nz, 0)) if last is None else last[:, self._signals.drive]
+        last, first = horizon.push(horizon.N - 1), np.zeros((nv, 0))
+        self._push = np.zeros((predictor.nz, 0)) if last is None else last[:, :-1]
         ng = self._push.shape[1]
         checked = np.zeros(len(found.low), dtype=np.bool_)
         if ng:

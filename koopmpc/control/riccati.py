@@ -1,4 +1,4 @@
-"""Riccati: the infinite-horizon gains, the finite-horizon recursion, and the terminal weight between them."""
+"""Riccati: the infinite-horizon gains, and the finite-horizon recursion."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,10 +11,6 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from koopmpc import checks
 from koopmpc.errors import DataError, DefinitenessError
-
-SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
-RESTS = 50  # steps for which it must have settled, at most
-LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
 
 
 class Gain(NamedTuple):
@@ -107,74 +103,14 @@ def recursion(
     for k in range(N - 1, -1, -1):
         A, B, Q, M, R, e, q, r = stages[k]
         p = p if e is None else p + P @ e
-        K[k], L[k], P = _step(A, B, Q, R, P, M)
+        K[k], L[k], P = step(A, B, Q, R, P, M)
         g = B.T @ p if r is None else B.T @ p + r
-        v[k] = -_solved(L[k], g)
+        v[k] = -solved(L[k], g)
         p = A.T @ p - K[k].T @ g if q is None else q + A.T @ p - K[k].T @ g
     return Law(K, L, v)
 
 
-def stationary(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    most: int,
-    M: Float[np.ndarray, "nz nu"] | None = None,
-) -> Gain:
-    """Iterate P ← Q + AᵀPA − KᵀSK from P = Q until K rests, at most `most` steps; the stage cost may hold 2xᵀMu.
-
-    K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
-    weight may take that long to reach an input. Never refused: a Constant, or any other mode that u cannot move,
-    only makes its own entries of P grow, which z − z_r does not see. Where P has grown by 1e12, an unstable mode
-    that u cannot move has taken over; the iteration then runs on the controllable part alone.
-    """
-    gain, bounded = _iterate(A, B, Q, R, most, M)
-    if not bounded:
-        V = _controllable(A, B)
-        gain, _ = _iterate(A @ V @ V.T, B, Q, R, most, M)
-    return gain
-
-
-def _iterate(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    most: int,
-    M: Float[np.ndarray, "nz nu"] | None,
-) -> tuple[Gain, bool]:
-    """Return the last gain, and whether P stayed below `LARGEST`."""
-    P, K = Q, np.zeros((B.shape[1], A.shape[0]))
-    scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
-    rested = 0
-    for _ in range(most):
-        K_next, _, P_next = _step(A, B, Q, R, P, M)
-        if not P_next.max() <= LARGEST * scale:  # P ⪰ 0: its largest entry is on its diagonal; False for NaN
-            return Gain(K, P), False
-        moved = abs(K_next - K).max()
-        P, K = P_next, K_next
-        rested = rested + 1 if moved <= SETTLED * abs(K).max() else 0
-        if rested >= min(len(A), RESTS):
-            break
-    return Gain(K, P), True
-
-
-def _controllable(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nc"]:
-    """Return an orthonormal basis of the controllable subspace, the span of [B, AB, A²B, …]."""
-    V = np.empty((len(A), 0))
-    new, least = B, SETTLED * float(np.linalg.norm(B, 2))
-    while new.shape[1] and V.shape[1] < len(A):
-        for _ in range(2):  # twice is enough for orthogonality to rounding
-            new = new - V @ (V.T @ new)
-        left, sigma, _ = np.linalg.svd(new, full_matrices=False)
-        left = left[:, sigma > least]
-        V = np.hstack([V, left])
-        new, least = A @ left, SETTLED * float(np.linalg.norm(A, 2))
-    return V
-
-
-def _step(
+def step(
     A: Float[np.ndarray, "nz nz"],
     B: Float[np.ndarray, "nz nu"],
     Q: Float[np.ndarray, "nz nz"],
@@ -182,6 +118,22 @@ def _step(
     P: Float[np.ndarray, "nz nz"],
     M: Float[np.ndarray, "nz nu"] | None,
 ) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "nz nz"]]:
+    """Return K, L and P of the stage before: P ← Q + AᵀPA − KᵀSK."""
+    K, L = gain(A, B, R, P, M)
+    P = Q + A.T @ (P @ (A - B @ K))
+    if M is not None:
+        P = P - M @ K
+    return K, L, 0.5 * (P + P.T)
+
+
+def gain(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    R: Float[np.ndarray, "nu nu"],
+    P: Float[np.ndarray, "nz nz"],
+    M: Float[np.ndarray, "nz nu"] | None,
+) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"]]:
+    """Return K = S⁻¹(BᵀPA + Mᵀ) and the L of S = R + BᵀPB = L Lᵀ."""
     BP = B.T @ P
     S = R + BP @ B
     L, info = dpotrf(S, lower=1)
@@ -191,14 +143,10 @@ def _step(
             f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state"
             " that every input moves"
         )
-    K = _solved(L, BP @ A if M is None else BP @ A + M.T)
-    P = Q + A.T @ (P @ (A - B @ K))
-    if M is not None:
-        P = P - M @ K
-    return K, L, 0.5 * (P + P.T)
+    return solved(L, BP @ A if M is None else BP @ A + M.T), L
 
 
-def _solved(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> Float[np.ndarray, "nu n"]:
+def solved(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> Float[np.ndarray, "nu n"]:
     """Return S⁻¹ right for S = L Lᵀ; LAPACK itself, for SciPy's own checks take ten times as long."""
     return np.ascontiguousarray(dpotrs(L, right, lower=1)[0])
 

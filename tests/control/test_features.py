@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import stationary
+from koopmpc.control.stationary import stationary
 from tests.control.models import PRECISE, Told, linear, random_pair
 from tests.control.oracle import oracle, targets_of
 

@@ -11,7 +11,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.outputs import outputs
-from koopmpc.control.riccati import stationary
+from koopmpc.control.stationary import stationary
 from koopmpc.errors import DataError
 from koopmpc.lifting.expressions import Expressions
 from koopmpc.plant.step_map import StepMap

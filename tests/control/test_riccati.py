@@ -6,7 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import Stage, recursion, stationary
+from koopmpc.control.horizon import one_step
+from koopmpc.control.riccati import Stage, recursion
+from koopmpc.control.stationary import _iterate, _leap, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -159,6 +161,39 @@ def test_the_difference_equation_is_never_refused(seed, nc, nu, kind):
     Kc = (K @ T)[:, :nc]
     assert np.abs(np.linalg.eigvals(Ac - Bc @ Kc)).max() < 1
     np.testing.assert_allclose(Kc, km.dlqr(Ac, Bc, 1, 1).K, atol=1e-4 * (1 + np.abs(Kc).max()))
+
+
+@given(
+    seed=SEEDS,
+    nc=st.integers(1, 4),
+    nu=st.integers(1, 2),
+    kind=st.sampled_from(["none", "one", "turning", "unstable"]),
+    free=st.sampled_from(["none", "inputs", "changes"]),
+)
+def test_a_leap_is_as_many_steps_of_the_difference_equation(seed, nc, nu, kind, free):
+    """Also where an input costs nothing, where its changes are weighed, and with modes that it does not move."""
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0, np.pi)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    modes = {"none": np.eye(0), "one": np.eye(1), "turning": rotation, "unstable": 1.3 * rotation}[kind]
+    _, _, _, A, B = with_uncontrollable(rng, nc, nu, modes)
+    Q, R = weights(rng, len(A), nu)
+    step = one_step(A, B, Q, 0.0 * R if free == "inputs" else R, R if free == "changes" else None)
+    given = step.A, step.B, step.Q, step.R, step.M
+    P, taken = _leap(*given, 400)
+    assert 1 <= taken < 400
+    assert taken & (taken - 1) == 0
+    plain, _ = _iterate(*given, step.Q, taken)
+    np.testing.assert_allclose(P, P.T, rtol=0, atol=0)
+    np.testing.assert_allclose(
+        _iterate(*given, P, 1)[0].K,
+        _iterate(*given, plain.P, 1)[0].K,
+        atol=1e-8 * (1 + np.abs(plain.K).max()),
+    )
+    if kind == "none":
+        found = stationary(*given[:4], 10_000, step.M).K
+        slow = _iterate(*given, step.Q, 10_000)[0].K
+        np.testing.assert_allclose(found, slow, atol=1e-6 * (1 + np.abs(slow).max()))
 
 
 def test_a_weight_may_take_long_to_reach_an_input():
