@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CUT = 0.8 * np.pi  # no lines of equal phase near ±π, where it jumps
+_EDGE = 0.08  # of the width: no label nearer to the side, where it would be cut
+_PAPER: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 _QUARTERS = {-np.pi / 2: "−π/2", 0.0: "0", np.pi / 2: "π/2"}
 
 
@@ -112,6 +114,8 @@ def _surface(made: Any, axes: Any, plane: Plane, values: np.ndarray, label: str)
 
 def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) -> None:
     """Draw the phase in colours that close at ±π, with lines at the quarters that can be read in grey."""
+    from matplotlib.patheffects import withStroke
+
     mesh = axes.pcolormesh(
         plane.across,
         plane.up,
@@ -134,4 +138,10 @@ def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) ->
             "linestyles": ["--", "-", ":"],
         }
         lines = axes.contour(plane.across, plane.up, inner, **look)
-        axes.clabel(lines, fontsize=6, fmt=_QUARTERS)
+        lines.set_path_effects(
+            [withStroke(linewidth=2.0, foreground="white")]
+        )  # the darkest shade is as dark
+        across = np.quantile(plane.across, [_EDGE, 1 - _EDGE])
+        axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)
+        for label in lines.labelTexts:
+            label.set(x=np.clip(label.get_position()[0], *across), bbox=_PAPER)

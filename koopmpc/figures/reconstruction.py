@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 _BEYOND = 0.5  # spans of the truth that a curve may leave it by and stay in the picture
 _LEAST = 1e-13  # errors below it are rounding
 _HIGHEST = 1e3  # errors above it are all the same
+_TICKS = 5  # at most, of the error
 _PANEL = 0.92  # height [in]
+_BENEATH: dict[str, Any] = TRUTH | {"linewidth": 2.4}  # seen on both sides of a curve that lies on it
 
 
 @styled
@@ -81,10 +83,12 @@ def plot_reconstruction(
 def _column(
     panels: Any, t: np.ndarray, truth: np.ndarray, curves: Mapping[str, np.ndarray], names: Sequence[str]
 ) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator
+
     size = float(np.linalg.norm(truth, axis=1).max())
     errors: list[np.ndarray] = []
     for panel, i in zip(panels[:-1], range(truth.shape[1]), strict=True):
-        panel.plot(t, truth[:, i], **TRUTH, label="truth")
+        panel.plot(t, truth[:, i], **_BENEATH, label="truth")
         for name, curve in curves.items():
             panel.plot(t, curve[:, i], **line(names.index(name), len(t)), label=name)
         low, high = float(truth[:, i].min()), float(truth[:, i].max())
@@ -102,6 +106,8 @@ def _column(
         highest = max(float(error.max()) for error in errors)
         low, high = (float(np.log10(np.clip(v, _LEAST, _HIGHEST))) for v in (usual, highest))
         panels[-1].set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
+    panels[-1].yaxis.set_major_locator(LogLocator(numticks=_TICKS))
+    panels[-1].yaxis.set_minor_locator(NullLocator())
 
 
 def _fitting(curve: ArrayLike, name: str, truth: np.ndarray) -> np.ndarray:
