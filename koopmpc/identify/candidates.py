@@ -158,12 +158,12 @@ def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Itera
     rest = [i for i in range(len(states)) if i not in found]
     for k in (1, 2, 3):
         circle = Fourier(k, which)
-        yield f"fourier {k} of {where}", base + circle
+        yield f"fourier {k} ({where})", base + circle
         if rest and k < 3:
             others = State(rest)
-            yield f"fourier {k} of {where} × state", base + circle + circle * others
+            yield f"fourier {k} ({where}) × state", base + circle + circle * others
             squares = others * others
-            yield f"fourier {k} of {where} × squares", base + circle + squares + circle * (others + squares)
+            yield f"fourier {k} ({where}) × squares", base + circle + squares + circle * (others + squares)
 
 
 def _quadratic(nx: int) -> tuple[str, Lifting]:

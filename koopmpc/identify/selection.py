@@ -13,7 +13,7 @@ from koopmpc.predict.score import Predictor
 from koopmpc.values import Value
 
 PLAIN = "linear: x, 1"  # [x 1] as it is, the one that others have to beat
-_WIDTH = 110
+_WIDTH = 100
 _SHOWN = 15  # rows of the printed table
 
 
@@ -133,15 +133,15 @@ class Selection(Value):
         shown = sorted({*range(min(rows, len(self.leaderboard))), self.chosen, self.chosen_linear, *plain})
         wide = max(len(self.leaderboard[i].title) for i in shown)
         steps = (f"{n} step{'s' * (n > 1)}" for n in (1, max(h // 2, 1), h))
-        head = "".join(f"{text:>10}" for text in (*steps, "worst", "ρ(A)", "ridge"))
-        lines = [f"    {'':<{wide}}{'nz':>5}{head}{'time':>8}"]
+        head = "".join(f"{text:>9}" for text in (*steps, "worst", "ρ(A)", "ridge"))
+        lines = [f"    {'':<{wide}}{'nz':>4}{head}{'time':>7}"]
         for i in shown:
             row = self.leaderboard[i]
             mark = "→" if i == self.chosen else ("l" if i == self.chosen_linear else " ")
-            errors = "".join(f"{e:>10.2g}" for e in (row.first, row.middle, row.last, row.worst))
+            errors = "".join(f"{e:>9.2g}" for e in (row.first, row.middle, row.last, row.worst))
             lines.append(
-                f"{mark:>2}  {row.title:<{wide}}{row.nz:>5}{errors}{row.radius:>10.4g}{row.ridge:>10.0e}"
-                f"{row.seconds:>6.1f} s"
+                f"{mark:>2}  {row.title:<{wide}}{row.nz:>4}{errors}{row.radius:>9.4g}"
+                f"{f'{row.ridge:.0e}' if row.ridge else '0':>9}{row.seconds:>5.1f} s"
             )
         hidden = len(self.leaderboard) - len(shown)
         more = f" {hidden} more are in the leaderboard." if hidden else ""
