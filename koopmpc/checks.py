@@ -56,7 +56,7 @@ def array(
         raise DataError(
             f"{name} is not an array of numbers: got {type(value).__name__}, {error}; pass numbers of one shape"
         ) from error
-    if shape is not None:
+    if shape is not None and shape != result.shape:
         fits = len(shape) == result.ndim and all(
             n is None or n == m for n, m in zip(shape, result.shape, strict=True)
         )

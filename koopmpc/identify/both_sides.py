@@ -28,19 +28,10 @@ class BothSides(NamedTuple):
 
 
 def both_sides(total: Moments) -> BothSides:
-    """Return RᵀR = G for the columns [p t]: a triangular factor, or from Gram sums a root with half the digits."""
-    n = len(total.regressors)
-    columns = np.concatenate([total.regressors, total.targets[: total.nz]])
-    rounding = float(np.finfo(float).eps * max(total.samples, len(columns)))
-    if total.route == "qr":
-        R = np.asarray(np.linalg.qr(total.sums[:, columns], mode="r"), dtype=np.float64)
-        return BothSides(R[:, :n], R[:, n:], rounding)
-    G = total.sums[np.ix_(columns, columns)]
-    size = np.sqrt(G.diagonal())
-    size[size == 0] = 1.0
-    values, vectors = np.linalg.eigh(G / np.outer(size, size))
-    R = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * size
-    return BothSides(R[:, :n], R[:, n:], float(np.sqrt(rounding)))
+    """Return these rows, and where rounding begins: with Gram sums at half the digits."""
+    rows = total.complete(total.regressors, total.targets[: total.nz])
+    rounding = float(np.finfo(float).eps * max(total.samples, len(total.regressors) + total.nz))
+    return BothSides(rows.P, rows.T, rounding if total.route == "qr" else float(np.sqrt(rounding)))
 
 
 def orthonormal(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:

@@ -18,6 +18,7 @@ from koopmpc.identify.regression import regression
 from koopmpc.identify.ridge import Ridge, ridge_of
 from koopmpc.identify.solve import solve
 from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.lifting.buffered import buffered
 from koopmpc.predict.linear import LinearPredictor
 
 _BLOCK = 32  # rows that the factor takes in at once
@@ -29,6 +30,9 @@ class OnlineEDMD:
     It keeps the triangular factor of the rows [ψ(x) u w ψ(x⁺)], never a covariance: updates are orthogonal
     transformations, so errors do not grow with their number. With a window it is the fit of the last `window` pairs.
     Without either it is the batch fit.
+
+    It takes no embedding, for it remembers no steps. A model with delays learns from points ζ, as its states:
+    ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``update(zeta, u, zeta_next)``.
 
     Parameters
     ----------
@@ -74,6 +78,7 @@ class OnlineEDMD:
     ) -> None:
         self._lifting = lifting_of(lifting).bind(tuple(states))
         self._full = with_states(self._lifting)
+        self._psi, self._pair = buffered(self._full), np.empty((2, self._full.nz))  # for single pairs
         self._inputs, self._disturbances = tuple(inputs), tuple(disturbances)
         self._dt = checks.positive(dt, "dt", "s")
         self._ridge: Ridge = ridge_of(ridge)
@@ -152,12 +157,13 @@ class OnlineEDMD:
             raise DataError(f"the model has {nw} measured disturbances; pass w")
         pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw)) if nw else None
         count = 1 if single else len(now)
-        states = np.concatenate([now.reshape(count, nx), after.reshape(count, nx)])
-        with np.errstate(all="ignore"):  # what is not finite is named below
-            Z = self._full(states)
-        if not np.isfinite(Z).all():
-            bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
-            raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")
+        Z = self._lifted(now, after) if single else None
+        if Z is None or not np.isfinite(Z).all():  # rows, or what the quick way cannot do
+            with np.errstate(all="ignore"):  # what is not finite is named below
+                Z = self._full(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
+            if not np.isfinite(Z).all():
+                bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
+                raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")
         done = 0
         while done < count:
             take = min(count - done, len(self._rows) - self._waiting)
@@ -191,6 +197,17 @@ class OnlineEDMD:
             ridge=solution.ridge,
             doubts=sentences,
         )
+
+    def _lifted(
+        self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]
+    ) -> Float[np.ndarray, "2 nf"]:
+        """Return ψ of both at a microsecond each, in memory of our own; NaN beyond 1e30."""
+        memory = self._psi.slot()
+        for z, point in zip(self._pair, (now, after), strict=True):
+            memory.arguments[0][:] = point
+            memory.evaluate()
+            z[:] = memory.results[0]
+        return self._pair
 
     def _write(
         self,

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.folder import Files
 from koopmpc.data.stream import Stream
-from koopmpc.errors import DataError, KoopmpcError, ShapeError
+from koopmpc.errors import DataError, FitWarning, KoopmpcError, ShapeError
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.dmd import dmdc
 from koopmpc.identify.edmd import edmd
@@ -225,6 +226,24 @@ def test_weighted_coefficients_and_residuals_are_those_of_weighted_least_squares
     error = (D[:, 3:] - D[:, :3] @ K) ** 2
     size = np.sqrt(np.average(error, axis=0, weights=np.concatenate(w)))
     assert np.allclose(fitted.report.residual, size)
+
+
+def test_listed_weights_go_with_the_pairs_that_an_embedding_and_disturbances_leave() -> None:
+    rng = np.random.default_rng(4)
+    lengths = [12, 2, 9]  # the second has no pair of ζ
+    parts = [
+        Episode(X=rng.normal(size=(n + 1, 2)), U=rng.normal(size=(n, 1)), W=rng.normal(size=(n, 1)))
+        for n in lengths
+    ]
+    data, delay = Episodes(parts, 0.1), Delay(2)
+    w = [rng.uniform(1, 2, n) for n in lengths]
+    with pytest.warns(FitWarning, match="1 of 3 episodes have 2 steps or less"):
+        listed = edmd(data, State(), embedding=delay, weights=w)
+    whole = delay(Episodes([parts[0], parts[2]], 0.1)).driven()
+    P = np.vstack([np.hstack([e.X[:-1], e.U]) for e in whole])
+    T, root = np.vstack([e.X[1:] for e in whole]), np.sqrt(np.concatenate([w[0][2:], w[2][2:]]))[:, None]
+    K = np.linalg.lstsq(P * root, T * root, rcond=None)[0]
+    assert np.allclose(np.hstack([listed.A, listed.B, listed.E]), K.T, atol=1e-6)
 
 
 def test_weights_that_do_not_fit_are_refused() -> None:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from koopmpc.control.cost import Cost
 from koopmpc.control.koopman_mpc import KoopmanMPC
 from koopmpc.control.limits import Limits
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.edmd import edmd
@@ -112,6 +113,16 @@ def test_a_ridge_is_that_of_the_batch() -> None:
         rtol=0,
         atol=1e-10,
     )
+    chosen = OnlineEDMD.start(data, LIFTING, ridge="gcv").predictor()
+    batch = edmd(data, LIFTING, ridge="gcv")
+    assert np.allclose(chosen.A, batch.A, atol=1e-6)
+    assert np.isclose(chosen.report.ridge, batch.report.ridge, rtol=1e-3)
+
+
+def test_points_of_a_delay_are_its_states() -> None:
+    data = random_episodes(0, [40, 30], 2, 1)
+    online = OnlineEDMD.start(Delay(1)(data), State()).predictor()
+    assert np.allclose(online.A, edmd(data, State(), embedding=Delay(1)).A, atol=1e-9)
 
 
 def moving(A: np.ndarray, B: np.ndarray, x: np.ndarray, U: np.ndarray) -> np.ndarray:

@@ -147,6 +147,25 @@ def test_a_ridge_is_kept() -> None:
     assert model.report.ridge == 0.1
 
 
+def test_the_ridge_of_cross_validation_is_that_of_the_plain_fit() -> None:
+    data = runs(1, 3, 1, radius=1.05, noise=0.3)
+    plain = edmd(data, State(), ridge="gcv")
+    assert plain.report.ridge > 0
+    free = Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]])
+    for model, same in (
+        (stable_edmd(data, State(), ridge="gcv", radius=5.0), stable_edmd(data, State(), radius=5.0)),
+        (stable_edmd(data, State(), ridge="gcv", radius=0.5), stable_edmd(data, State(), radius=0.5)),
+        (constrained_edmd(data, State(), prior=Prior(), ridge="gcv"), edmd(data, State())),
+        (constrained_edmd(data, State(), prior=free, ridge="gcv"), edmd(data, State())),
+    ):
+        assert model.report.ridge == plain.report.ridge
+        assert "chosen by generalised cross-validation" in model.report.route
+        assert not np.array_equal(model.A, same.A)
+    fixed = constrained_edmd(data, State(), prior=free, ridge=plain.report.ridge)
+    assert np.array_equal(fixed.A, constrained_edmd(data, State(), prior=free, ridge="gcv").A)
+    assert np.allclose(constrained_edmd(data, State(), prior=Prior(), ridge="gcv").A, plain.A, atol=1e-12)
+
+
 def test_more_observables_than_the_inequality_takes() -> None:
     data = runs(0, 24, 2, radius=1.02, noise=0.3)
     model = stable_edmd(data, State(), radius=0.9)
