@@ -5,8 +5,8 @@ constant + unit · Σ ‖w_j‖²: w = 0 is the unconstrained optimum, and the H
 unstable and plain condensing (u as the variable) has lost all its digits. In plain coordinates w is u less its
 unconstrained optimum, and the Hessian is what the Riccati coordinates say of it.
 
-References only add to the cost what is linear in w, −2 Σ (C z_k)ᵀQ r_k and so on, with z_k as w moves it: as the Hessian
-is unit · I, half of that gradient over −unit is the w that they ask for.
+References only add to the cost what is linear in w, −2 Σ (C z_k)ᵀQ r_k and so on, with z_k as w moves it: as the
+Hessian is unit · I, half of that gradient over −unit is the w that they ask for.
 """
 
 from dataclasses import dataclass

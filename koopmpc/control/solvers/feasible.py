@@ -9,7 +9,7 @@ _INFEASIBLE = 2  # status of SciPy's linprog
 
 
 def empty(A: Float[np.ndarray, "m n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> bool:
-    """Return whether the simplex method finds that no v satisfies low ≤ A v ≤ high; some 10 ms at 50 × 150.
+    """Return whether the simplex method finds that no v satisfies low ≤ A v ≤ high; some 20 ms at 50 × 150.
 
     It is the HiGHS of SciPy: that of CasADi crashes in a process that has imported CVXPY.
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import osqp
+import scipy.sparse
 from jaxtyping import Float
 
 from koopmpc.control.limits import Box
@@ -48,6 +49,22 @@ _STATUS = {
 }
 
 
+class Pattern:
+    """Where a matrix in compressed columns has entries."""
+
+    def __init__(self, matrix: scipy.sparse.csc_matrix) -> None:
+        self._shape = matrix.shape
+        columns = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+        self._places = matrix.indices.astype(np.intp) * matrix.shape[1] + columns
+
+    def entries(self, matrix: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " k"] | None:
+        """Return the entries of another matrix in the same order; None where its zeros stand elsewhere."""
+        if matrix.shape != self._shape:
+            return None
+        found = matrix.ravel()[self._places]
+        return found if found.all() and np.count_nonzero(matrix) == len(found) else None
+
+
 class OSQP:
     """A QP set up once in OSQP; limits move, solves start warm.
 
@@ -69,7 +86,8 @@ class OSQP:
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._qp, self._settings = qp, dict(settings or {})
         self._bounds = Bounds(qp)
-        P, A = self._matrices = qp.sparse()
+        P, A = qp.sparse()
+        self._patterns = Pattern(P), Pattern(A)
         self._problem = osqp.OSQP()
         options = {"verbose": False, **DEFAULTS, **self._settings}
         try:
@@ -101,16 +119,14 @@ class OSQP:
         DataError
             OSQP refuses the problem.
         """
-        matrices = qp.sparse()
-        same = all(
-            np.array_equal(new.indptr, old.indptr) and np.array_equal(new.indices, old.indices)
-            for new, old in zip(matrices, self._matrices, strict=True)
+        P, A = (
+            pattern.entries(matrix)
+            for pattern, matrix in zip(self._patterns, (np.triu(qp.P), qp.A), strict=True)
         )
-        if not same or qp.A.shape != self._qp.A.shape:
+        if P is None or A is None:
             self.__init__(qp, self._settings)
             return
-        self._qp, self._matrices, self._bounds = qp, matrices, Bounds(qp)
-        P, A = (np.ascontiguousarray(matrix.data) for matrix in matrices)
+        self._qp, self._bounds = qp, Bounds(qp)
         self._solver.update_data_vec(q=qp.q, l=self._bounds.low, u=self._bounds.high)
         if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
             raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
