@@ -138,10 +138,9 @@ def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) ->
             "linestyles": ["--", "-", ":"],
         }
         lines = axes.contour(plane.across, plane.up, inner, **look)
-        lines.set_path_effects(
-            [withStroke(linewidth=2.0, foreground="white")]
-        )  # the darkest shade is as dark
+        halo = withStroke(linewidth=2.0, foreground="white")  # the darkest shade is as dark as the line
+        lines.set_path_effects([halo])
         across = np.quantile(plane.across, [_EDGE, 1 - _EDGE])
-        axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)
-        for label in lines.labelTexts:
-            label.set(x=np.clip(label.get_position()[0], *across), bbox=_PAPER)
+        texts: Any = axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)
+        for text in texts:
+            text.set(x=np.clip(text.get_position()[0], *across), bbox=_PAPER)

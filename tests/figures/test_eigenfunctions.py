@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from koopmpc.errors import DataError
 from koopmpc.figures.eigenfunctions import plot_eigenfunctions
@@ -44,6 +45,18 @@ def test_real_eigenfunctions_are_one_picture_each_and_pairs_stand_side_by_side(t
     save(made, tmp_path / "a.pdf")
     only = plot_eigenfunctions(model, [0], ("a", "b"), [(-1, 1), (0, 1)], points=5)
     assert [axes.get_ylabel() for axes in only.axes] == ["b", "φ₀"]
+
+
+def test_a_picture_of_shades_keeps_its_colours_and_its_labels_stay_inside(tmp_path) -> None:
+    made = plot_eigenfunctions(turning(), 1, (0, 1), SQUARE)
+    save(made, tmp_path / "a.png")
+    picture = Image.open(tmp_path / "a.png")
+    assert len(picture.convert("RGB").getcolors(1 << 24)) > 1000
+    labels = [(axes, text) for axes in made.axes for text in axes.texts if "π" in text.get_text()]
+    assert labels
+    for axes, text in labels:
+        frame = axes.get_window_extent()
+        assert frame.x0 < text.get_window_extent().x0 < text.get_window_extent().x1 < frame.x1
 
 
 def test_episodes_give_the_ranges() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
+from PIL import Image
 
 from koopmpc.errors import DataError, LogError
 from koopmpc.figures.style import WIDTHS, band, figure, line, save, styled
@@ -28,6 +29,18 @@ def test_the_same_figure_is_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     save(_drawn(), second)
     assert first.read_bytes() == second.read_bytes()
     assert len(first.read_bytes()) > 1000
+
+
+def test_pictures_of_lines_are_small_and_look_the_same(tmp_path: Path) -> None:
+    made = _drawn()
+    save(made, tmp_path / "a.png")
+    styled(lambda: made.savefig(tmp_path / "full.png"))()
+    small, full = Image.open(tmp_path / "a.png"), Image.open(tmp_path / "full.png")
+    assert (tmp_path / "a.png").stat().st_size < 0.6 * (tmp_path / "full.png").stat().st_size
+    assert small.size == full.size
+    assert small.info["dpi"] == pytest.approx((200, 200), abs=0.1)
+    away = np.abs(np.asarray(small.convert("RGB"), float) - np.asarray(full.convert("RGB"), float))
+    assert away.mean() < 0.5
 
 
 def test_a_users_settings_change_nothing_and_come_back(tmp_path: Path) -> None:
