@@ -1,7 +1,7 @@
 """metrics: what a Run amounts to, from the Run alone."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,12 +59,16 @@ class Metrics(Value):
 
     def __str__(self) -> str:
         """Return a line a figure."""
+        return "\n".join(f"{name:<25} {value}" for name, value in self.figures().items())
+
+    def figures(self, tracked: Sequence[str] | None = None) -> dict[str, str]:
+        """Return each figure in words by its name; those of a tracked output in a line of its own, if named."""
         settles = f"{self.settling_time:.3g} s" if np.isfinite(self.settling_time) else "does not settle"
         times = (self.solve_time_p50, self.solve_time_p99, self.solve_time_max)
-        lines = {
+        return {
             "cost": f"{self.cost:.6g}",
-            "tracking rmse": _vector(self.tracking_rmse),
-            "final error": _vector(self.final_error),
+            **_by_output("tracking rmse", self.tracking_rmse, tracked),
+            **_by_output("final error", self.final_error, tracked),
             "violation": f"{self.violation:.3g}",
             "input violation": f"{self.input_violation:.3g}",
             "effort": f"{self.effort:.6g}",
@@ -74,7 +78,6 @@ class Metrics(Value):
             "status": _counts(self.status),
             "fallback": _counts(self.fallback),
         }
-        return "\n".join(f"{name:<25} {value}" for name, value in lines.items())
 
 
 def duration(seconds: float) -> str:
@@ -163,6 +166,12 @@ def _excess(
     under, over = np.isfinite(low), np.isfinite(high)  # where there is no limit, not even inf is beyond it
     beyond = np.hstack([low[under] - values[:, under], values[:, over] - high[over]])
     return float(np.maximum(beyond, 0.0).max(initial=0.0))
+
+
+def _by_output(name: str, values: Float[np.ndarray, " nr"], tracked: Sequence[str] | None) -> dict[str, str]:
+    if tracked is None:
+        return {name: _vector(values)}
+    return {f"{name}, {output}": f"{value:.4g}" for output, value in zip(tracked, values, strict=True)}
 
 
 def _vector(values: Float[np.ndarray, " n"]) -> str:

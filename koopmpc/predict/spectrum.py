@@ -45,14 +45,15 @@ def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, 
     predictor
         Its `modes` are the state's rows of Φ.
     x
-        (nx,), or (steps, nx): x_0, x_1, … of a run without input, one `dt` apart.
+        (nx,), or (steps, nx): x_0, x_1, … of a run without input, one `dt` apart; with an embedding points ζ, as
+        ``predictor.embed(episodes)`` has them.
     """
-    states = checks.array(x, "x")
+    states, width = checks.array(x, "x"), len(predictor.point_names)
     modes, lifting = _lifted_modes(predictor)
     if states.ndim == 1:
-        z = lifting(checks.array(states, "x", (predictor.nx,)))
+        z = lifting(checks.array(states, "x", (width,)))
         return lstsq(modes, z.astype(complex), cond=_ROUNDING * max(modes.shape), lapack_driver="gelsy")[0]
-    Z = lifting(checks.array(states, "x", (None, predictor.nx)))
+    Z = lifting(checks.array(states, "x", (None, width)))
     basis, small = np.linalg.qr(modes)  # what lies outside of Φ no b can reach
     powers = np.power(predictor.eigenvalues, np.arange(len(Z))[:, None])
     stacked = (small * powers[:, None, :]).reshape(-1, modes.shape[1])
@@ -68,7 +69,8 @@ def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> 
     predictor
         Its inputs are taken as 0.
     x0
-        (nx,), the state at t = 0; or (steps, nx), a run from t = 0 on, whose best amplitudes are taken.
+        (nx,), the state at t = 0; or (steps, nx), a run from t = 0 on, whose best amplitudes are taken; with an
+        embedding points ζ.
     times
         (steps,) [s].
     """
@@ -102,7 +104,8 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
     same_names(predictor, episodes)
     forced = predictor.left_eigenvectors @ np.hstack([predictor.B, predictor.E])
     error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
-    for episode in episodes.driven() if predictor.nw else episodes:
+    points = predictor.embed(episodes)
+    for episode in points.driven() if predictor.nw else points:
         for first in range(0, len(episode), _ROWS):
             phi = predictor.eigenfunctions(episode.X[first : first + _ROWS + 1])
             gap = phi[1:] - phi[:-1] * predictor.eigenvalues - episode.U[first : first + _ROWS] @ forced.T

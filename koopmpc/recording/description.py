@@ -111,22 +111,8 @@ def to_markdown(about: About) -> str:
 
 def metrics_to_markdown(metrics: Metrics, tracked: tuple[str, ...]) -> str:
     """Return the metrics as a table."""
-    m = metrics
-    times = (m.solve_time_p50, m.solve_time_p99, m.solve_time_max)
-    rows = [
-        ("closed-loop cost", f"{m.cost:.6g}"),
-        *((f"tracking RMSE, {n}", f"{e:.4g}") for n, e in zip(tracked, m.tracking_rmse, strict=True)),
-        *((f"final error, {n}", f"{e:.3g}") for n, e in zip(tracked, m.final_error, strict=True)),
-        ("settling time", f"{m.settling_time:.3g} s" if np.isfinite(m.settling_time) else "never settles"),
-        ("state limit violation", f"{m.violation:.3g}"),
-        ("input limit violation", f"{m.input_violation:.3g}"),
-        ("effort, Σ u² dt", f"{m.effort:.4g}"),
-        ("solve time p50 / p99 / max", " / ".join(f"{1e3 * t:.3g}" for t in times) + " ms"),
-        ("late steps", str(m.late)),
-        ("status", _short(m.status)),
-        ("fallback", _short(m.fallback)),
-    ]
-    return "\n".join(["| metric | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
+    rows = [f"| {name} | {_short(value)} |" for name, value in metrics.figures(tracked).items()]
+    return "\n".join(["| metric | value |", "|---|---|", *rows])
 
 
 def _table(value: Cost | Limits, about: About) -> list[str]:

@@ -184,3 +184,14 @@ def test_a_measurement_that_is_no_number_beside_a_hidden_state(value):
     found = km.metrics(replace(run, X=np.full_like(run.X, np.nan), Y=Y))
     assert found.violation == max(value - 100.0, 0.0)
     assert not np.isfinite(found.cost)
+
+
+def test_figures_of_named_outputs_stand_each_in_a_line():
+    found = km.metrics(random_run(np.random.default_rng(6)))
+    names = [f"y{i}" for i in range(len(found.tracking_rmse))]
+    plain, named = found.figures(), found.figures(names)
+    for what, values in (("tracking rmse", found.tracking_rmse), ("final error", found.final_error)):
+        lines = [named.pop(f"{what}, {name}") for name in names]
+        np.testing.assert_allclose([float(line) for line in lines], values, rtol=1e-3)
+        plain.pop(what)
+    assert named == plain

@@ -19,6 +19,7 @@ from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.state import State
 from koopmpc.predict.bilinear import BilinearPredictor, load_bilinear_predictor
 from koopmpc.predict.linear import LinearPredictor, load_predictor
+from koopmpc.predict.spectrum import amplitudes, linearity_error, reconstruct
 
 # Two states, of which one is measured: y_{k+1} is a function of y_k, u_k, y_{k−1}, u_{k−1}, exactly.
 A = np.array([[0.9, 0.3], [-0.2, 0.95]])
@@ -52,6 +53,19 @@ def test_what_the_past_determines_is_predicted_exactly(model: LinearPredictor) -
     assert np.abs(blind.rollout(episode.X[3], episode.U[3:]) - episode.X[3:]).max() > 1e-2
     assert model.states == ("y [m]",)
     assert model.C.shape == (1, 3)
+
+
+def test_modes_and_eigenfunctions_are_those_of_points(model: LinearPredictor) -> None:
+    data = hidden_state(2)
+    assert linearity_error(model, data).max() < 1e-6
+    free = Episode(X=data[0].X[:2], U=data[0].U[:1])
+    zeta = model.embed(Episodes([Episode(X=data[0].X, U=data[0].U)], 0.1, data.states, data.inputs))[0].X[0]
+    times = 0.1 * np.arange(6)
+    X = model.rollout(free.X[-1], np.zeros((5, 1)), history=free)
+    assert np.allclose(reconstruct(model, zeta, times), X, atol=1e-9)
+    assert amplitudes(model, zeta).shape == (model.nz,)
+    with pytest.raises(ShapeError, match=r"x has shape \(1,\), expected \(3,\)"):
+        reconstruct(model, free.X[-1], times)
 
 
 def test_the_re_lifted_map_moves_the_whole_point(model: LinearPredictor) -> None:
