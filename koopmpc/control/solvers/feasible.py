@@ -1,6 +1,8 @@
 # pyright: basic
 """Whether any v satisfies low ≤ A v ≤ high, by linear programming: exact where a first-order method only creeps."""
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -28,3 +30,9 @@ def empty(A: Float[np.ndarray, "m n"], low: Float[np.ndarray, " m"], high: Float
         method="highs",
     )
     return found.status == _INFEASIBLE
+
+
+@cache
+def prepare() -> None:
+    """Load what `empty` needs, 0.1 s once in a process, before a loop begins."""
+    empty(np.ones((1, 1)), np.zeros(1), np.ones(1))

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, Bounds, QPSolution, check_start
-from koopmpc.control.solvers.feasible import empty
+from koopmpc.control.solvers.feasible import empty, prepare
 from koopmpc.errors import DataError
 
 # sigma: on plans of an unstable plant that saturate for many steps, half the iterations of OSQP's own 1e-6.
@@ -100,6 +100,7 @@ class OSQP:
         self._most = self._solver.get_settings().max_iter
         self._first = True
         self._moved = True
+        prepare()
 
     def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Box, float]]:
         limits = Box(self._bounds.low, self._bounds.high)
