@@ -1,5 +1,6 @@
 """NonlinearMPC: multiple shooting and a nonlinear program a step; the oracle that others are measured against."""
 
+import pickle
 from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import Any
@@ -119,6 +120,10 @@ class NonlinearMPC(Receding):
         )
         self._warm: Start | None = None
         self._plan: Plan | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "NonlinearMPC":
+        """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process."""
+        return pickle.loads(pickle.dumps(self))
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget the last plan; rates count from `u_prev`, which is held if the first step fails."""

@@ -1,5 +1,9 @@
 """NonlinearMPC: three solvers and one answer, several starts against a local optimum, a terminal cost with a period."""
 
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -51,6 +55,27 @@ def test_all_solvers_find_the_same_plan(limits: Limits) -> None:
         plans.append(mpc.plan().U)
     assert np.allclose(plans[1], plans[0], atol=1e-3)
     assert np.allclose(plans[2], plans[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_copies_go_on_as_their_original_also_in_threads(solver: str) -> None:
+    plant, limits = pendulum(), Limits(-1, 1, du_max=0.3, x_max=[np.inf, 0.2])
+    mpc = NonlinearMPC(plant, Cost(Q=[2, 0.2], R=0.1), limits, 12, solver=solver)
+    start = np.array([0.45, 0.1])
+    start = plant(start, mpc(start, [0, 0]).u)
+
+    def run(controller: NonlinearMPC) -> np.ndarray:
+        x, inputs = start, []
+        for k in range(25):
+            inputs.append(controller(x, [0.01 * (k % 5), 0]).u)
+            x = plant(x, inputs[-1])
+        return np.array(inputs)
+
+    controllers = [copy.deepcopy(mpc), copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))]
+    alone = run(mpc)
+    with ThreadPoolExecutor(3) as pool:
+        for inputs in pool.map(run, controllers):
+            assert np.array_equal(inputs, alone)
 
 
 def test_no_starts_are_refused() -> None:
