@@ -11,7 +11,7 @@ from jaxtyping import Float
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting, Sum, lifting_of, short
+from koopmpc.lifting.base import Lifting, lifting_of, short
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.gaussian import Gaussian
@@ -19,6 +19,7 @@ from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.random_fourier import RandomFourier
 from koopmpc.lifting.standardized import Standardized
 from koopmpc.lifting.state import State
+from koopmpc.lifting.sum import Sum
 from koopmpc.lifting.thin_plate import ThinPlate
 from koopmpc.values import Arrays, Value, from_data, to_data
 
@@ -136,6 +137,18 @@ def angles(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> list[int]:
     """
     moving = np.ptp(X, axis=0) > 0.2
     return [i for i, name in enumerate(states) if moving[i] and _angle(name)]
+
+
+def jumps(episodes: Episodes) -> dict[int, int]:
+    """Return for each angle that was wrapped how often it jumps by 2π."""
+    X = np.concatenate([episode.X for episode in episodes])
+    found: dict[int, int] = {}
+    for i in angles(episodes.states, X):
+        steps = np.abs(np.concatenate([np.diff(episode.X[:, i]) for episode in episodes]))
+        count = int(np.sum(np.abs(steps - 2 * np.pi) < 1.0))
+        if count and np.median(steps) < 1.0:
+            found[i] = count
+    return found
 
 
 def _angle(name: str) -> bool:

@@ -10,9 +10,10 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.identify.assemble import assembled, growth, warned
 from koopmpc.identify.doubts import doubts
+from koopmpc.identify.entries import Entries, entries_of
 from koopmpc.identify.fit import rule
 from koopmpc.identify.gather import How
-from koopmpc.identify.prior import Entries, Prior
+from koopmpc.identify.prior import Prior
 from koopmpc.identify.program import optimum, violation
 from koopmpc.identify.regression import read
 from koopmpc.identify.ridge import Ridge, ridge_of
@@ -67,7 +68,7 @@ def constrained_edmd(
     asked = ridge_of(ridge)
     task = read(episodes, lifting, embedding, "constrained_edmd", **how)
     nz, names = task.lifting.nz, task.lifting.names
-    entries = prior.entries(names, task.inputs)
+    entries = entries_of(prior, names, task.inputs)
     rows = task.rows.leading(nz)
     sentences = _doubts(rows, entries, names, task.inputs, regular=asked != 0)
     without = solve(rows, ridge=asked)

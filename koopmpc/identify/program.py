@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.errors import DataError
-from koopmpc.identify.prior import Combination, Entries, Prior, Storage
+from koopmpc.identify.entries import Entries
+from koopmpc.identify.prior import Combination, Prior, Storage
 from koopmpc.identify.solve import Rows, norms
 
 

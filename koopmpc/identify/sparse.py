@@ -14,9 +14,9 @@ from koopmpc.errors import DataError
 from koopmpc.identify.assemble import assembled, growth, warned
 from koopmpc.identify.constrained import linear
 from koopmpc.identify.doubts import doubts
+from koopmpc.identify.entries import Entries
 from koopmpc.identify.gather import How
 from koopmpc.identify.lasso import lasso
-from koopmpc.identify.prior import Entries
 from koopmpc.identify.regression import read
 from koopmpc.identify.solve import Rows, norms, onto, solve
 from koopmpc.lifting.base import Lifting

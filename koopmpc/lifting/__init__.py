@@ -1,4 +1,5 @@
 """Observables ψ(x): one family a file."""
 
-# `a * b` imports it only when it is called, and files and tasks that hold one are read before
+# `a + b` and `a * b` import them only when they are called, and files and tasks that hold one are read before
 from koopmpc.lifting.product import Product as Product
+from koopmpc.lifting.sum import Sum as Sum

@@ -1,4 +1,4 @@
-"""Lifting z = ψ(x), its sum, and the traced form that a file holds.
+"""Lifting z = ψ(x), and the traced form that a file holds.
 
 A lifting is a frozen rule ("all monomials up to degree 3"). `bind` gives it the names of the states and so
 its size; from then on it evaluates arrays (`lifting(X)`) and CasADi symbols (`lifting.symbolic(x)`), the
@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import accumulate
 
 import casadi as ca
 import numpy as np
@@ -118,6 +117,8 @@ class Lifting(Value, ABC):
 
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return both liftings one under the other; an observable that both name is held once."""
+        from koopmpc.lifting.sum import Sum  # which is a Lifting itself
+
         other = lifting_of(other)
         parts = [
             part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))
@@ -174,47 +175,6 @@ class Lifting(Value, ABC):
     def _misfit(self, got: object) -> str:
         what = f"has {got} states" if isinstance(got, int) else f"has shape {got}"
         return f"x {what}, the lifting was bound to {len(self._states)} ({', '.join(self._states)})"
-
-
-@dataclass(frozen=True, eq=False)
-class Sum(Lifting):
-    """ψ(x) = [ψ₁(x); ψ₂(x); …] without what an earlier part names already; written ``a + b``."""
-
-    parts: tuple[Lifting, ...]
-
-    def bind(self, states: Sequence[str]) -> "Sum":
-        """Return the sum of the bound parts."""
-        return Sum(tuple(part.bind(states) for part in self.parts), bound=tuple(states))
-
-    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names of all parts, each once."""
-        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
-
-    def formula(self, x: ca.SX) -> ca.SX:
-        """Return the new observables of each part, one under the other."""
-        columns = [part.formula(x) for part in self.parts]
-        return ca.vertcat(*(z[int(i)] for z, new in zip(columns, self._new, strict=True) for i in new))
-
-    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        ends = accumulate(len(new) for new in self._new)
-        for part, new, end in zip(self.parts, self._new, ends, strict=True):
-            own = Z[:, end - len(new) : end]
-            if len(new) == part.nz:
-                part._fill(x, own)
-            elif len(new):
-                whole = np.empty((len(Z), part.nz))
-                part._fill(x, whole)
-                own[:] = whole[:, new]
-
-    @cached_property
-    def _new(self) -> tuple[Indices, ...]:
-        """For each part the indices of the observables that no earlier part names."""
-        held: set[str] = set()
-        new: list[Indices] = []
-        for part in self.parts:
-            new.append(np.array([i for i, name in enumerate(part.names) if name not in held], dtype=np.intp))
-            held.update(part.names)
-        return tuple(new)
 
 
 @dataclass(frozen=True, eq=False)

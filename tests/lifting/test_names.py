@@ -5,13 +5,14 @@ import pytest
 from hypothesis import given
 
 from koopmpc.errors import DataError, ObservableError
-from koopmpc.lifting.base import Lifting, Sum, rows
+from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import State
+from koopmpc.lifting.sum import Sum
 from koopmpc.lifting.thin_plate import ThinPlate
 from tests.lifting.families import NAMES, Case, cases, made
 
