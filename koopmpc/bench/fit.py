@@ -128,7 +128,7 @@ def fit_data(
     with _noted(notes):
         files = Files(data, **{name: value for name, value in reading.items() if value is not None})
         split = divided(files, horizon, draw, memory)
-    understood = _understood(files, split, notes)
+    understood = _understood(split, notes)
     tell(understood)
     doubts: list[str] = []
     with _noted(doubts):
@@ -174,15 +174,15 @@ def fit_data(
     return whole
 
 
-def _understood(files: Files, split: Divided, notes: list[str]) -> str:
+def _understood(split: Divided, notes: list[str]) -> str:
     """Return what was made of the data: sizes, sample time, names and ranges, and all that was repaired."""
-    lines = [f"data      {split.size}", f"step      dt = {files.dt:g} s"]
+    lines = [f"data      {split.size}", f"step      dt = {split.seen.dt:g} s"]
     X = np.concatenate([e.X for e in split.seen])
     V = np.concatenate([np.hstack([e.U, e.W]) for e in split.seen])
     for what, names, columns in (
-        ("states", files.states, X),
-        ("inputs", files.inputs, V[:, : files.nu]),
-        ("measured", files.disturbances, V[:, files.nu :]),
+        ("states", split.seen.states, X),
+        ("inputs", split.seen.inputs, V[:, : split.seen.nu]),
+        ("measured", split.seen.disturbances, V[:, split.seen.nu :]),
     ):
         wide = max(map(len, names), default=0)
         for i, name in enumerate(names):
@@ -193,7 +193,7 @@ def _understood(files: Files, split: Divided, notes: list[str]) -> str:
     steps = sum(map(len, split.held_out))
     lines.append(
         f"held out  {len(split.held_out)} episodes, {steps} steps; horizon {split.horizon} steps = "
-        f"{split.horizon * files.dt:.3g} s"
+        f"{split.horizon * split.seen.dt:.3g} s"
     )
     return "\n".join([*lines, *(f"! {note}" for note in (*notes, *split.notes))])
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from koopmpc.bench.repair import needed
 from koopmpc.data.agreement import joined
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.folder import Files
@@ -60,11 +61,15 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     size = sum(file.stat().st_size for file in files.files)
     told = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_bytes(size)}"
     if size <= memory or len(parts) < 2:
-        return _in_memory(joined([part.load() for part in parts]), horizon, rng, told)
+        episodes = joined([part.load() for part in parts])
+        repair = needed(episodes)
+        return _in_memory(repair(episodes), horizon, rng, told, repair.notes)
+    repair = needed(sampled(files, _JUDGED)[0])
+    source = repair.source(files)
     count = max(len(parts) // 10, 1)
     out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
-    rest = Subset(files, [i for i in range(len(parts)) if i not in out])
-    judged, _ = sampled(Subset(files, sorted(out)), _JUDGED)
+    rest = Subset(source, [i for i in range(len(parts)) if i not in out])
+    judged, _ = sampled(Subset(source, sorted(out)), _JUDGED)
     ahead = usual_horizon(judged) if horizon is None else horizon
     held_out = _long(list(judged), ahead + PAST)
     if len(held_out) < 2:
@@ -77,11 +82,18 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
         f"{'is' if len(out) == 1 else 'are'} held out, and the fit reads the others one by one"
     )
     return Divided(
-        rest, _like(judged, _long(list(seen), ahead + PAST)), _like(judged, held_out), ahead, told, (note,)
+        rest,
+        _like(judged, _long(list(seen), ahead + PAST)),
+        _like(judged, held_out),
+        ahead,
+        told,
+        (*repair.notes, note),
     )
 
 
-def _in_memory(episodes: Episodes, horizon: int | None, rng: np.random.Generator, files: str) -> Divided:
+def _in_memory(
+    episodes: Episodes, horizon: int | None, rng: np.random.Generator, files: str, repaired: tuple[str, ...]
+) -> Divided:
     lengths = [len(episode) for episode in episodes]
     same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
     number = len(episodes)
@@ -111,7 +123,9 @@ def _in_memory(episodes: Episodes, horizon: int | None, rng: np.random.Generator
     train = _like(episodes, [episode for i, episode in enumerate(whole) if i not in out])
     seen, _ = sampled(Held(_like(episodes, _long(list(train), needed))), _JUDGED)
     held_out, _ = sampled(Held(_like(episodes, [whole[i] for i in sorted(out)])), _JUDGED)
-    return Divided(train, _like(episodes, _long(list(seen), needed)), held_out, ahead, told, notes)
+    return Divided(
+        train, _like(episodes, _long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes)
+    )
 
 
 def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:

@@ -12,7 +12,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.bilinear import bilinear_edmd
-from koopmpc.identify.candidates import Candidate, angles, expanded, usual
+from koopmpc.identify.candidates import Candidate, expanded, jumps, usual
 from koopmpc.identify.cross_validation import Trial, ridges_of, tried
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.folds import folded, sampled, usual_horizon
@@ -102,7 +102,13 @@ def select(
     if not past:
         raise DataError("delays is empty; pass 0 for a model without an embedding")
     held, notes = sampled(source, checks.count(sample, "sample"))
-    _warn_of_jumps(held)
+    for i, count in jumps(held).items():
+        warnings.warn(
+            f"{held.states[i]} jumps by 2π {count} times: it was wrapped, and a model of it as a state cannot follow; "
+            "unwrap it first, with numpy.unwrap along each episode",
+            FitWarning,
+            stacklevel=2,
+        )
     ahead = usual_horizon(held) if horizon is None else checks.count(horizon, "horizon")
     both = bilinear and source.nu > 0 and source.nw == 0
     given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
@@ -155,18 +161,3 @@ def select(
         folds=data.number,
         notes=(*notes, *data.notes),
     )
-
-
-def _warn_of_jumps(episodes: Episodes) -> None:
-    """Warn of angles that were wrapped."""
-    X = np.concatenate([episode.X for episode in episodes])
-    for i in angles(episodes.states, X):
-        steps = np.concatenate([np.diff(episode.X[:, i]) for episode in episodes])
-        jumps = int(np.sum(np.abs(np.abs(steps) - 2 * np.pi) < 1.0))
-        if jumps and np.median(np.abs(steps)) < 1.0:
-            warnings.warn(
-                f"{episodes.states[i]} jumps by 2π {jumps} times: it was wrapped, and a model of it as a state cannot "
-                "follow; unwrap it first, with numpy.unwrap along each episode",
-                FitWarning,
-                stacklevel=3,
-            )

@@ -28,8 +28,8 @@ class Row(Value):
     ----------
     name
         Of the candidate.
-    kind
-        "linear" or "bilinear".
+    bilinear
+        z⁺ = A z + B u + Σ uᵢ Nᵢ z instead of z⁺ = A z + B u.
     nz
         Number of observables.
     size
@@ -53,7 +53,7 @@ class Row(Value):
     """
 
     name: str
-    kind: str
+    bilinear: bool
     nz: int
     size: int
     delays: int
@@ -68,6 +68,11 @@ class Row(Value):
     seconds: float
     lifting: Lifting
     embedding: Delay | None
+
+    @property
+    def kind(self) -> str:
+        """Return "linear" or "bilinear"."""
+        return "bilinear" if self.bilinear else "linear"
 
     @property
     def title(self) -> str:
@@ -164,7 +169,7 @@ def row_of(trial: Tried) -> Row:
         deviation = scores.std(ddof=1) / np.sqrt(len(scores))
     return Row(
         name=candidate.name,
-        kind=candidate.kind,
+        bilinear=candidate.bilinear,
         nz=nz,
         size=nz * (nz + nu + nu * nz * candidate.bilinear),
         delays=candidate.delays,

@@ -14,6 +14,7 @@ import koopmpc.bench.fit
 import koopmpc.bench.fit_report
 from koopmpc.bench.fit import fit_data
 from koopmpc.bench.hold_out import divided
+from koopmpc.bench.repair import needed
 from koopmpc.cli import app
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
@@ -69,6 +70,13 @@ def few(monkeypatch):
         return [one.bind(episodes.states, episodes.inputs) for one in tried]
 
     monkeypatch.setattr("koopmpc.identify.select.usual", usual)
+
+
+@pytest.fixture
+def quick(few, monkeypatch):
+    """Draw and record nothing either."""
+    monkeypatch.setattr(koopmpc.bench.fit, "drawn", lambda *_: [])
+    monkeypatch.setattr(koopmpc.bench.fit, "record_model", lambda *_, **__: None)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +157,7 @@ def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
     assert load_predictor(tmp_path / "out" / "linear.npz") == found.selection.linear
 
 
-@pytest.mark.usefixtures("few")
+@pytest.mark.usefixtures("quick")
 def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.data.folder._PART", 1)
     data = cart_pole(24)
@@ -176,7 +184,7 @@ def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path,
     assert pytest.approx(again.A, abs=1e-6) == found.selection.predictor.A
 
 
-@pytest.mark.usefixtures("few")
+@pytest.mark.usefixtures("quick")
 def test_one_long_log_is_cut_into_blocks_and_that_is_said(tmp_path):
     write_csv(cart_pole(1, steps=1200), tmp_path / "csv")
     told = []
@@ -185,8 +193,45 @@ def test_one_long_log_is_cut_into_blocks_and_that_is_said(tmp_path):
     assert len(found.held_out) >= 12
 
 
-@pytest.mark.usefixtures("few")
-def test_gaps_and_constant_columns_are_told(tmp_path):
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("memory", [10**9, 1000])
+def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_that_is_said(
+    tmp_path, monkeypatch, memory
+):
+    monkeypatch.setattr("koopmpc.data.folder._PART", 1)
+    for i, e in enumerate(cart_pole(24)):
+        turning = e.X[:, 1] + 0.1 * np.arange(len(e.X))
+        wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
+        rest, ones = e.X[:, [0, 2, 3]], np.ones(len(e.X))
+        X = np.column_stack([rest, wrapped, 7 * ones, rest[:, 0]])
+        names = ["x", "v", "omega", "theta", "temp", "again"]
+        U = np.column_stack([e.U, np.zeros(len(e))])
+        Episodes([Episode(X=X, U=U)], 0.02, names, ["force", "brake"]).save(tmp_path / "in" / f"{i:02d}.npz")
+    told = []
+    found = fit_data(
+        tmp_path / "in", tmp_path / "out", horizon=10, memory=memory, bilinear=False, say=told.append
+    )
+    for words in (
+        "left out: temp is 7 throughout",
+        "left out: again repeats x",
+        "left out: brake is 0 through",
+    ):
+        assert f"! {words}" in told[0]
+    assert re.search(r"! theta jumped by 2π \d+ times and was unwrapped", told[0])
+    model = found.selection.predictor
+    assert (model.states, model.inputs) == (("x", "v", "omega", "theta"), ("force",))
+    steps = np.concatenate([np.diff(e.X[:, 3]) for e in found.held_out])
+    assert np.abs(steps).max() < 1.0
+
+
+def test_data_in_which_nothing_moves_are_refused():
+    still = Episodes([Episode(X=np.ones((9, 2)), U=np.zeros((8, 0)))], 0.1)
+    with pytest.raises(DataError, match="no state moves"):
+        needed(still)
+
+
+@pytest.mark.usefixtures("quick")
+def test_gaps_are_told(tmp_path):
     folder = write_csv(cart_pole(16), tmp_path / "csv")
     lines = (folder / "03.csv").read_text().splitlines()
     (folder / "03.csv").write_text("\n".join(lines[:40] + lines[45:]) + "\n")
@@ -226,7 +271,7 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
         (["csv", "--scheduler", "here"], "scheduler"),
     ],
 )
-@pytest.mark.usefixtures("few")
+@pytest.mark.usefixtures("quick")
 def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     write_csv(cart_pole(14, steps=30), tmp_path / "csv")
@@ -239,7 +284,7 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
     assert not list((tmp_path / "logs").iterdir())  # no empty folder is left behind
 
 
-def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, few):
+def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):
     monkeypatch.chdir(tmp_path)
     write_csv(cart_pole(16), tmp_path / "csv", header="when,p,q,r,s,push")
     arguments = ["--states", "p, q,r,s", "--inputs", "push", "--dt", "0.02", "--linear", "--name", "cart"]

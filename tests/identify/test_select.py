@@ -21,6 +21,7 @@ from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.gaussian import Gaussian
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import State
+from koopmpc.values import from_data, to_data
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])
 
@@ -59,7 +60,7 @@ def noisy(data, size, seed=1):
 
 
 def test_a_linear_plant_gets_the_linear_model_though_larger_ones_hold_it():
-    found = select(noisy(episodes_of(linear), 0.01), horizon=8, folds=3, delays=[0, 1])
+    found = select(noisy(episodes_of(linear), 0.01), horizon=8, folds=2, delays=[0], ridges=[0.0, 1e-6])
     assert (found.best.name, found.best.kind, found.chosen) == ("x, 1", "linear", found.chosen_linear)
     assert found.predictor is found.linear
     assert len(found.leaderboard) > 20
@@ -287,6 +288,12 @@ def test_measured_disturbances_are_in_the_fit_and_in_the_forecast():
 def test_a_mistake_is_told(change, words):
     with pytest.raises(DataError, match=words):
         select(episodes_of(linear, count=4), **({"candidates": [PLAIN]} | change))
+
+
+def test_a_selection_is_data():
+    found = select(episodes_of(linear, count=6), candidates=[PLAIN], horizon=5, folds=2)
+    arrays = {}
+    assert from_data(to_data(found, arrays), arrays) == found
 
 
 def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():
