@@ -37,7 +37,7 @@ class Contest:
     models
         Lifted or identified models by name.
     cost, limits
-        The same for all; the limits hold in the second half of the runs.
+        The same for all; each controller runs once without the limits, and once within them.
     x0, reference
         (nx,) each.
     steps, horizon

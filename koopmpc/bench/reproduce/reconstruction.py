@@ -45,7 +45,8 @@ class Reconstruction(Value):
     evolution
         (rank,) ‖φ(x_k) − λᵏ φ(x₀)‖ / ‖φ‖ of each eigenfunction, on the fitted trajectory.
     leading
-        The eigenfunction with the largest share |b_j| ‖Φ_j‖ of the first state; constants are left out.
+        The eigenfunction with the largest share |b_j| ‖Φ_j‖ of the first state, of a pair that with Im λ > 0;
+        constants are left out.
     """
 
     model: LinearPredictor
@@ -90,7 +91,8 @@ def rebuilt(
         model = edmd(trajectory, bound, rank=kept)
     X = reconstruction(model, episode)
     share = np.abs(amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)
-    moving = np.abs(model.eigenvalues - 1) > _STEADY
+    values = model.eigenvalues
+    moving = (np.abs(values - 1) > _STEADY) & (np.imag(values) >= 0)
     return Reconstruction(
         model=model,
         X=X,

@@ -9,8 +9,9 @@ from koopmpc.bench.reproduce.page import Page
 from koopmpc.bench.reproduce.reconstruction import Reconstruction
 from koopmpc.bench.reproduce.registry import Outcome, Paper, Progress
 from koopmpc.bench.reproduce.scenes import Scene
+from koopmpc.bench.reproduce.snyder_appendix import appendix_dmdc
 from koopmpc.bench.reproduce.snyder_claims import Fits, of_figures, of_text
-from koopmpc.bench.reproduce.snyder_control import TASKS, contest, predictions
+from koopmpc.bench.reproduce.snyder_control import SHAKINGS, TASKS, contest, predictions
 from koopmpc.bench.reproduce.snyder_scenes import OBSERVABLES, scenes
 from koopmpc.recording.curves import record_curves
 
@@ -27,12 +28,16 @@ def reproduce(folder: Path, quick: bool, progress: Progress) -> Outcome:
     change = held_change(stage, fits)
     causes = beyond.origin(stage["cart-pole-lqr"])
     progress("models of exciting data")
+    exciting = 10 if quick else 40
     predicted = {
-        "pendulum": predictions(stage["pendulum-lqr"], (1.0, 1.0), 4.0, 10 if quick else 40),
-        "cart-pole": predictions(stage["cart-pole-lqr"], (1.0, 0.5, 0.1, 0.1), 10.0, 10 if quick else 40),
+        name: predictions(stage[f"{name}-lqr"], shaking, exciting) for name, shaking in SHAKINGS.items()
     }
     progress("control on lifted models")
-    length = {"steps": 20, "horizon": 8, "episodes": 30} if quick else {"steps": 200, "horizon": 60}
+    length = (
+        {"steps": 20, "horizon": 8, "episodes": 30}
+        if quick
+        else {"steps": 200, "horizon": 60, "episodes": 100}
+    )
     tasks = {title: contest(title, **length) for title in TASKS}
     runs = {title: task.runs() for title, task in tasks.items()}
     progress("figures")
@@ -42,14 +47,14 @@ def reproduce(folder: Path, quick: bool, progress: Progress) -> Outcome:
     text.verdicts(page, said)
     text.numbers(page, stage, fits, shown)
     text.pictures(page, stage, fits)
-    text.appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
+    appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
     text.variants(page, stage, fits)
     text.gains_table(page)
     text.frequencies(page, fits)
     text.theory(page, stage["pendulum"], fits)
     beyond.why(page, stage["cart-pole-lqr"], causes)
-    beyond.inputs(page, predicted)
-    beyond.control(page, tasks, runs)
+    beyond.inputs(page, predicted, exciting)
+    beyond.control(page, tasks, runs, length["episodes"])
     progress("report and recording")
     report, recording = folder / "report.md", folder / "snyder.rrd"
     report.write_text(page.markdown, encoding="utf-8")

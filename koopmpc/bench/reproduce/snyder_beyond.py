@@ -10,6 +10,7 @@ from koopmpc.bench.reproduce.contest import ORACLE, Contest, costs
 from koopmpc.bench.reproduce.page import Page, percent
 from koopmpc.bench.reproduce.reconstruction import Reconstruction, rebuilt
 from koopmpc.bench.reproduce.scenes import Scene
+from koopmpc.bench.reproduce.snyder_control import LASTING, SHAKINGS, TASKS
 from koopmpc.bench.reproduce.snyder_scenes import OBSERVABLES, TARGET
 from koopmpc.figures.reconstruction import plot_reconstruction
 from koopmpc.figures.runs import plot_runs
@@ -68,9 +69,13 @@ def why(page: Page, scene: Scene, causes: Mapping[str, Reconstruction]) -> None:
     page.curve("why cart-pole", scene.dt, scene.dynamics.states, {"truth": truth, **curves})
 
 
-def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]]) -> None:
-    """Add what models predict that were fitted to feedback data, and to exciting data."""
-    page.text("## Data that show what the input does", words.INPUTS)
+def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
+    """Add what models predict that were fitted to feedback data, and to so many episodes of exciting data."""
+    noise = {name.replace("-", "_"): shaking.noise for name, shaking in SHAKINGS.items()}
+    page.text(
+        "## Data that show what the input does",
+        words.INPUTS.format(episodes=episodes, lasting=LASTING, **noise),
+    )
     page.table(
         (
             "plant",
@@ -106,12 +111,28 @@ def ratios(runs: Runs) -> dict[str, dict[str, float]]:
     return found
 
 
-def control(page: Page, tasks: Mapping[str, Contest], runs: Runs) -> None:
-    """Add the closed loops of all controllers, cost by cost, and a figure for each plant."""
+def control(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -> None:
+    """Add the closed loops of all controllers, cost by cost, and a figure for each plant.
+
+    Parameters
+    ----------
+    page
+        Where it goes.
+    tasks, runs
+        By the title of the task.
+    episodes
+        How many each model was fitted to.
+    """
     one = next(iter(tasks.values()))
     page.text(
         "## Control, which the paper left as future work",
-        words.CONTROL.format(seconds=one.steps * one.plant.dt, ahead=one.horizon * one.plant.dt),
+        words.CONTROL.format(
+            episodes=episodes,
+            lasting=LASTING,
+            noise=", ".join(f"±{TASKS[title].shaking.noise:g} for “{title}”" for title in tasks),
+            seconds=one.steps * one.plant.dt,
+            ahead=one.horizon * one.plant.dt,
+        ),
     )
     for limited in (False, True):
         table = {title: costs(each, limited) for title, each in runs.items()}

@@ -37,10 +37,25 @@ from koopmpc.plant.integrators import RK4
 from koopmpc.plant.step_map import StepMap, discretize
 
 DT = 0.05  # of the controllers [s]
+LASTING = 3.0  # an exciting episode [s]
 LIFTINGS: Mapping[str, Lifting] = {
     "DMDc": State() + Constant(),
     "Fourier 1": State() + Fourier(1) + Constant(),
     "monomials 3": State() + Monomials(3) + Constant(),
+}
+
+
+@dataclass(frozen=True)
+class Shaking:
+    """How a plant is excited for data: it starts in x ± spread, and u is shaken by ± noise."""
+
+    spread: Sequence[float]
+    noise: float
+
+
+SHAKINGS: Mapping[str, Shaking] = {
+    "pendulum": Shaking((1.0, 1.0), 4.0),
+    "cart-pole": Shaking((1.0, 0.5, 0.1, 0.1), 10.0),
 }
 
 
@@ -52,8 +67,8 @@ class Task:
     ----------
     dynamics, x_eq, K
         The plant; where it rests; the feedback that holds it while data are taken, None where it needs none.
-    spread, noise
-        Data start in x_eq ± spread, and u is shaken by ± noise.
+    shaking
+        Of the data, about x_eq.
     cost, limit
         The paper's weights; |u| in the runs with limits, below what LQR would take.
     x0, reference
@@ -63,8 +78,7 @@ class Task:
     dynamics: Dynamics
     x_eq: Sequence[float]
     K: str | None
-    spread: Sequence[float]
-    noise: float
+    shaking: Shaking
     cost: Cost
     limit: float
     x0: Sequence[float]
@@ -74,19 +88,27 @@ class Task:
 _DRIVEN, _CARRIED = Cost(*PENDULUM_WEIGHTS), Cost(*CART_POLE_WEIGHTS)
 _REST, _START = (0.0, 0.0), (np.pi / 4, 0.0)
 TASKS: Mapping[str, Task] = {
-    "pendulum, hanging, π/4": Task(Pendulum(), _REST, None, (1.2, 2.0), 4.0, _DRIVEN, 2.0, _START, _REST),
+    "pendulum, hanging, π/4": Task(
+        Pendulum(), _REST, None, Shaking((1.2, 2.0), 4.0), _DRIVEN, 2.0, _START, _REST
+    ),
     "pendulum, upright, π/4": Task(
-        Pendulum(upright=True), _REST, "upright", (1.0, 1.0), 10.0, _DRIVEN, 20.0, _START, _REST
+        Pendulum(upright=True), _REST, "upright", Shaking((1.0, 1.0), 10.0), _DRIVEN, 20.0, _START, _REST
     ),
     "cart-pole, 2 m shift": Task(
-        CartPole(), UP, "cart-pole", (2.0, 1.0, 0.1, 0.1), 5.0, _CARRIED, 3.0, (-1.0, 0.0, np.pi, 0.0), TARGET
+        CartPole(),
+        UP,
+        "cart-pole",
+        Shaking((2.0, 1.0, 0.1, 0.1), 5.0),
+        _CARRIED,
+        3.0,
+        (-1.0, 0.0, np.pi, 0.0),
+        TARGET,
     ),
     "cart-pole, 0.3 rad off": Task(
         CartPole(),
         UP,
         "cart-pole",
-        (2.0, 1.0, 0.4, 0.4),
-        10.0,
+        Shaking((2.0, 1.0, 0.4, 0.4), 10.0),
         _CARRIED,
         40.0,
         (0.0, 0.0, np.pi + 0.3, 0.0),
@@ -95,12 +117,12 @@ TASKS: Mapping[str, Task] = {
 }
 
 
-def contest(title: str, steps: int, horizon: int, episodes: int = 100) -> Contest:
-    """Return one of `TASKS` with its models, fitted to so many exciting episodes of 3 s."""
+def contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
+    """Return one of `TASKS` with its models, fitted to so many exciting episodes."""
     task = TASKS[title]
     plant = discretize(task.dynamics, DT, RK4(4))
     K = None if task.K is None else gains()[task.K]
-    data = _excited(plant, task.x_eq, K, task.spread, task.noise, episodes=episodes, steps=60)
+    data = _excited(plant, task.x_eq, K, task.shaking, episodes=episodes, steps=round(LASTING / DT))
     with unwarned():
         models = {name: edmd(data, lifting) for name, lifting in LIFTINGS.items()}
     return Contest(
@@ -117,9 +139,7 @@ def contest(title: str, steps: int, horizon: int, episodes: int = 100) -> Contes
     )
 
 
-def predictions(
-    scene: Scene, spread: Sequence[float], noise: float, episodes: int = 40
-) -> dict[str, Prediction]:
+def predictions(scene: Scene, shaking: Shaking, episodes: int) -> dict[str, Prediction]:
     """Return what is predicted by fits of one trajectory under feedback, and by fits of exciting data, with inputs.
 
     Inputs are held over a sample; coordinates are x − x_ref, so that no origin is in the way.
@@ -128,10 +148,10 @@ def predictions(
     ----------
     scene
         The plant, its feedback and its start.
-    spread, noise
-        Exciting data, and what is predicted, start in x_ref ± spread; u is shaken by ± noise.
+    shaking
+        Of the exciting data, and of what is predicted, about x_ref.
     episodes
-        How many exciting ones, of 3 s.
+        How many exciting ones.
     """
     plant = discretize(scene.dynamics, scene.dt, RK4(2))
     K = scene.K
@@ -139,10 +159,11 @@ def predictions(
     x_ref = np.broadcast_to(scene.x_ref, plant.nx)
     law = Feedback(K, x_ref=x_ref)
     one = centred(collect(plant, scene.x0, law, episodes=1, steps=scene.steps), x_ref)
-    rich = centred(_excited(plant, x_ref, K, spread, noise, episodes=episodes, steps=300), x_ref)
-    starts = Uniform(x_ref - spread, x_ref + spread)
+    steps = round(LASTING / scene.dt)
+    rich = centred(_excited(plant, x_ref, K, shaking, episodes=episodes, steps=steps), x_ref)
+    starts = Uniform(x_ref - shaking.spread, x_ref + shaking.spread)
     feedback = centred(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
-    excited = centred(_excited(plant, x_ref, K, spread, noise, episodes=10, steps=200, seed=2), x_ref)
+    excited = centred(_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
     B = plant.linearize(x_ref, np.zeros(plant.nu)).B
     with unwarned():
         models = {
@@ -158,16 +179,15 @@ def _excited(
     plant: StepMap,
     x_ref: ArrayLike,
     K: Float[np.ndarray, "nu nx"] | None,
-    spread: Sequence[float],
-    noise: float,
+    shaking: Shaking,
     *,
     episodes: int,
     steps: int,
     seed: int = 0,
 ) -> Episodes:
-    """Return episodes from x_ref ± spread under noise of ± `noise`, on top of feedback where there is K."""
+    """Return episodes from x_ref ± spread under noise, on top of feedback where there is K."""
     middle = checks.vector(x_ref, "x_ref", plant.nx)
-    shaken = Noise(-noise, noise, hold=max(1, round(0.05 / plant.dt)))
+    shaken = Noise(-shaking.noise, shaking.noise, hold=max(1, round(0.05 / plant.dt)))
     excitation = shaken if K is None else Feedback(K, shaken, x_ref=middle)
-    starts = Uniform(middle - spread, middle + spread)
+    starts = Uniform(middle - shaking.spread, middle + shaking.spread)
     return collect(plant, starts, excitation, episodes=episodes, steps=steps, rng=seed)

@@ -8,20 +8,15 @@ import numpy as np
 from koopmpc.bench.reproduce import snyder_words as words
 from koopmpc.bench.reproduce.equations import equations, sides
 from koopmpc.bench.reproduce.page import Page, percent
-from koopmpc.bench.reproduce.plants import Pendulum, frequency, inputs_of, trajectories
-from koopmpc.bench.reproduce.reconstruction import Reconstruction, relative, unwarned
+from koopmpc.bench.reproduce.plants import Pendulum, frequency
+from koopmpc.bench.reproduce.reconstruction import Reconstruction
 from koopmpc.bench.reproduce.scenes import Scene
 from koopmpc.bench.reproduce.snyder_claims import Fits
 from koopmpc.bench.reproduce.snyder_scenes import FIGURES, OBSERVABLES, VARIANTS, gains
 from koopmpc.bench.reproduce.verdicts import Claim, Verdict
-from koopmpc.data.collect import collect
-from koopmpc.data.excitation import Noise
 from koopmpc.figures.eigenfunctions import plot_eigenfunctions
 from koopmpc.figures.reconstruction import plot_reconstruction
 from koopmpc.figures.style import save
-from koopmpc.identify.dmd import dmd, dmdc
-from koopmpc.plant.integrators import RK4
-from koopmpc.plant.step_map import discretize
 from koopmpc.predict.spectrum import continuous_eigenvalues
 
 HEAD = ("data", "observables", "rank", "σ₁/σ_r", "error [%]", "held out [%]", "leading φ [%]", "φ within 5 %")
@@ -80,14 +75,17 @@ def numbers(page: Page, stage: Mapping[str, Scene], fits: Fits, claims: Sequence
 
 def pictures(page: Page, stage: Mapping[str, Scene], fits: Fits) -> None:
     """Draw the figures of the paper, its appendix last."""
-    page.text("## The figures")
+    page.text("## The figures", words.FIGURES)
     for shown in sorted(FIGURES, key=lambda shown: shown.appendix):
         cases = {
             stage[scene].title: (stage[scene].trajectory[0].X, _curves(shown.method, fits[scene]))
             for scene in shown.scenes
         }
         first = stage[shown.scenes[0]]
-        caption = f"{first.title.split(',')[0]}: {shown.method}" + (" (appendix)" if shown.appendix else "")
+        data = " and ".join(stage[scene].title.split(", ")[-1] for scene in shown.scenes)
+        caption = f"{first.title.split(',')[0]}, {data}: {shown.method}" + (
+            " (appendix)" if shown.appendix else ""
+        )
         draw(page, shown.name, caption, cases, first)
 
 
@@ -108,50 +106,6 @@ def draw(
             error = np.linalg.norm(X - truth, axis=1, keepdims=True) / size
             table[curve] = np.hstack([X, np.log10(np.maximum(error, 1e-16))])
         page.curve(f"{name}, {title}", scene.dt, (*states, "log10 of the relative error"), table)
-
-
-def appendix_dmdc(page: Page, free: Scene, driven: Scene) -> None:
-    """Add DMDc of the pendulum, where the input is the feedback's and where it excites."""
-    K = gains()["pendulum"]
-    plant = discretize(Pendulum(), driven.dt, RK4(8))
-    held = trajectories(driven.dynamics, driven.x0, dt=driven.dt, steps=driven.steps, K=K, held=True)
-    fed = inputs_of(held, plant.inputs, K)
-    rich = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps)
-    other = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps, rng=1)
-    B = plant.linearize([0.0, 0.0], [0.0]).B
-    page.text("### Appendix: DMDc of the pendulum", words.DMDC)
-    with unwarned():
-        models = {
-            "DMD, uncontrolled": (dmd(free.trajectory), free.trajectory),
-            "DMDc, LQR data": (dmdc(fed), fed),
-            "DMDc, LQR data, B known": (dmdc(fed, B=B), fed),
-            "DMDc, exciting input": (dmdc(rich), rich),
-        }
-    rows: list[tuple[object, ...]] = []
-    curves: dict[str, np.ndarray] = {}
-    for name, (model, data) in models.items():
-        episode, report = data[0], model.report
-        assert report is not None
-        curves[name] = model.rollout(episode.X[0], episode.U[:, : model.nu])
-        elsewhere = model.rollout(other[0].X[0], other[0].U) if model.nu else None
-        rows.append(
-            (
-                name,
-                f"{report.rank} of {report.columns}",
-                percent(relative(curves[name], episode.X)),
-                "–" if elsewhere is None else percent(relative(elsewhere, other[0].X)),
-                "–" if not model.nu else f"{float(model.B[1, 0] / B[1, 0]):.4g}",
-            )
-        )
-    page.table(
-        ("model and data", "rank of [X; U]", "error [%]", "under another input [%]", "B, of the true one"),
-        rows,
-    )
-    cases = {
-        "LQR data": (held[0].X, {n: curves[n] for n in ("DMDc, LQR data", "DMDc, LQR data, B known")}),
-        "Exciting input": (rich[0].X, {"DMDc, exciting input": curves["DMDc, exciting input"]}),
-    }
-    draw(page, "appendix-pendulum-dmdc", "Pendulum: DMDc (appendix)", cases, driven)
 
 
 def variants(page: Page, stage: Mapping[str, Scene], fits: Fits) -> None:
@@ -227,12 +181,13 @@ def frequencies(page: Page, fits: Fits) -> None:
 def theory(page: Page, scene: Scene, fits: Fits) -> None:
     """Add each equation with the function that computes it, and a picture of the leading eigenfunction."""
     lifting = OBSERVABLES["EDMD Fourier 1"]
-    page.text("## The equations", words.EQUATIONS)
+    width, rank = lifting.bind(scene.dynamics.states).nz, 4
+    page.text("## The equations", words.EQUATIONS.format(rank=rank, width=width))
     page.table(
         ("equations", "formula", "function", "distance"),
         [
             (e.number, e.formula, f"`{e.function}`", "0" if e.residual == 0 else f"{e.residual:.0e}")
-            for e in equations(scene.trajectory, lifting, rank=6)
+            for e in equations(scene.trajectory, lifting, rank)
         ],
     )
     left, right = sides(scene.trajectory, OBSERVABLES["EDMD monomials 3"])

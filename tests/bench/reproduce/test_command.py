@@ -11,7 +11,7 @@ from koopmpc.bench.reproduce import registry
 from koopmpc.bench.reproduce.contest import ORACLE, costs
 from koopmpc.bench.reproduce.page import Page, percent
 from koopmpc.bench.reproduce.registry import Outcome, Paper, find_paper
-from koopmpc.bench.reproduce.snyder_control import contest, predictions
+from koopmpc.bench.reproduce.snyder_control import SHAKINGS, contest, predictions
 from koopmpc.bench.reproduce.snyder_scenes import scenes
 from koopmpc.bench.reproduce.verdicts import Claim, Verdict, judged
 from koopmpc.cli import app
@@ -35,7 +35,7 @@ def test_the_shortened_paper_writes_all_its_files(tmp_path):
 
 
 def test_data_that_excite_find_B_and_feedback_data_do_not():
-    each = predictions(scenes()["pendulum-lqr"], (1.0, 1.0), 4.0, episodes=10)
+    each = predictions(scenes()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
     assert each["DMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["EDMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["DMDc, feedback data"].warned == "A and B inseparable"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
-from koopmpc.bench.reproduce import snyder_beyond, snyder_text
+from koopmpc.bench.reproduce import snyder_appendix, snyder_beyond, snyder_text
 from koopmpc.bench.reproduce.beyond import Prediction
 from koopmpc.bench.reproduce.contest import ORACLE
 from koopmpc.bench.reproduce.equations import equations, sides
@@ -141,11 +141,10 @@ def test_a_held_input_changes_little(stage, fits):
     assert 1e-4 < held_change(stage, fits) < 0.02
 
 
-@pytest.mark.parametrize("method", ["DMD", "EDMD monomials 3", "EDMD Fourier 1"])
-def test_each_equation_is_its_function(stage, method):
+@pytest.mark.parametrize(("method", "rank"), [("DMD", 2), ("EDMD monomials 3", 10), ("EDMD Fourier 1", 4)])
+def test_each_equation_is_its_function(stage, method, rank):
     lifting = OBSERVABLES[method]
     trajectory = stage["pendulum"].trajectory
-    rank = lifting.bind(trajectory.states).nz
     checked = equations(trajectory, lifting, rank)
     assert {e.number for e in checked} == {"10–12", "14–17", "18–23", "24–26", "27–31"}
     for equation in checked:
@@ -194,6 +193,25 @@ def test_the_page_holds_these_numbers_and_verdicts(stage, fits):
     assert all((PAGE.parent / picture).is_file() for picture in pictures)
 
 
+def test_the_lessons_of_the_page_are_those_of_its_costs():
+    text = PAGE.read_text(encoding="utf-8")
+    (cubic,) = re.findall(r"steer it at ([\d.]+) times", text)
+    ((lifted, local),) = re.findall(r"observables takes ([\d.]+) times .* linearisation ([\d.]+):", text)
+    free = text.split("Inputs without limits:")[1].split("Inputs limited:")[0]
+    ratio = {
+        cells[1].strip(): [float(cell.split("(")[1].split(")")[0]) for cell in cells[2:-1]]
+        for cells in (line.split("|") for line in free.splitlines() if "(" in line)
+    }
+    hanging, upright, shift, _ = np.transpose(list(ratio.values()))
+    assert list(ratio)[-1] == ORACLE
+    assert ratio["LQR, monomials 3"][0] == hanging.max() == pytest.approx(float(cubic), abs=0.005)
+    assert float(cubic) > 2
+    assert ratio["LQR, linearisation"][0] == pytest.approx(hanging.min(), abs=1e-3)
+    assert ratio["LQR, Fourier 1"][1] == float(lifted) < float(local) == ratio["LQR, linearisation"][1]
+    assert upright.min() == 1.0
+    assert shift.max() < 1.001
+
+
 def told(fits, *, ours, feedback, excited):
     """Return the verdicts of abstract and discussion for made-up costs and predictions."""
     names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
@@ -233,7 +251,7 @@ def test_the_parts_of_the_report(stage, fits, tmp_path, monkeypatch):
     snyder_text.gains_table(page)
     snyder_text.frequencies(page, fits)
     snyder_text.theory(page, stage["pendulum"], fits)
-    snyder_text.appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
+    snyder_appendix.appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
     gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
     assert gains_of_page.strip() in page.markdown
     assert saved == ["pendulum-eigenfunctions", "appendix-pendulum-dmdc"]
