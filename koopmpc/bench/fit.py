@@ -13,6 +13,7 @@ import numpy as np
 from koopmpc import checks
 from koopmpc.bench.fit_report import Page, drawn, write_page
 from koopmpc.bench.hold_out import IN_MEMORY, PAST, Divided, divided
+from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.folder import Files
 from koopmpc.errors import FitWarning
@@ -26,6 +27,7 @@ from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.score import Score, score
 from koopmpc.recording.model import record_model
 
+Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 Say = Callable[[str], None]
 LINEAR = "linear.npz"  # beside a bilinear model.npz
 
@@ -76,7 +78,7 @@ class Fitted:
 
 
 def fit_data(
-    data: str | PathLike[str] | Iterable[str | PathLike[str]],
+    data: Data,
     folder: str | PathLike[str],
     *,
     horizon: int | None = None,
@@ -94,7 +96,7 @@ def fit_data(
     Parameters
     ----------
     data
-        A folder of .npz, .parquet, .csv and .rrd files, or files.
+        A folder of .npz, .parquet, .csv and .rrd files, or files; of a folder of runs the .rrd logs.
     folder
         Where all is written; it is made.
     horizon
@@ -126,7 +128,7 @@ def fit_data(
     tell = _silent if say is None else say
     notes: list[str] = []
     with _noted(notes):
-        files = Files(data, **{name: value for name, value in reading.items() if value is not None})
+        files = Files(_logs(data), **{name: value for name, value in reading.items() if value is not None})
         split = divided(files, horizon, draw, memory)
     understood = _understood(split, notes)
     tell(understood)
@@ -172,6 +174,13 @@ def fit_data(
     )
     write_page(whole.page, Page(understood, chosen, judged, pictures, whole.usage, whole.failures))
     return whole
+
+
+def _logs(data: Data) -> Data:
+    """Return the logs of a folder of runs, which holds their table too; all else as it is."""
+    if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
+        return sorted(Path(data).glob("*.rrd"))
+    return data
 
 
 def _understood(split: Divided, notes: list[str]) -> str:

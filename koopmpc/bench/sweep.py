@@ -24,6 +24,7 @@ from koopmpc.recording.connect import find_viewer, why_none
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 
+RESULTS = "results.parquet"  # beside the logs of the runs
 Progress = Callable[[str, int, int], None]
 
 
@@ -103,7 +104,7 @@ def sweep(
         rows.append(_row(parts, task, folder, live))
     if progress is not None:
         progress("done", len(tasks), len(tasks))
-    write_results(rows, folder / "results.parquet")
+    write_results(rows, folder / RESULTS)
     return rows
 
 

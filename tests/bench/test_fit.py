@@ -14,7 +14,9 @@ import koopmpc.bench.fit
 import koopmpc.bench.fit_report
 from koopmpc.bench.fit import fit_data
 from koopmpc.bench.hold_out import divided
+from koopmpc.bench.library import load_problem
 from koopmpc.bench.repair import needed
+from koopmpc.bench.sweep import RESULTS, sweep
 from koopmpc.cli import app
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
@@ -30,6 +32,7 @@ from koopmpc.plant.step_map import discretize
 from koopmpc.predict.bilinear import load_bilinear_predictor
 from koopmpc.predict.linear import load_predictor
 from koopmpc.predict.score import score
+from tests.bench.tiny import write
 
 
 @dataclass(frozen=True)
@@ -228,6 +231,17 @@ def test_data_in_which_nothing_moves_are_refused():
     still = Episodes([Episode(X=np.ones((9, 2)), U=np.zeros((8, 0)))], 0.1)
     with pytest.raises(DataError, match="no state moves"):
         needed(still)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_folder_of_runs_is_data_though_their_table_is_in_it(tmp_path):
+    problem = load_problem(write(tmp_path))
+    sweep([problem], ["lqr"], folder=tmp_path / "runs")
+    assert (tmp_path / "runs" / RESULTS).exists()
+    told = []
+    found = fit_data(tmp_path / "runs", tmp_path / "out", horizon=1, say=told.append)
+    assert "2 files" in told[0]
+    assert found.selection.predictor.states == problem.dynamics.states
 
 
 @pytest.mark.usefixtures("quick")
