@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
@@ -37,6 +37,7 @@ def score(P: np.ndarray, T: np.ndarray, ridge: float) -> float:
     return M * float(error.sum()) / (M - np.trace(H)) ** 2
 
 
+@settings(max_examples=15)
 @given(st.integers(0, 999), st.integers(25, 80), st.floats(0.02, 1), st.integers(0, 2))
 def test_no_ridge_on_a_fine_grid_scores_better_on_the_full_data(
     seed: int, count: int, noise: float, nu: int
