@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import checks
 from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
 from koopmpc.control.program import Program
@@ -43,6 +44,10 @@ class Constrained:
         self, hard: Program, soft: Program | None, solver: str, settings: Mapping[str, Any] | None
     ) -> None:
         named(solver)
+        if settings is not None:
+            checks.kind(
+                settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}'
+            )
         self._hard = Solve(hard, solver, settings or {})
         self._soft = (
             None if soft is None else Solve(soft, solver, {**SOFT_SETTINGS[solver], **(settings or {})})

@@ -51,6 +51,7 @@ class Cost(Value):
     R_delta: ArrayLike | None = None
 
     def __post_init__(self) -> None:
+        checks.kind(self.of, "of", Lifting, 'for example km.State("theta"), or km.Fourier(1, states="theta")')
         for name in ("Q", "R", "Q_N", "R_delta"):
             value = getattr(self, name)
             if value is None and name in ("Q", "R"):

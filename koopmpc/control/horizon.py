@@ -7,7 +7,7 @@ condensed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -104,6 +104,10 @@ def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:
         if sum(lengths) != N:
             raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
         return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(
+            f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths"
+        )
     M = checks.count(moves, "moves")
     if M > N:
         raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -103,6 +103,8 @@ class KoopmanMPC(Receding):
         checks.kind(
             predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap"
         )
+        if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator | None):
+            raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
         super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, time_limit)
         self._blocks = blocked(moves, self._N)
         self.predictor = predictor
@@ -177,6 +179,7 @@ class KoopmanMPC(Receding):
         DataError
             The predictor has another lifting, dt, other states, inputs or disturbances than the last one.
         """
+        checks.kind(predictor, "predictor", LinearPredictor, "it replaces another LinearPredictor")
         old = self.predictor
         for name in ("lifting", "dt", "states", "inputs", "disturbances"):
             if getattr(predictor, name) != getattr(old, name):

@@ -96,6 +96,8 @@ class Limits(Value):
             raise DataError(
                 "y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)"
             )
+        if self.of is not None:
+            checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
         for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
             value = getattr(self, end)
             if value is not None and (sign * value > 0).any():

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.control.condense import Coordinates
 from koopmpc.control.cost import Cost
 from koopmpc.control.koopman_mpc import KoopmanMPC
@@ -34,6 +35,9 @@ class LinearMPC(KoopmanMPC):
         settings: Mapping[str, Any] | None = None,
         time_limit: float | None = None,
     ) -> None:
+        checks.kind(
+            step_map, "step_map", StepMap, "discretize the dynamics, or use KoopmanMPC for a predictor"
+        )
         super().__init__(
             LinearPredictor.local(step_map, x, u),
             cost,

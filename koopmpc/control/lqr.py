@@ -48,6 +48,8 @@ class LQR:
     """
 
     def __init__(self, predictor: LinearPredictor, cost: Cost, limits: Limits | None = None) -> None:
+        advice = "fit one with edmd, or linearise with LinearPredictor.local"
+        checks.kind(predictor, "predictor", LinearPredictor, advice)
         self.predictor, self.cost, self.limits = predictor, cost, limits
         track = tracking(predictor, cost, Limits() if limits is None else limits)
         step = one_step(predictor.A, predictor.B, track.C.T @ track.Q @ track.C, track.R, track.R_delta)

@@ -156,6 +156,8 @@ class Origin:
                 f"y has shape {measured.shape}, expected {self._shape}, one value a {_measured(self._estimated)}"
             )
         if self._plain:
+            if applied is not None and numbers(applied, "applied").shape != last.shape:
+                raise ShapeError(f"applied has shape {np.shape(applied)}, expected {last.shape}")
             observer.update(measured, last, self._w)
             self.z[:] = observer.z
             return

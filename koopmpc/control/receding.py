@@ -1,5 +1,6 @@
 """Receding: what every controller with a plan shares: its horizon, its deadline, and what a failed step returns."""
 
+import copy
 from time import perf_counter
 
 import numpy as np
@@ -56,6 +57,10 @@ class Receding:
         self._time_limit = time_limit
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
         self._planned = False
+
+    def __copy__(self) -> "Receding":
+        """Return a copy that shares nothing with this one that moves in a step."""
+        return copy.deepcopy(self)
 
     @property
     def dt(self) -> float:

@@ -63,6 +63,11 @@ class Injections(Injection):
     """
 
     def __init__(self, faults: Sequence[Fault], wiring: Wiring, rng: np.random.Generator) -> None:
+        if isinstance(cast(object, faults), Fault):
+            raise DataError(f"faults is {faults}; pass a list of faults, for example faults=[{faults}]")
+        for fault in faults:
+            if not isinstance(cast(object, fault), Fault):
+                raise DataError(f"faults holds {fault!r}; pass objects, for example faults=[km.NaNSensor()]")
         streams = rng.spawn(len(faults))
         self._parts = [fault.start(wiring, own) for fault, own in zip(faults, streams, strict=True)]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import checks
 from koopmpc.errors import ShapeError
 from koopmpc.loop.run import Run
 from koopmpc.values import Value
@@ -93,6 +94,7 @@ def duration(seconds: float) -> str:
 )  # a state that diverged, a sensor that showed inf: the cost says so
 def metrics(run: Run) -> Metrics:
     """Return the closed-loop figures of `run`: cost, tracking, violation, effort, settling and solve times."""
+    checks.kind(run, "run", Run, "simulate returns one")
     error = tracking_error(run)
     nr, nu = error.shape[1], run.U.shape[1]
     Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)

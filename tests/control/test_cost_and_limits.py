@@ -98,6 +98,17 @@ show(lambda: km.Cost(1, 1, u_target="rest"))
 show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), solver="simplex"))
 show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), horizon=2.5))
 show(lambda: km.Limits(slack=5))
+show(lambda: km.Limits(y_max=1, of="theta"))
+show(lambda: km.Cost(1, 1, of="theta"))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), moves=np.array([1, 19])))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), settings=["eps_abs"]))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), estimator="kalman"))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), estimator=km.LiftedDisturbance))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1)).update(None))
+show(lambda: km.KoopmanMPC(model, km.Cost(1, 1))([0], [0], applied=[1, 2]))
+show(lambda: km.LinearMPC(model, [0], [0], km.Cost(1, 1)))
+show(lambda: km.LQR(None, km.Cost(1, 1)))
+show(lambda: km.metrics([1, 2]))
 """
     )
     assert lines == [
@@ -105,4 +116,19 @@ show(lambda: km.Limits(slack=5))
         "DataError solver is 'simplex'; there are 'osqp', 'daqp'",
         "DataError horizon is 2.5; pass a whole number",
         "ShapeError slack is 5; pass (linear, quadratic), or None for hard limits",
+        'DataError of is a str, expected a Lifting; for example km.Fourier(1, states="theta")',
+        'DataError of is a str, expected a Lifting; for example km.State("theta"), or km.Fourier(1, states="theta")',
+        "DataError moves is array([ 1, 19]); pass how many moves there are, or a tuple of the blocks' lengths",
+        "DataError settings is a list, expected a Mapping; pass the solver's own by name, for example "
+        '{"max_iter": 100}',
+        "DataError estimator is 'kalman'; pass an object, for example km.LiftedDisturbance()",
+        "DataError estimator is <class 'koopmpc.estimate.disturbance.LiftedDisturbance'>; pass an object, for "
+        "example km.LiftedDisturbance()",
+        "DataError predictor is a NoneType, expected a LinearPredictor; it replaces another LinearPredictor",
+        "ShapeError applied has shape (2,), expected (1,)",
+        "DataError step_map is a LinearPredictor, expected a StepMap; discretize the dynamics, or use KoopmanMPC "
+        "for a predictor",
+        "DataError predictor is a NoneType, expected a LinearPredictor; fit one with edmd, or linearise with "
+        "LinearPredictor.local",
+        "DataError run is a list, expected a Run; simulate returns one",
     ]

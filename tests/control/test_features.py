@@ -376,7 +376,7 @@ def whole(seed=0):
     return km.KoopmanMPC(model, cost, limits, 10, moves=6, estimator=Told([0.01, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
 @pytest.mark.parametrize("steps", [0, 5])
 def test_a_copy_goes_on_as_its_original(copied, steps):
     original = whole()

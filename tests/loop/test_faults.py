@@ -38,6 +38,7 @@ from koopmpc.plant.dynamics import Dynamics
 from koopmpc.plant.step_map import discretize
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import record
+from tests.bare import shown
 
 COST = Cost(Q=[10.0, 1.0], R=0.1)
 LIMITS = Limits(u_min=-3.0, u_max=5.0)
@@ -414,3 +415,23 @@ def test_mistakes_say_what_was_got_and_what_to_do(make, text):
     with pytest.raises(DataError) as caught:
         make()
     assert text in str(caught.value)
+
+
+def test_what_is_no_fault_is_refused():
+    """What the type hook of the tests would catch first, as users see it."""
+    lines = shown(
+        """
+import casadi as ca
+x, u = ca.SX.sym("x"), ca.SX.sym("u")
+plant = km.StepMap(ca.Function("F", [x, u], [x + u]), 0.1, states=("x",), inputs=("u",))
+mpc = km.LinearMPC(plant, [0], [0], km.Cost(1, 1))
+run = lambda faults: km.simulate(plant, mpc, x0=[1], reference=[0], steps=2, faults=faults)
+show(lambda: run(km.SensorDelay(1)))
+show(lambda: run([km.SensorDelay]))
+"""
+    )
+    assert lines == [
+        "DataError faults is SensorDelay(steps=1); pass a list of faults, for example faults=[SensorDelay(steps=1)]",
+        "DataError faults holds <class 'koopmpc.loop.faults.SensorDelay'>; pass objects, for example "
+        "faults=[km.NaNSensor()]",
+    ]
