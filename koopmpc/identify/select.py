@@ -89,7 +89,8 @@ def select(
     Warns
     -----
     FitWarning
-        A state jumps by 2π: it was wrapped, and no model can follow that. Or the chosen fit itself is doubtful.
+        A state jumps by 2π: it was wrapped, and no model can follow that; every candidate's forecasts run away; or the
+        chosen fit itself is doubtful.
 
     References
     ----------
@@ -124,6 +125,13 @@ def select(
     )
     rows = tuple(sorted(map(row_of, results), key=lambda row: (row.worst, row.size)))
     chosen = choice(rows)
+    if not np.isfinite(rows[chosen].worst):
+        warnings.warn(
+            f"the forecasts of all {len(rows)} candidates run away within {ahead} steps; pass a shorter horizon, or "
+            "candidates that know the plant",
+            FitWarning,
+            stacklevel=2,
+        )
     linear = choice(rows, "linear") if any(row.kind == "linear" for row in rows) else chosen
 
     def refit(row: Row) -> Predictor:
