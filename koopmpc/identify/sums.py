@@ -32,9 +32,7 @@ class Gram:
             self._add_weighted(chunk.pairs(weights))
             return
         P, first, last, nz = chunk
-        at_ends = np.unique(
-            np.concatenate([first, last - 1])
-        )  # pairs with the first or the last state of a piece
+        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs of a first or a last state
         now, after = P[at_ends], P[at_ends + 1, :nz]
         starts, stops = P[first], P[last, :nz]
         P[first] = P[last] = 0.0
