@@ -114,10 +114,10 @@ def fit(
     ] = None,
     inputs: Annotated[str | None, typer.Option("--inputs", help="Columns that are inputs: u,v,…")] = None,
     dt: Annotated[
-        float | None, typer.Option("--dt", help="Sample time [s], where no column tells it.")
+        float | None, typer.Option("--dt", help="Sample time in s, where no column tells it.")
     ] = None,
     resample: Annotated[
-        float | None, typer.Option("--resample", help="Sample time [s] to bring unequal steps to.")
+        float | None, typer.Option("--resample", help="Sample time in s to bring unequal steps to.")
     ] = None,
     horizon: Annotated[
         int | None, typer.Option("--horizon", help="Steps ahead that the model is chosen and judged by.")
