@@ -74,7 +74,7 @@ class Prepared:
         equilibria = Equilibria(learned_map(plant), problem.cost, seen, 10 * problem.horizon)
         rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
         distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
-        return np.array([equilibria.find(row)[1] for row in distinct])[of.ravel()]
+        return np.array([equilibria.rests.find(row).u for row in distinct])[of.ravel()]
 
     @cached_property
     def data(self) -> Episodes:

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -30,6 +30,16 @@ from koopmpc.plant.step_map import StepMap
 FIRST = 10  # passes of a first step, at most
 SETTLED = 1e-6  # a first plan rests when no input and no state moves by more than this share of their size
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
+
+
+class Ahead(NamedTuple):
+    """A reference: its rows, the inputs that hold them and their slopes, which rows are the last, and its goal."""
+
+    R: Float[np.ndarray, "N1 nr"]
+    U: Float[np.ndarray, "N nu"]
+    slopes: Float[np.ndarray, "N nu nx"]
+    last: Bool[np.ndarray, " N"]
+    goal: Goal
 
 
 class BilinearMPC(Receding):
@@ -148,7 +158,7 @@ class BilinearMPC(Receding):
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         self._memory.reset(u_prev)
         self._origin.reset(x0, self._memory.last())
-        self._planned = self._warm = False
+        self._planned = self._warm = self._moved = False
         self._goal, self._reference_key = None, None
         self._iteration.e[:] = 0.0
 
@@ -269,30 +279,37 @@ class BilinearMPC(Receding):
             pushed = pushed + origin.d
         if not np.abs(pushed).max() < HUGE:
             return False
-        if (pushed[-1] != e[-1]).any():
-            self._reference_key = None
+        self._moved = self._moved or bool((pushed[-1] != e[-1]).any())
         e[:] = pushed
         return True
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
         """Hand the reference and its goals to the iteration; False where it is not finite."""
         key = reference.tobytes()
-        if key == self._reference_key:
+        if key == self._reference_key and not self._moved:
             return True
-        R = reference_rows(self._previewed(reference), self._N, len(self._outputs.Q))
-        self._reference_key = None
-        if not np.isfinite(R).all():
-            return False
-        goals = [self._equilibria(row) for row in R]
-        U_r, goal = np.array([goal.u for goal in goals[:-1]]), goals[-1]
+        if key != self._reference_key:
+            R = reference_rows(self._previewed(reference), self._N, len(self._outputs.Q))
+            self._reference_key = None
+            if not np.isfinite(R).all():
+                return False
+            goals = [self._equilibria(row) for row in R]
+            self._ahead = Ahead(
+                R,
+                np.array([goal.u for goal in goals[:-1]]),
+                np.array([goal.slope for goal in goals[:-1]]),
+                (R[:-1] == R[-1]).all(axis=1),
+                goals[-1],
+            )
+            self._reference_key = key
+        R, U_r, slopes, last, goal = self._ahead
         if self._disturbed:  # the last disturbance of the preview stays
             e = self._iteration.e[-1, : self._map.nx]
-            moved = np.array([each.slope for each in goals[:-1]]) @ e
-            U_r = np.clip(U_r + moved, *self._outputs.inputs)
             goal = self._goal = self._equilibria.pushed(R[-1], e, self._goal)
-            U_r[(R[:-1] == R[-1]).all(axis=1)] = goal.u
+            U_r = np.clip(U_r + slopes @ e, *self._outputs.inputs)
+            U_r[last] = goal.u
         self._iteration.aim(self._staged.aim(R[1:], U_r, goal))
-        self._reference_key = key
+        self._moved = False
         return True
 
     def _lose(self, applied: ArrayLike | None, status: Status, iterations: int, start: float) -> Move:

@@ -38,7 +38,7 @@ class LearnedMap:
     @property
     def nx(self) -> int:
         """Number of entries of x."""
-        return self.F.size1_in(0)
+        return self._sizes[0]
 
     @property
     def embedding(self) -> Delay | None:
@@ -53,7 +53,7 @@ class LearnedMap:
     @property
     def nu(self) -> int:
         """Number of inputs."""
-        return self.F.size1_in(1)
+        return self._sizes[1]
 
     @property
     def nw(self) -> int:
@@ -103,6 +103,10 @@ class LearnedMap:
     ) -> Float[np.ndarray, " nx"]:
         """Return x⁺, with what disturbs it."""
         return self.step(z, u) + self.push @ w + d
+
+    @cached_property
+    def _sizes(self) -> tuple[int, int]:
+        return self.F.size1_in(0), self.F.size1_in(1)  # each takes as long as a step of F
 
     @cached_property
     def _buffered(self) -> Buffered:

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.equilibrium import flat
 from koopmpc.control.limits import Box
 from koopmpc.control.move import Status
+from koopmpc.control.rest import flat
 from koopmpc.control.staged import Aim, Problem
 from koopmpc.errors import DataError
 

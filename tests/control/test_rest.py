@@ -1,0 +1,87 @@
+"""Equilibria near a guess are those of ipopt, with the same limits active; a moving load takes one step of Newton's."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from koopmpc.control.bilinear_mpc import BilinearMPC
+from koopmpc.control.cost import Cost
+from koopmpc.control.learned_map import learned_map
+from koopmpc.control.limits import Limits
+from koopmpc.control.outputs import outputs
+from koopmpc.control.rest import CLOSE, Rests
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.plant.step_map import StepMap
+from tests.control.test_bilinear_mpc import pendulum
+
+COST = Cost(Q=[1, 0.1], R=0.1)
+BOX = Limits(-0.3, 0.4, x_max=[0.7, 5.0])
+
+
+def two_tanks() -> StepMap:
+    """Return two levels that drain faster the higher they are, the second fed by the first too."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    flow = ca.vertcat(u[0] - x[0] - 0.2 * x[0] ** 2, u[1] + 0.5 * x[0] - x[1] - 0.1 * x[1] ** 3)
+    return StepMap(ca.Function("F", [x, u], [x + 0.1 * flow]), 0.1)
+
+
+def rests(model, limits: Limits, cost: Cost = COST) -> Rests:
+    seen = outputs(model.states, model.nu, cost, limits)
+    return Rests(learned_map(model), seen, of_state=True)
+
+
+SWING, TANKS = rests(pendulum(), BOX), rests(two_tanks(), Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
+    rng = np.random.default_rng(seed)
+    each = TANKS if tanks else SWING
+    nx, theta = each.model.nx, each.model.theta
+    row = rng.uniform(0.2, 1.6, nx) if tanks else np.array([rng.uniform(-0.5, 1.2), 0.0])
+    e = 0.02 * rng.standard_normal(nx)
+    begin = each.find(row)
+    near, far = each.near(begin, row, e), each.find(row, e, begin)
+    if near is None:
+        return
+    assert np.allclose(near.x, far.x, atol=1e-4)
+    assert np.allclose(near.u, far.u, atol=1e-4)
+    at = each.local(near.x, near.u, theta)
+    assert np.allclose(at.F + e, near.x, atol=1e-9)
+    for values, box in ((near.u, each._outputs.inputs), (at.g, each._outputs.box)):
+        assert (values >= box.low - 1e-8).all()
+        assert (values <= box.high + 1e-8).all()
+    again = each.near(near, row, e, CLOSE)
+    assert again is not None
+    assert np.allclose(again.x, near.x, atol=1e-9)
+
+
+@pytest.mark.parametrize("limits", [Limits(-4, 4), Limits(-0.35, 0.4), Limits(-4, 4, x_max=[0.5, np.inf])])
+@pytest.mark.parametrize("reference", [0.3, 0.9])
+def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(
+    monkeypatch: pytest.MonkeyPatch, limits: Limits, reference: float
+) -> None:
+    """Where the reference is out of reach the state ends at the limit, and the input where it is inside its own."""
+    model = pendulum()
+    F, found = model.step_map(), []
+    mpc = BilinearMPC(model, COST, limits, 30, estimator=LiftedDisturbance(0.3))
+    x = np.array([0.1, 0.0])
+    find = Rests.find
+    monkeypatch.setattr(Rests, "find", lambda self, *rest: found.append(1) or find(self, *rest))
+    load = np.array([0.0, 0.004])
+    for k in range(300):
+        move = mpc(x, [reference, 0.0])
+        assert (move.u >= limits.inputs(1).low).all()
+        assert (move.u <= limits.inputs(1).high).all()
+        x = F(x, move.u) + load * (1 + 0.1 * np.sin(0.1 * k) if k < 100 else 1.0)
+    assert len(found) <= 3
+    # at rest u cos θ holds the load and gravity: what θ needs is u(θ) = −(0.05 sin θ + 0.004) / (0.1 cos θ)
+    need = -(0.05 * np.sin(reference) + 0.004) / (0.1 * np.cos(reference))
+    top = limits.states(2).high[0]
+    if limits.inputs(1).low[0] < need and reference < top:
+        assert abs(x[0] - reference) < 1e-6
+    elif reference > top:
+        assert abs(x[0] - top) < 1e-4
