@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
 import numpy as np
@@ -16,6 +17,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallback, Status
 from koopmpc.control.nonlinear_mpc import NonlinearMPC
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.fourier import Fourier
@@ -177,6 +179,28 @@ def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
     first = run(mpc)
     for other in (mpc, copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
         assert np.array_equal(first, run(other))
+
+
+def test_two_in_two_threads_do_not_disturb_each_other() -> None:
+    limits, plant = Limits(-0.8, 0.5, x_max=[np.inf, 0.5]), pendulum().step_map()
+
+    def run(job: tuple[BilinearMPC, float]) -> list[np.ndarray]:
+        (controller, load), x, found = job, np.array([0.9, 0.2]), []
+        for _ in range(60):
+            found.append(controller(x, [0.3, 0]).u)
+            x = plant(x, found[-1]) + [0, load]
+        return found
+
+    def made() -> BilinearMPC:
+        return BilinearMPC(pendulum(), Cost(Q=[1, 0.1], R=0.1), limits, 15, estimator=LiftedDisturbance(0.3))
+
+    loads = (0.005, -0.005)
+    alone = [run((made(), load)) for load in loads]
+    controller = made()
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(run, zip((controller, copy.deepcopy(controller)), loads, strict=True)))
+    for a, b in zip(alone, together, strict=True):
+        assert np.array_equal(a, b)
 
 
 def test_a_solver_that_is_made_to_fail_leaves_the_last_plan() -> None:
