@@ -3,6 +3,7 @@
 This file is the table of contents; see README.md for ten lines that use it.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from koopmpc.bench.library import list_problems, load_problem
@@ -38,13 +39,6 @@ from koopmpc.errors import (
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.kalman import LiftedKalman
 from koopmpc.estimate.observer import Estimator
-from koopmpc.figures.eigenfunctions import plot_eigenfunctions
-from koopmpc.figures.error import plot_error
-from koopmpc.figures.reconstruction import plot_reconstruction
-from koopmpc.figures.runs import plot_runs
-from koopmpc.figures.series import plot_rollout, plot_run
-from koopmpc.figures.spectrum import plot_spectrum
-from koopmpc.figures.style import save as save_figure
 from koopmpc.identify.bilinear import bilinear_edmd
 from koopmpc.identify.candidates import Candidate
 from koopmpc.identify.constrained import constrained_edmd
@@ -98,14 +92,34 @@ from koopmpc.predict.report import FitReport
 from koopmpc.predict.score import Score, score
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
 from koopmpc.recording.episodes import run_episodes
-from koopmpc.recording.model import record_model
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.scene import Box, Disk, Line
 from koopmpc.recording.viewer import view
 
 if TYPE_CHECKING:
+    from koopmpc.figures.eigenfunctions import plot_eigenfunctions
+    from koopmpc.figures.error import plot_error
+    from koopmpc.figures.reconstruction import plot_reconstruction
+    from koopmpc.figures.runs import plot_runs
+    from koopmpc.figures.series import plot_rollout, plot_run
+    from koopmpc.figures.spectrum import plot_spectrum
+    from koopmpc.figures.style import save as save_figure
     from koopmpc.identify.regressor import KoopmanRegressor as KoopmanRegressor
+    from koopmpc.recording.model import record_model
+
+_LATER = {  # imported when they are asked for: what draws, and what needs an extra
+    "KoopmanRegressor": ("koopmpc.identify.regressor", "KoopmanRegressor"),
+    "plot_eigenfunctions": ("koopmpc.figures.eigenfunctions", "plot_eigenfunctions"),
+    "plot_error": ("koopmpc.figures.error", "plot_error"),
+    "plot_reconstruction": ("koopmpc.figures.reconstruction", "plot_reconstruction"),
+    "plot_rollout": ("koopmpc.figures.series", "plot_rollout"),
+    "plot_run": ("koopmpc.figures.series", "plot_run"),
+    "plot_runs": ("koopmpc.figures.runs", "plot_runs"),
+    "plot_spectrum": ("koopmpc.figures.spectrum", "plot_spectrum"),
+    "record_model": ("koopmpc.recording.model", "record_model"),
+    "save_figure": ("koopmpc.figures.style", "save"),
+}
 
 __all__ = [
     "CVODES",
@@ -253,9 +267,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Return KoopmanRegressor when it is asked for: scikit-learn is an extra, and slow to import."""
-    if name == "KoopmanRegressor":
-        from koopmpc.identify.regressor import KoopmanRegressor
-
-        return KoopmanRegressor
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Return what is imported only when it is asked for."""
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _LATER[name]
+    found = globals()[name] = getattr(import_module(module), attribute)
+    return found

@@ -10,10 +10,10 @@ Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Ma
 """
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
-import osqp
 import scipy.sparse
 from jaxtyping import Float
 
@@ -38,15 +38,21 @@ DEFAULTS: Mapping[str, Any] = {
 
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
-_codes = osqp.SolverStatus
-_STATUS = {
-    int(_codes.OSQP_SOLVED): Status.OPTIMAL,
-    int(_codes.OSQP_SOLVED_INACCURATE): Status.MAX_ITERATIONS,
-    int(_codes.OSQP_MAX_ITER_REACHED): Status.MAX_ITERATIONS,
-    int(_codes.OSQP_TIME_LIMIT_REACHED): Status.TIME_LIMIT,
-    int(_codes.OSQP_PRIMAL_INFEASIBLE): Status.INFEASIBLE,
-    int(_codes.OSQP_PRIMAL_INFEASIBLE_INACCURATE): Status.INFEASIBLE,
-}
+
+@cache
+def _statuses() -> dict[int, Status]:
+    """Return what OSQP's codes mean; any other is FAILED."""
+    import osqp  # 30 ms, which those need not pay who set up no QP
+
+    codes = osqp.SolverStatus
+    return {
+        int(codes.OSQP_SOLVED): Status.OPTIMAL,
+        int(codes.OSQP_SOLVED_INACCURATE): Status.MAX_ITERATIONS,
+        int(codes.OSQP_MAX_ITER_REACHED): Status.MAX_ITERATIONS,
+        int(codes.OSQP_TIME_LIMIT_REACHED): Status.TIME_LIMIT,
+        int(codes.OSQP_PRIMAL_INFEASIBLE): Status.INFEASIBLE,
+        int(codes.OSQP_PRIMAL_INFEASIBLE_INACCURATE): Status.INFEASIBLE,
+    }
 
 
 class Pattern:
@@ -84,11 +90,13 @@ class OSQP:
     goes_on = False
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
+        import osqp
+
         self._qp, self._settings = qp, dict(settings or {})
         self._bounds = Bounds(qp)
         P, A = qp.sparse()
         self._patterns = Pattern(P), Pattern(A)
-        self._problem = osqp.OSQP()
+        self._problem, self._status = osqp.OSQP(), _statuses()
         options = {"verbose": False, **DEFAULTS, **self._settings}
         try:
             self._problem.setup(P, qp.q, A, self._bounds.low, self._bounds.high, **options)
@@ -179,7 +187,7 @@ class OSQP:
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
         self._solver.solve()
         info, solution = self._solver.info, self._solver.solution
-        status = _STATUS.get(int(info.status_val), Status.FAILED)
+        status = self._status.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
             status = Status.TIME_LIMIT
         if status is Status.MAX_ITERATIONS and time_limit is None and self._nothing_fits():
