@@ -188,7 +188,7 @@ def test_two_in_two_threads_do_not_disturb_each_other() -> None:
         (controller, load), x, found = job, np.array([0.9, 0.2]), []
         for _ in range(60):
             found.append(controller(x, [0.3, 0]).u)
-            x = plant(x, found[-1]) + [0, load]
+            x = plant(x, found[-1]) + np.array([0, load])
         return found
 
     def made() -> BilinearMPC:
