@@ -65,7 +65,7 @@ def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordina
     k = 0
     for j, b in enumerate(h.blocks):
         u = U[j]
-        np.matmul(-law.K[j], X, out=u)
+        np.dot(-law.K[j], X, out=u)
         u[:, nx : nx + nf] += law.v[j]
         u[:, nx + nf + j * nu : nx + nf + (j + 1) * nu] += spread[j]
         if h.rated:
@@ -73,10 +73,11 @@ def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordina
         Bu = h.B @ u
         for _ in range(b):
             z = Z[k]
-            np.matmul(h.A, X[:nz], out=z)
+            np.dot(h.A, X[:nz], out=z)
             z += Bu
-            z[:, nx:][:, signals.w(k)] += h.E
-            z[:, nx:][:, signals.d] += np.eye(nz, signals.nd)
+            push = h.push(k)
+            if push is not None:
+                z[:, nx : nx + nf] += push
             X[:nz] = z
             k += 1
     rows = [U.reshape(n, -1)]

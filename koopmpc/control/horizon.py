@@ -80,9 +80,9 @@ class Horizon:
 
     def push(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
         """Return E w_k + d as a matrix on f; None where there is neither."""
-        signals = self.signals
-        if signals.size == 1:
+        if not self.disturbed and not self.E.shape[1]:
             return None
+        signals = self.signals
         e = np.zeros((len(self.A), signals.size))
         e[:, signals.w(k)] = self.E
         e[:, signals.d] = np.eye(len(self.A), signals.nd)
