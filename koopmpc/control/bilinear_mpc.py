@@ -220,7 +220,8 @@ class BilinearMPC(Receding):
         if self.solver_fails:
             status = Status.FAILED
         if status not in GOOD:
-            return self._lose(applied, status, iterations, start)
+            free = self._iteration.without_limits + (u_prev if self._rated else 0.0)
+            return self._lose(applied, status, iterations, start, free)
         self._planned = self._warm = True
         U = self._staged.plan(self._iteration.X, self._iteration.U)[1].copy()
         if self._hard_rates is not None:
@@ -312,7 +313,15 @@ class BilinearMPC(Receding):
         self._moved = False
         return True
 
-    def _lose(self, applied: ArrayLike | None, status: Status, iterations: int, start: float) -> Move:
+    def _lose(
+        self,
+        applied: ArrayLike | None,
+        status: Status,
+        iterations: int,
+        start: float,
+        free: Float[np.ndarray, " nu"] | None = None,
+    ) -> Move:
         """Return what stands in for a failed step; the next one starts anew, unless there was no time."""
         self._warm = status is Status.TIME_LIMIT
-        return self._fail(None, applied, status, iterations, start)
+        known = free is not None and bool((np.abs(free) < HUGE).all())
+        return self._fail(free if known else None, applied, status, iterations, start)

@@ -79,6 +79,7 @@ class RealTimeIteration:
         self._linearise = Routine(linearisation(problem), plan, [A, B, F, Q, q, r, self._g, self._G])
         passes, curvature, R = Passes(nx, nu, N), zeros((N, nu)), weights(problem)
         stages = [A, B, self._c, Q, q, r, self._x0]
+        self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
         self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
         self._next, after = _views([each.shape for each in state])
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
@@ -113,6 +114,7 @@ class RealTimeIteration:
         self._c += self.e
         np.subtract(x, self.X[0], out=self._x0)
         self._free.call()
+        self.without_limits = self.U[0] + self._dU[0]
         y = self._quantities()
         free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._moved()], axis=1)
         nothing = np.zeros_like(self._eps)

@@ -251,3 +251,24 @@ def test_refusals() -> None:
         mpc([0, 0, 0], [0, 1, 0])
     with pytest.raises(ShapeError, match=r"reference has shape \(2,\), expected \(3,\)"):
         mpc([0, 0], [0, 1])
+
+
+def test_a_step_that_fails_without_a_plan_takes_the_clipped_optimum() -> None:
+    """A hard limit that nothing meets: the loop goes on as a feedback law, and comes back inside."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    x_next = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.3 * ca.sin(x[0]) + 0.1 * u)
+    plant = StepMap(ca.Function("F", [x, u], [x_next]), 0.1, states=("theta", "omega"), inputs=("u",))
+    for rate in (None, 2.0):
+        mpc = BilinearMPC(
+            plant, Cost([2, 0.2], 0.1), Limits(-9, 9, x_max=[0.1, np.inf], slack=None, du_max=rate), 15
+        )
+        state = np.array([0.5, 0.0])
+        first = mpc(state, [0, 0])
+        assert (first.status, first.fallback) == (Status.INFEASIBLE, Fallback.CLIPPED_LQR)
+        assert -9 <= first.u[0] < -1
+        assert rate is None or first.u[0] == -rate
+        for _ in range(60):
+            move = mpc(state, [0, 0])
+            state = plant(state, move.u)
+        assert move.fallback is Fallback.NONE
+        assert np.abs(state).max() < 0.01
