@@ -110,6 +110,11 @@ def roles(
     )
 
 
+def label(name: str) -> bool:
+    """Return whether a column of this name tells rows or episodes apart, and so need not hold numbers."""
+    return _TIME.fullmatch(_stem(name)) is not None or _EPISODE.fullmatch(_stem(name)) is not None
+
+
 def _stem(name: str) -> str:
     """Return the name without its unit, in lower case."""
     return re.split(r"\s*[\[(]", name)[0].strip().lower()

@@ -85,8 +85,8 @@ def load_episodes(
     LogError
         A file is missing, is cut, or holds no episodes.
     DataError
-        The suffix is another, the files have unequal dt or names, a table lacks a column or a step, or its sampling is
-        unequal.
+        The suffix is another, the files have unequal dt or names, a table lacks a column or a step, a column
+        of numbers holds a cell that is none, or its sampling is unequal.
 
     Warns
     -----

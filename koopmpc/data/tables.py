@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.data.cells import numbers
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.roles import Roles, roles
+from koopmpc.data.roles import Roles, label, roles
 from koopmpc.data.sampling import Signals, episodes_from, resampled, restarts, sample_time
 from koopmpc.errors import DataError, FitWarning, KoopmpcError
 
@@ -48,9 +49,19 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
     Raises
     ------
     DataError
-        Something is not told and cannot be found out, a column is missing, or its rows are no whole episodes.
+        Something is not told and cannot be found out, a column is missing or holds a cell that is no number, or its
+        rows are no whole episodes.
     """
     where = str(file)
+    rows = len(next(iter(columns.values()))) if columns else 0
+    if rows == 0:
+        raise DataError(f"{where} has columns and no row in them; leave the file out")
+    sought = {*(told.states or ()), *(told.inputs or ()), *(told.disturbances or ())}
+    every = told.states is None or told.inputs is None
+    columns = {
+        name: numbers(column, name, where) if name in sought or (every and not label(name)) else column
+        for name, column in columns.items()
+    }
     numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
     found = roles(
         names,
@@ -60,7 +71,6 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         disturbances=told.disturbances,
         numeric=numeric,
     )
-    rows = len(next(iter(columns.values()))) if columns else 0
     table = {
         name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values
     }

@@ -1,5 +1,6 @@
 """Tables as text: what is told and what is guessed, gaps, unequal time, and files that are no tables."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -130,7 +131,7 @@ def test_columns_that_say_nothing_are_named(tmp_path: Path) -> None:
         ("0,1,2\n1,2,3\n", LogError, "has no line of names: its first row is 0, 1, 2"),
         ("t,x,x\n0,1,2\n1,2,3\n", DataError, "has two columns 'x'; rename one"),
         ("t,u\n0,1\n1,2\n", DataError, "has no column that could be a state: its columns are t, u"),
-        ("t,x,u\n", DataError, "has no column that could be a state|no two rows in sequence|does not advance"),
+        ("t,x,u\n", DataError, "has columns and no row in them; leave the file out"),
         ("x,u\n1,2\n2,3\n", DataError, "does not say its sample time: pass dt="),
     ],
 )  # fmt: skip
@@ -148,3 +149,36 @@ def test_a_changed_file_of_our_own_is_refused(tmp_path: Path) -> None:
         LogError, match="holds no episodes that can be read: its rows are not those that were written"
     ):
         load_episodes(tmp_path / "own.csv")
+
+
+def table(tmp_path: Path, cells: list[str], header: str = "t,x,v,u") -> Path:
+    rows = [f"{0.1 * k},{cell},{k * k},{k % 3}" for k, cell in enumerate(cells)]
+    return text(tmp_path / "log.csv", "\n".join([header, *rows, ""]))
+
+
+@pytest.mark.parametrize("spoilt", ["oops", "0.3+0.1j", "-", " ", "n/a", '"1,5"'])
+def test_a_cell_that_is_no_number_costs_no_column_in_silence(tmp_path: Path, spoilt: str) -> None:
+    file = table(tmp_path, ["1.5", "2.5", spoilt, "4.5", "6"])
+    shown = re.escape(spoilt.strip('"'))
+    said = rf"log\.csv: 'x' holds '{shown}' in row 3, which is no real number; repair the cell"
+    with pytest.raises(DataError, match=said):
+        load_episodes(file)
+    with pytest.raises(DataError, match=said):
+        load_episodes(file, states=["x", "v"], inputs=["u"])
+    assert load_episodes(file, states=["v"], inputs=["u"]).states == ("v",)
+
+
+def test_complex_cells_are_not_left_out_in_silence(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"'x' holds '\(1\+2j\)' in row 1, which is no real number"):
+        load_episodes(table(tmp_path, ["(1+2j)", "(2+1j)", "(3-1j)"]))
+
+
+def test_a_column_of_labels_is_no_state(tmp_path: Path) -> None:
+    assert load_episodes(table(tmp_path, ["walk", "walk", "2nd", "3", "run"])).states == ("v",)
+
+
+def test_truth_values_with_one_missing_cut_an_episode(tmp_path: Path) -> None:
+    file = table(tmp_path, ["true", "false", "", "true", "false"])
+    with pytest.warns(FitWarning, match="1 gaps .* cut 1 episodes into 2; 1 of 5 rows are lost"):
+        read = load_episodes(file)
+    assert [episode.X[:, 0].tolist() for episode in read] == [[1, 0], [1, 0]]
