@@ -31,3 +31,7 @@ class LogError(KoopmpcError, OSError):
 
 class FitWarning(UserWarning):
     """A fit is doubtful: rank deficient, ill conditioned, or with inputs that feedback made collinear."""
+
+
+class ColumnWarning(FitWarning):
+    """A column of a table says nothing: it is constant in it, or repeats another."""

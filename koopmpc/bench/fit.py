@@ -1,8 +1,6 @@
 """fit_data: from a file or a folder of logs to a model file, with its report, its pictures and its Rerun log."""
 
-import warnings
-from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -13,10 +11,10 @@ import numpy as np
 from koopmpc import checks
 from koopmpc.bench.fit_report import Page, drawn, write_page
 from koopmpc.bench.hold_out import IN_MEMORY, PAST, Divided, divided
+from koopmpc.bench.notes import noted, shortened
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.folder import Files
-from koopmpc.errors import FitWarning
 from koopmpc.identify.edmd import edmd
 from koopmpc.identify.select import Progress, select
 from koopmpc.identify.selection import Selection
@@ -127,13 +125,13 @@ def fit_data(
     horizon = None if horizon is None else checks.count(horizon, "horizon")
     tell = _silent if say is None else say
     notes: list[str] = []
-    with _noted(notes):
+    with noted(notes):
         files = Files(_logs(data), **{name: value for name, value in reading.items() if value is not None})
         split = divided(files, horizon, draw, memory)
-    understood = _understood(split, notes)
+    understood = _understood(split, shortened(notes, files.files))
     tell(understood)
     doubts: list[str] = []
-    with _noted(doubts):
+    with noted(doubts):
         selection = select(
             split.fitted,
             horizon=split.horizon,
@@ -150,7 +148,7 @@ def fit_data(
         selection.linear.save(place / LINEAR)
     chosen = "\n".join([str(selection), *(f"! {doubt}" for doubt in doubts)])
     tell(chosen)
-    with _noted([]):  # the same doubts again
+    with noted([]):  # the same doubts again
         report = trust(selection.predictor, split.held_out, split.horizon, train=split.seen, rng=draw)
         plain = score(edmd(split.seen, State() + Constant()), split.held_out, split.horizon)
     judged = f"{report}\n\n{_beside(report.score, plain)}"
@@ -215,20 +213,6 @@ def _beside(score: Score, plain: Score) -> str:
     return (
         f"RMSE {score.horizon} steps ahead over that of the plain linear fit x⁺ = A x + B u + c:\n  {named}"
     )
-
-
-@contextmanager
-def _noted(notes: list[str]) -> Generator[None]:
-    """Collect the text of each FitWarning, once, instead of showing it."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", FitWarning)
-        yield
-    for one in caught:
-        if issubclass(one.category, FitWarning):
-            if str(one.message) not in notes:
-                notes.append(str(one.message))
-        else:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
 
 
 def _silent(_: str) -> None:

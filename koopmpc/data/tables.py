@@ -13,7 +13,7 @@ from koopmpc.data.cells import numbers
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.roles import Roles, label, roles
 from koopmpc.data.sampling import Signals, episodes_from, resampled, restarts, sample_time
-from koopmpc.errors import DataError, FitWarning, KoopmpcError
+from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: boo
         if len(column) and np.ptp(column) == 0:
             warnings.warn(
                 f"{where}: {name!r} is {column[0]:g} throughout; leave it out: pass states= and inputs=",
-                FitWarning,
+                ColumnWarning,
                 stacklevel=3,
             )
             continue
@@ -139,7 +139,7 @@ def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: boo
             if np.array_equal(table[name], table[other], equal_nan=True):
                 warnings.warn(
                     f"{where}: {name!r} repeats {other!r}; leave one out: pass states= and inputs=",
-                    FitWarning,
+                    ColumnWarning,
                     stacklevel=3,
                 )
 

@@ -15,6 +15,7 @@ import koopmpc.bench.fit_report
 from koopmpc.bench.fit import fit_data
 from koopmpc.bench.hold_out import divided
 from koopmpc.bench.library import load_problem
+from koopmpc.bench.notes import shortened
 from koopmpc.bench.repair import needed
 from koopmpc.bench.sweep import RESULTS, sweep
 from koopmpc.cli import app
@@ -314,3 +315,29 @@ def test_too_little_data_is_told(tmp_path):
     cart_pole(2, steps=20).save(tmp_path / "data.npz")
     with pytest.raises(DataError, match="too few of 22 steps"):
         divided(Files(tmp_path / "data.npz"), 20, np.random.default_rng(0), 10**9)
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_judged(tmp_path):
+    for i, e in enumerate(cart_pole(24)):
+        lines = ["time [s],x,theta,v,omega,load,force"]
+        for k, row in enumerate(e.X):
+            push = (
+                e.U[min(k, len(e) - 1), 0] if k != 9 or i % 2 else np.nan
+            )  # a gap at row 10 of half of them
+            cells = [0.02 * k, *row, float(i), push]
+            lines.append(",".join("" if np.isnan(c) else repr(float(c)) for c in cells))
+        (tmp_path / f"{i:02d}.csv").write_text("\n".join(lines))
+    told = []
+    found = fit_data(tmp_path, tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    (gaps,) = [line for line in told[0].splitlines() if "gaps" in line]
+    assert gaps.startswith(f"! {tmp_path / '00.csv'} and 11 more files: 1 gaps (after row 10)")
+    assert "throughout" not in told[0]  # load is constant in each file, and not over all of them
+    assert "load" in found.selection.predictor.states
+
+
+def test_of_notes_that_differ_from_file_to_file_the_first_are_shown_and_the_others_counted(tmp_path):
+    files = [tmp_path / f"{i}.csv" for i in range(9)]
+    short = shortened([*(f"{file}: gap {i}" for i, file in enumerate(files)), "of all: one"], files)
+    assert short[:2] == [f"{files[0]}: gap 0", f"{files[1]}: gap 1"]
+    assert short[6:] == ["of all: one", "3 more files have such notes of their own; load_episodes says them"]
