@@ -16,7 +16,7 @@ from koopmpc.control.fallback import PlanMemory, admitted, hard
 from koopmpc.control.horizon import blocked
 from koopmpc.control.learned_map import Source, learned_map
 from koopmpc.control.lifted import HUGE, reference_rows
-from koopmpc.control.limits import Limits, softened
+from koopmpc.control.limits import Limits, beyond, softened
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.origin import Origin, Sizes, numbers
 from koopmpc.control.outputs import outputs
@@ -227,7 +227,10 @@ class BilinearMPC(Receding):
         if self._hard_rates is not None:
             U[0] = admitted(U[0], self._outputs.inputs, self._hard_rates, u_prev)
         self._memory.keep(U.ravel())
-        return self._move(U[0].copy(), Status.SOFTENED if conflict else status, iterations, start)
+        slack = self._iteration.slack
+        if conflict and self._hard_rates is not None:
+            slack = max(slack, beyond(U[0] - u_prev, self._hard_rates))
+        return self._move(U[0].copy(), Status.SOFTENED if conflict else status, iterations, start, slack)
 
     def _improve(
         self, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], passes: int, deadline: float
@@ -243,7 +246,8 @@ class BilinearMPC(Receding):
                 return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
             length = iteration.take(s, found)
             self._enter(*self._staged.plan(iteration.X, iteration.U), u_prev)
-            status = Status.SOFTENED if softened(found.slacks, iteration.soft_box) else found.status
+            iteration.slack = softened(found.slacks, iteration.soft_box)
+            status = Status.SOFTENED if iteration.slack else found.status
             moved = (found.U, iteration.U), (found.X, iteration.X)
             if length < SHORTEST:
                 status = Status.FAILED

@@ -74,8 +74,8 @@ class Constrained:
 
     def solve(
         self, v: Float[np.ndarray, " nv"], room: Box | None, deadline: float | None
-    ) -> tuple[QPSolution, bool]:
-        """Return the least deviation from the plan v, w of D w, and whether a limit gave way.
+    ) -> tuple[QPSolution, float]:
+        """Return the least deviation from the plan v, w of D w, and how far a soft limit gave way, 0 where none did.
 
         Parameters
         ----------
@@ -94,7 +94,9 @@ class Constrained:
             return found, conflict
         found, conflict = self._soft.solve(v, room, deadline)
         nw = self._hard.size
-        gave_way = conflict or bool((found.v[nw:] > self._soft.program.allowance).any())
+        program, slacks = self._soft.program, found.v[nw:]
+        given = slacks > program.allowance
+        gave_way = max(conflict, float((slacks * program.slack_unit)[given].max(initial=0.0)))
         found.v, found.iterations = found.v[:nw], iterations + found.iterations
         return found, gave_way
 
@@ -127,9 +129,9 @@ class Solve:
 
     def solve(
         self, v: Float[np.ndarray, " nv"], room: Box | None, deadline: float | None
-    ) -> tuple[QPSolution, bool]:
-        """Return the solution, and whether the input limits are out of the hard rates' reach."""
-        program, solver, conflict = self.program, self._solver, False
+    ) -> tuple[QPSolution, float]:
+        """Return the solution, and how far the input limits are out of the hard rates' reach."""
+        program, solver, conflict = self.program, self._solver, 0.0
         moved = self._moved
         np.multiply(v[program.source], program.scale, out=moved[: len(program.source)])
         if room is None:
@@ -140,7 +142,8 @@ class Solve:
             scale = program.scale[rows]
             lowest = np.minimum(low[rows], room.high[which] * scale)
             highest = np.maximum(high[rows], room.low[which] * scale)
-            conflict = bool((lowest < low[rows] - 1e-9).any() or (highest > high[rows] + 1e-9).any())
+            past = np.maximum(low[rows] - lowest, highest - high[rows])
+            conflict = float((past / scale)[past > 1e-9].max(initial=0.0))
             low[rows], high[rows] = lowest, highest
             solver.update(low - moved, high - moved)
         start = self._cold

@@ -304,7 +304,7 @@ class KoopmanMPC(Receding):
             u[:] = admitted(u, inputs, self._hard_rates, u_prev)
         self._keep(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
-        return self._move(u.copy(), status, found.iterations, start)
+        return self._move(u.copy(), status, found.iterations, start, gave_way)
 
     def _fail(
         self,

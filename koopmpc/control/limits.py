@@ -150,9 +150,14 @@ def allowance(box: Box) -> Float[np.ndarray, " n"]:
     return SOFTENED * (1 + np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)))
 
 
-def softened(slacks: Float[np.ndarray, "N ng"], outputs: Box) -> bool:
-    """Return whether a soft limit gives way by more than 1e-4 (1 + |limit|) at any stage."""
-    return bool(slacks.size and (slacks > allowance(outputs)).any())
+def softened(slacks: Float[np.ndarray, "N ng"], outputs: Box) -> float:
+    """Return the largest slack of a soft limit that gives way by more than 1e-4 (1 + |limit|); 0 where none does."""
+    return float(slacks[slacks > allowance(outputs)].max(initial=0.0))
+
+
+def beyond(value: Float[np.ndarray, " n"], box: Box) -> float:
+    """Return how far the value that is farthest outside its limits is outside; 0 where all are inside."""
+    return float(np.maximum(box.low - value, value - box.high).max(initial=0.0))
 
 
 def _given(low: ArrayLike | None, high: ArrayLike | None) -> bool:

@@ -48,6 +48,8 @@ class Move:
         Wall-clock time of the whole step, from y to u [s].
     iterations
         Iterations of the solver; 0 where none ran.
+    slack
+        How far the plan breaks the soft limit, or the rate, that gives way most, in its own unit; 0 but for SOFTENED.
     """
 
     u: Float[np.ndarray, " nu"]
@@ -55,6 +57,7 @@ class Move:
     fallback: Fallback
     solve_time: float
     iterations: int
+    slack: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from koopmpc.control.fallback import PlanMemory, admitted, hard
 from koopmpc.control.horizon import blocked
 from koopmpc.control.learned_map import Source, learned_map
 from koopmpc.control.lifted import reference_rows
-from koopmpc.control.limits import Box, Limits, softened
+from koopmpc.control.limits import Box, Limits, beyond, softened
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.origin import Origin, Sizes, numbers
 from koopmpc.control.outputs import outputs
@@ -164,8 +164,11 @@ class NonlinearMPC(Receding):
             U[0] = admitted(U[0], self._outputs.inputs, self._hard_rates, u_prev)
         self._memory.keep(U.ravel())
         self._plan = Plan(X[:, : self._ny].copy(), U.copy())
-        soft = conflict or softened(found.slacks, self._soft)
-        return self._move(U[0].copy(), Status.SOFTENED if soft else Status.OPTIMAL, iterations, start)
+        slack = softened(found.slacks, self._soft)
+        if conflict and self._hard_rates is not None:
+            slack = max(slack, beyond(U[0] - u_prev, self._hard_rates))
+        soft = conflict or slack > 0
+        return self._move(U[0].copy(), Status.SOFTENED if soft else Status.OPTIMAL, iterations, start, slack)
 
     def _lose(self, applied: ArrayLike | None, status: Status, iterations: int, start: float) -> Move:
         self._warm = None

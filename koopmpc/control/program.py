@@ -36,11 +36,12 @@ class Program:
 
     It is the cost unit · wᵀH w + Σ (linear ε + quadratic ε²), divided by 2 unit.
 
-    Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v times `scale`: their
-    bounds are `low` and `high` less that product; the rest are ε ≥ 0. Every row is measured by the norm of its row of
-    D. `shift_primal` and `shift_dual` tell where the next stage's entry stands; one past the end stands for zero. A
-    slack above its `allowance` is reported. Where soft rows are held hard, their multipliers must be at most `most`
-    for the solution to be that of the soft QP.
+    Soft rows are relaxed by their ε ≥ 0. The first rows of the QP limit the entries `source` of v times `scale`:
+    their bounds are `low` and `high` less that product; the rest are ε ≥ 0. Every row is measured by the norm of
+    its row of D. `shift_primal` and `shift_dual` tell where the next stage's entry stands; one past the end stands
+    for zero. A slack above its `allowance` is reported, `slack_unit` times as large: in the unit of its limit.
+    Where soft rows are held hard, their multipliers must be at most `most` for the solution to be that of the soft
+    QP.
     """
 
     qp: QP
@@ -51,6 +52,7 @@ class Program:
     shift_primal: Int[np.ndarray, " n"]
     shift_dual: Int[np.ndarray, " m"]
     allowance: Float[np.ndarray, " ns"]
+    slack_unit: Float[np.ndarray, " ns"]
     most: Float[np.ndarray, " m"]
     rates: FirstRates
 
@@ -125,7 +127,7 @@ def program(
                 )
             )
         shifts.append(_next(following, len(soft)))
-        of_stage = softness.linear, softness.quadratic, allowance(given) / size
+        of_stage = softness.linear, softness.quadratic, allowance(given) / size, size
         weights.append(tuple(np.tile(weight[soft], N) for weight in of_stage))
         first, slacks = first + width * N, slacks + len(soft) * N
     source = np.concatenate([block.source for block in blocks])
@@ -138,7 +140,7 @@ def program(
             A[row + np.arange(len(block.source)), nw + block.slack] = block.sign
         row += len(block.source)
     A[row:, nw:] = np.eye(slacks)
-    linear, quadratic, allowed = (np.concatenate(parts) for parts in zip(*weights, strict=True))
+    linear, quadratic, allowed, slack_unit = (np.concatenate(parts) for parts in zip(*weights, strict=True))
     P, q = np.zeros((nw + slacks, nw + slacks)), np.zeros(nw + slacks)
     P[:nw, :nw] = hessian
     P[nw:, nw:] = np.diag(quadratic / unit)
@@ -154,6 +156,7 @@ def program(
         _joined(shifts),
         _joined([*(block.next for block in blocks), *shifts[1:]]),
         allowed,
+        slack_unit,
         np.concatenate([*(block.linear / (2 * unit) for block in blocks), np.full(slacks, np.inf)]),
         first_rates,
     )

@@ -82,12 +82,18 @@ class Receding:
         """The estimate now: its z, and its disturbance d."""
         return self._origin.observer
 
-    def _move(self, u: Float[np.ndarray, " nu"], status: Status, iterations: int, start: float) -> Move:
+    def _move(
+        self,
+        u: Float[np.ndarray, " nu"],
+        status: Status,
+        iterations: int,
+        start: float,
+        slack: float = 0.0,
+    ) -> Move:
         """Return a good step; a late one says so."""
         taken = perf_counter() - start
-        return Move(
-            u, status if taken <= self._allowed else Status.TIME_LIMIT, Fallback.NONE, taken, iterations
-        )
+        in_time = status if taken <= self._allowed else Status.TIME_LIMIT
+        return Move(u, in_time, Fallback.NONE, taken, iterations, slack)
 
     def _fail(
         self,

@@ -64,6 +64,7 @@ class RealTimeIteration:
         self._free_stages = problem.free
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros
+        self.slack = 0.0  # of the soft limit that the plan breaks most
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))

@@ -45,6 +45,8 @@ class Run(Value):
         The plan of each step, where asked for.
     cost, limits
         What the run is judged by.
+    slack
+        (T,) how far the plan of each step breaks the soft limit that gives way most, in its own unit.
     u_reference
         (T, nu) inputs whose distance from U costs: what holds the reference; zeros by default.
     dt
@@ -75,10 +77,13 @@ class Run(Value):
     angles: tuple[int, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
     u_reference: Float[np.ndarray, "T nu"] = field(default_factory=lambda: np.empty((0, 0)))
+    slack: Float[np.ndarray, " Ts"] = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         if not self.u_reference.size:
             object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
+        if not self.slack.size:
+            object.__setattr__(self, "slack", np.zeros(len(self.U)))
 
     @property
     def steps(self) -> int:

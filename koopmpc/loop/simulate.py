@@ -23,7 +23,7 @@ _CONTROLLER = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
     "controller(y, reference, applied) -> Move; make it a class, see km.Controller"
 )
-_MOVE = ("status", "fallback", "solve_time", "iterations")
+_MOVE = ("status", "fallback", "solve_time", "iterations", "slack")
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +199,7 @@ def simulate(
         fallback=tuple(m.fallback for m in moves),
         solve_time=np.array([m.solve_time for m in moves]),
         iterations=np.array([m.iterations for m in moves], dtype=np.int64),
+        slack=np.array([m.slack for m in moves]),
         cost=cost,
         limits=limits,
         dt=plant.dt,

@@ -13,7 +13,7 @@ from koopmpc.recording.columns import Columns, read_columns
 from koopmpc.recording.description import About, from_json
 
 _ENTITIES = (
-    "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/time_ms",
+    "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/slack", "/solver/time_ms",
     "/solver/status", "/prediction/x", "/prediction/u", "/description", "/metrics",
 )  # fmt: skip
 
@@ -75,7 +75,8 @@ def _run(log: Columns, path: Path) -> Run:
         solve_time=seconds[:steps],
         iterations=iterations[:steps].astype(np.int64),
         plans=_plans(log, steps),
-        u_reference=_held(log, steps, len(about.inputs)),
+        u_reference=_sparse(log, "/control/u_reference", steps, len(about.inputs)),
+        slack=_sparse(log, "/solver/slack", steps, 1)[:, 0],
         **about.fields(),
     )
 
@@ -102,10 +103,10 @@ def _measured(log: Columns, X: np.ndarray) -> np.ndarray:
     return Y
 
 
-def _held(log: Columns, steps: int, nu: int) -> np.ndarray:
-    """Return the inputs that hold the reference: zero, but for the rows that were written."""
-    k, values = log.matrix("/control/u_reference")
-    held, inside = np.zeros((steps, nu)), k < steps
+def _sparse(log: Columns, entity: str, steps: int, width: int) -> np.ndarray:
+    """Return the rows of an entity: zero, but for those that were written."""
+    k, values = log.matrix(entity)
+    held, inside = np.zeros((steps, width)), k < steps
     if len(k):
         held[k[inside]] = values[inside]
     return held

@@ -32,6 +32,7 @@ class Rows:
     plan_X: Float[np.ndarray, "p N1 nx_plan"]
     plan_U: Float[np.ndarray, "p N nu_plan"]
     u_reference: Float[np.ndarray, "m nu"]
+    slack: Float[np.ndarray, " m"]
 
 
 def rows_of_run(run: Run) -> Rows:
@@ -51,6 +52,7 @@ def rows_of_run(run: Run) -> Rows:
         plan_X=no_plans if run.plans is None else run.plans.X,
         plan_U=no_plans if run.plans is None else run.plans.U,
         u_reference=run.u_reference,
+        slack=run.slack,
     )
 
 
@@ -83,6 +85,7 @@ def _part(rows: Rows, a: int, b: int) -> Rows:
         plan_X=rows.plan_X[p],
         plan_U=rows.plan_U[p],
         u_reference=rows.u_reference[a:b],
+        slack=rows.slack[a:b],
     )
 
 
@@ -115,6 +118,7 @@ def rows_of_steps(steps: Sequence[Step], nx: int, *, end: bool = False) -> Rows:
         plan_X=np.stack([p.X for _, p in plans]) if plans else np.empty((0, 0, 0)),
         plan_U=np.stack([p.U for _, p in plans]) if plans else np.empty((0, 0, 0)),
         u_reference=np.stack([np.zeros(len(s.u)) if s.u_reference is None else s.u_reference for s in steps]),
+        slack=np.array([0.0 if m is None else m.slack for m in moves]),
     )
 
 
@@ -134,5 +138,6 @@ def run_of_rows(blocks: Sequence[Rows], about: About) -> Run | None:
         solve_time=np.concatenate([b.solve_time for b in blocks])[:steps],
         iterations=np.concatenate([b.iterations for b in blocks])[:steps],
         u_reference=np.concatenate([b.u_reference for b in blocks])[:steps],
+        slack=np.concatenate([b.slack for b in blocks])[:steps],
         **about.fields(),
     )

@@ -91,6 +91,8 @@ class Writer:
             self._vectors("control/u", k[:m], rows.U)
             held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
             self._vectors("control/u_reference", k[held], rows.u_reference[held])
+            gave = np.flatnonzero(rows.slack)
+            self._vectors("solver/slack", k[gave], rows.slack[gave, None])
             ends = np.unique(k[[0, m - 1]])
             limits = [value for _, value in input_limits(self._about)]
             self._vectors("control/limits", ends, np.tile(limits, (len(ends), 1)))

@@ -86,6 +86,7 @@ def make_run(
         plans=None if N is None else Plans(numbers(T, N + 1, nx), numbers(T, N, nu)),
         angles=(nx - 1,),
         metadata={} if metadata is None else metadata,
+        slack=np.where(rng.random(T) < 0.5 * held, rng.random(T), 0.0),
         u_reference=np.where(rng.random((T, nu)) < 0.5 * held, numbers(T, nu), 0.0),
     )
 
@@ -99,7 +100,12 @@ def steps_of(run: Run) -> list[Step]:
             u=run.U[k],
             reference=run.reference[k],
             move=Move(
-                run.U[k], run.status[k], run.fallback[k], float(run.solve_time[k]), int(run.iterations[k])
+                run.U[k],
+                run.status[k],
+                run.fallback[k],
+                float(run.solve_time[k]),
+                int(run.iterations[k]),
+                float(run.slack[k]),
             ),
             x=run.X[k],
             plan=None if run.plans is None else Plan(run.plans.X[k], run.plans.U[k]),

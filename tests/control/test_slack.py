@@ -1,0 +1,74 @@
+"""How far a soft limit gives way: the same number from every controller, and that of a problem written down by hand."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from koopmpc.control.bilinear_mpc import BilinearMPC
+from koopmpc.control.cost import Cost
+from koopmpc.control.koopman_mpc import KoopmanMPC
+from koopmpc.control.limits import Limits
+from koopmpc.control.move import Status
+from koopmpc.control.nonlinear_mpc import NonlinearMPC
+from koopmpc.lifting.state import State
+from koopmpc.loop.simulate import simulate
+from koopmpc.predict.linear import LinearPredictor
+
+A, B, N = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]]), 12
+MODEL = LinearPredictor(A, B, np.eye(2), State(), 0.1, ("p [m]", "v [m/s]"), ("a [N]",))
+COST = Cost(Q=[10.0, 1.0], R=0.1, Q_N=np.diag([10.0, 1.0]))
+LIMITS = Limits(-1, 1, x_min=[-np.inf, -0.3], x_max=[np.inf, 0.3], slack=(20.0, 5.0))
+
+
+def by_hand(x: np.ndarray) -> float:
+    """Return the largest slack of the optimal plan."""
+    X, U, slack = cp.Variable((N + 1, 2)), cp.Variable((N, 1)), cp.Variable(N, nonneg=True)
+    cost = sum(cp.sum_squares(np.diag([10**0.5, 1.0]) @ X[k]) for k in range(1, N + 1))
+    cost += 0.1 * cp.sum_squares(U) + 20 * cp.sum(slack) + 5 * cp.sum_squares(slack)
+    held = [X[0] == x, X[1:] == X[:-1] @ A.T + U @ B.T, cp.abs(U) <= 1, cp.abs(X[1:, 1]) <= 0.3 + slack]
+    cp.Problem(cp.Minimize(cost), held).solve(solver="CLARABEL")
+    return float(np.max(slack.value))
+
+
+@pytest.mark.parametrize("x", [[0.0, 1.0], [1.0, -0.9], [0.1, 0.0]])
+def test_every_controller_says_what_the_plan_of_the_problem_breaks(x: list[float]) -> None:
+    expected = by_hand(np.array(x))
+    exact = {"eps_abs": 1e-9, "eps_rel": 1e-9}
+    for mpc in (
+        KoopmanMPC(MODEL, COST, LIMITS, N, settings=exact),
+        KoopmanMPC(MODEL, COST, LIMITS, N, solver="daqp"),
+        BilinearMPC(MODEL, COST, LIMITS, N),
+        NonlinearMPC(MODEL.step_map(), COST, LIMITS, N),
+    ):
+        move = mpc(x, [0.0, 0.0])
+        if expected < 1e-6:
+            assert move.slack == 0
+            assert move.status is not Status.SOFTENED
+        else:
+            assert move.status is Status.SOFTENED
+            assert abs(move.slack - expected) < 1e-4
+            assert mpc.plan() is not None
+            assert abs(np.abs(mpc.plan().X[1:, 1]).max() - 0.3 - expected) < 1e-4
+
+
+def test_a_rate_that_the_box_overrules_is_told_in_its_unit() -> None:
+    """u = 3 was applied, the limit is 1, and the rate allows 0.5: it is exceeded by 1.5."""
+    limits = Limits(-1, 1, du_min=-0.5, du_max=0.5)
+    for mpc in (
+        KoopmanMPC(MODEL, COST, limits, N),
+        BilinearMPC(MODEL, COST, limits, N),
+        NonlinearMPC(MODEL.step_map(), COST, limits, N),
+    ):
+        mpc.reset(u_prev=[1.0])
+        move = mpc([-5.0, 0.0], [0.0, 0.0], applied=[3.0])
+        assert move.status is Status.SOFTENED
+        assert abs(move.slack - 1.5) < 1e-6
+
+
+def test_a_run_keeps_it() -> None:
+    run = simulate(
+        MODEL.step_map(), KoopmanMPC(MODEL, COST, LIMITS, N), x0=[0.0, 1.0], reference=[0.0, 0.0], steps=20
+    )
+    gave = np.array([status is Status.SOFTENED for status in run.status])
+    assert gave.any()
+    assert ((run.slack > 0) == gave).all()
