@@ -42,6 +42,9 @@ class Ahead(NamedTuple):
     goal: Goal
 
 
+_HELD = ("_origin", "_memory", "_planned", "_warm", "_moved")  # what a copy takes over, with the plan
+
+
 class BilinearMPC(Receding):
     """Minimise the Cost over N steps of x⁺ = F(x, u) within the Limits, one linearisation a step.
 
@@ -132,7 +135,7 @@ class BilinearMPC(Receding):
         self._warm = False
         self.reset()
 
-    def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...], dict[str, Any]]:
         build = partial(
             BilinearMPC,
             passes=self._passes,
@@ -141,7 +144,17 @@ class BilinearMPC(Receding):
             moves=self._blocks,
             time_limit=self._time_limit,
         )
-        return build, (self.predictor, self.cost, self.limits, self._N)
+        held = {name: getattr(self, name) for name in _HELD}
+        iteration = self._iteration
+        held["plan"] = iteration.X.copy(), iteration.U.copy(), iteration.e.copy()
+        return build, (self.predictor, self.cost, self.limits, self._N), held
+
+    def __setstate__(self, held: dict[str, Any]) -> None:
+        """Go on where the original was."""
+        iteration = self._iteration
+        iteration.X[:], iteration.U[:], iteration.e[:] = held.pop("plan")
+        self.__dict__.update(held)
+        self._goal, self._reference_key = None, None  # the next step aims anew
 
     @property
     def predictor(self) -> Source:

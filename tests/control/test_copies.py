@@ -1,0 +1,46 @@
+"""A copy of a controller in mid-run goes on where the original is, and shares nothing with it."""
+
+import copy
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from koopmpc.control.bilinear_mpc import BilinearMPC
+from koopmpc.control.koopman_mpc import KoopmanMPC
+from koopmpc.control.limits import Limits
+from koopmpc.control.nonlinear_mpc import NonlinearMPC
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from tests.control.test_slack import COST, MODEL, A, B, N
+
+LIMITS = Limits(-1, 1, du_min=-0.2, du_max=0.2)
+MAKERS: dict[str, Callable[[], BilinearMPC | KoopmanMPC | NonlinearMPC]] = {
+    "koopman": lambda: KoopmanMPC(MODEL, COST, LIMITS, N, estimator=LiftedDisturbance(0.2)),
+    "bilinear": lambda: BilinearMPC(MODEL, COST, LIMITS, N),
+    "bilinear, estimated": lambda: BilinearMPC(MODEL, COST, LIMITS, N, estimator=LiftedDisturbance(0.2)),
+    "bilinear, late": lambda: BilinearMPC(MODEL, COST, LIMITS, N, latency=1),
+    "nonlinear": lambda: NonlinearMPC(MODEL.step_map(), COST, LIMITS, N),
+}
+
+
+def moves(
+    mpc: BilinearMPC | KoopmanMPC | NonlinearMPC, x: np.ndarray, steps: int
+) -> tuple[list[float], np.ndarray]:
+    """Return the inputs under a load that no model has, and the state at the end."""
+    found: list[float] = []
+    for _ in range(steps):
+        u = mpc(x, [0.0, 0.0]).u
+        found.append(float(u[0]))
+        x = A @ x + B @ u + 0.01
+    return found, x
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_copy_in_mid_run_goes_on(name: str) -> None:
+    original = MAKERS[name]()
+    _, x = moves(original, np.array([2.0, 0.0]), 4)  # the rate is active here
+    copies = [pickle.loads(pickle.dumps(original)), copy.deepcopy(original), copy.copy(original)]
+    expected, _ = moves(original, x, 6)
+    for other in copies:
+        assert np.allclose(moves(other, x, 6)[0], expected, atol=1e-6)
