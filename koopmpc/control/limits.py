@@ -152,7 +152,7 @@ def allowance(box: Box) -> Float[np.ndarray, " n"]:
 
 def softened(slacks: Float[np.ndarray, "N ng"], outputs: Box) -> float:
     """Return the largest slack of a soft limit that gives way by more than 1e-4 (1 + |limit|); 0 where none does."""
-    return float(slacks[slacks > allowance(outputs)].max(initial=0.0))
+    return float(slacks[slacks > allowance(outputs)].max(initial=0.0)) if slacks.size else 0.0
 
 
 def beyond(value: Float[np.ndarray, " n"], box: Box) -> float:

@@ -84,9 +84,9 @@ def test_limits_that_make_no_sense():
 
 def test_a_slack_is_reported_above_its_tolerance():
     box = km.Limits(x_min=-1, x_max=9).states(2)
-    assert not softened(np.zeros((3, 0)), box)
-    assert not softened(np.full((3, 2), 0.9e-3), box)
-    assert softened(np.array([[0, 0], [0, 1.1e-3]]), box)
+    assert softened(np.zeros((3, 0)), box) == 0
+    assert softened(np.full((3, 2), 0.9e-3), box) == 0
+    assert softened(np.array([[0, 0], [0, 1.1e-3]]), box) == 1.1e-3
 
 
 def test_choices_of_a_name():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.constrained import constrained_edmd
 from koopmpc.identify.contraction import Misfit, clipped, nearest, radius_of
 from koopmpc.identify.edmd import edmd
@@ -20,6 +20,7 @@ from koopmpc.identify.stable import stable_edmd
 from koopmpc.lifting.constant import Constant
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import State
+from koopmpc.lifting.thin_plate import ThinPlate
 from tests.identify.plants import brute_force, random_episodes
 
 
@@ -56,6 +57,7 @@ def refitted(data: Episodes, model, A: np.ndarray) -> float:
     return float(np.sum(np.sum(rest**2, axis=0) / np.sum(Z**2, axis=0)))
 
 
+@pytest.mark.filterwarnings("ignore:stability costs much")
 @given(st.integers(0, 999), st.integers(1, 6), st.integers(0, 2), st.floats(0.2, 1.2))
 @settings(max_examples=10)
 def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radius: float) -> None:
@@ -172,6 +174,36 @@ def test_more_observables_than_the_inequality_takes() -> None:
     assert radius_of(model.A) <= 0.9 + 1e-9
     plain = edmd(data, State())
     assert objective(data, model) <= refitted(data, model, clipped(plain.A, 0.9))
+
+
+def test_nearly_dependent_observables_stay_as_close_as_a_ridge_would_have_them() -> None:
+    generator = np.random.default_rng(3)
+    episodes = []
+    for x in generator.uniform(-1, 1, (40, 2)):  # a pendulum, pushed at random
+        X, U = [x], generator.uniform(-5, 5, (60, 1))
+        for (u,) in U:
+            v = X[-1][1] + 0.05 * (u - 9.81 * np.sin(X[-1][0]))
+            X.append(np.array([X[-1][0] + 0.05 * v, v]))
+        episodes.append(Episode(X=np.array(X), U=U))
+    data = Episodes(episodes, 0.05)
+    lifting = State() + ThinPlate(generator.uniform(-2, 2, (30, 2)))
+    plain, model, ridged = (
+        edmd(data, lifting),
+        stable_edmd(data, lifting),
+        stable_edmd(data, lifting, ridge=1e-10),
+    )
+    assert radius_of(plain.A) > 1 >= radius_of(model.A) - 1e-9
+    assert objective(data, model) <= objective(data, ridged) * (1 + 1e-6)
+    assert objective(data, model) < 2 * objective(data, plain)
+
+
+def test_a_stable_model_that_keeps_little_of_the_plant_says_so() -> None:
+    X = np.array([[1.5**k, 0.5**k] for k in range(9)])
+    data = Episodes([Episode(X=X, U=np.zeros((8, 0)))], 0.1)
+    with pytest.warns(
+        FitWarning, match=r"stability costs much: the stable model misses \d+% .* larger radius"
+    ):
+        stable_edmd(data, State(), radius=0.5)
 
 
 @pytest.mark.slow
