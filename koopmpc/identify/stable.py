@@ -9,7 +9,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.assemble import assembled, growth, warned
+from koopmpc.identify.assemble import assembled, growth, relative_misfit, warned
 from koopmpc.identify.contraction import Misfit, clipped, inside, nearest, radius_of
 from koopmpc.identify.doubts import doubts
 from koopmpc.identify.fit import rule
@@ -23,6 +23,8 @@ from koopmpc.lifting.constant import Constant
 from koopmpc.predict.linear import LinearPredictor
 
 _SMALL = 20  # observables up to which the matrix inequality is solved too
+_HELP = 1e-10  # ridge that helps the descent where columns are nearly dependent
+_MUCH = 0.5  # relative misfit of a stable model that is hardly one of the data
 _ROUNDING = 1e-9  # an eigenvalue this close to the circle is on it
 
 
@@ -41,7 +43,8 @@ def stable_edmd(
     Constant's column are eliminated, so they are the best for the A that is found, and A is the best of: the plain
     fit with its eigenvalues clipped; for up to 20 observables a linear matrix inequality in (A P, P); and descent
     over A = S⁻¹ X S, ‖X‖₂ ≤ radius, from each of them. So it is stable, and at least as close as all of these. The
-    problem is not convex: a closer stable A may exist.
+    problem is not convex: a closer stable A may exist. Where columns are nearly dependent and the ridge is below 1e-10,
+    the answer for a ridge of 1e-10 is tried too, and the closer one taken.
 
     A Constant keeps its own row 1⁺ = 1 and its eigenvalue 1; the radius holds for the others.
 
@@ -68,8 +71,9 @@ def stable_edmd(
     Warns
     -----
     FitWarning
-        As `edmd`. ``report.changes`` tells the spectral radius, the misfit and each state's residual before and
-        after: small residuals may grow much, for each observable counts relative to its own size.
+        As `edmd`, and where stability leaves little of the model. ``report.changes`` tells the spectral radius, the
+        misfit and each state's residual before and after: small residuals may grow much, for each observable counts
+        relative to its own size.
     """
     rho, asked = checks.positive(radius, "radius"), ridge_of(ridge)
     task = read(episodes, lifting, embedding, "stable_edmd", **how)
@@ -91,8 +95,19 @@ def stable_edmd(
         said = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, {said}"
         changes = [f"spectral radius {before:.6g} before, {after:.6g} after", growth(rows, stable, K)]
         changes += _losses(task, K, stable)
+        sentences += _doubt(relative_misfit(rows, K), relative_misfit(rows, stable))
         K = stable
     return warned(assembled(task, K, rule=said, ridge=weight, doubts=sentences, changes=changes))
+
+
+def _doubt(before: float, after: float) -> list[str]:
+    """Return a sentence where the stable model has little left of what the plain fit knew."""
+    if after < max(_MUCH, 2 * before):
+        return []
+    return [
+        f"stability costs much: the stable model misses {after:.0%} of the observables a step, the plain fit "
+        f"{before:.2%}; pass a ridge, 1e-6 say, fewer observables or a larger radius"
+    ]
 
 
 def _losses(
@@ -114,16 +129,40 @@ def _stabilised(
     size = norms(rows.P)
     size[size == 0] = 1.0
     others = np.setdiff1d(np.arange(n), moving)
-    P = np.vstack([rows.P / size, np.sqrt(ridge) * np.eye(n)])
-    free = P[:, moving] - onto(P[:, others], P[:, moving])
     scale = size[moving] / size[moving, None]  # A in units of the observables' sizes
-    A0 = K[np.ix_(moving, moving)].T
-    misfit = Misfit(A0 * scale, free.T @ free)
+
+    def misfit(K: Float[np.ndarray, "n nz"], ridge: float) -> Misfit:
+        P = np.vstack([rows.P / size, np.sqrt(ridge) * np.eye(n)])
+        free = P[:, moving] - onto(P[:, others], P[:, moving])
+        return Misfit(K[np.ix_(moving, moving)].T * scale, free.T @ free)
+
+    asked = misfit(K, ridge)
+    found = [_nearest(asked, rho)]
+    if ridge < _HELP and np.linalg.cond(asked.G) > 1 / _HELP:  # too steep a valley for the descent
+        found.append(_nearest(misfit(solve(rows, ridge=_HELP).K, _HELP), rho))
+    choices = [_refitted(rows, K, moving, A / scale, rho, ridge) for A in found]
+    return min(choices, key=lambda K: relative_misfit(rows, K))
+
+
+def _nearest(misfit: Misfit, rho: float) -> Float[np.ndarray, "m m"]:
+    """Return the stable A of the least misfit that the descent finds from all starts."""
     starts = [clipped(misfit.A0, rho)]
-    if len(moving) <= _SMALL:
+    if len(misfit.A0) <= _SMALL:
         start = lyapunov_fit(misfit.A0, misfit.G, rho)
         starts += [] if start is None else [inside(start, rho)]
-    A = nearest(misfit, rho, starts) / scale
+    return nearest(misfit, rho, starts)
+
+
+def _refitted(
+    rows: Rows,
+    K: Float[np.ndarray, "n nz"],
+    moving: Int[np.ndarray, " m"],
+    A: Float[np.ndarray, "m m"],
+    rho: float,
+    ridge: float,
+) -> Float[np.ndarray, "n nz"]:
+    """Return K with A as the block of the `moving` observables, and what multiplies the others fitted to it."""
+    others = np.setdiff1d(np.arange(len(K)), moving)
     found = K.copy()
     found[np.ix_(moving, moving)] = inside(A, rho).T
     if len(others):
