@@ -1,6 +1,6 @@
 """Weights of snapshot pairs: Σ w dᵀd, so that a pair of weight 2 counts as if it came twice."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import cast
 
 import numpy as np
@@ -29,6 +29,9 @@ def weights_of(weights: Weights, episodes: Episodes) -> Steps:
     if callable(weights):
         given = [weights(episode) for episode in episodes]
     else:
+        single = isinstance(weights, np.ndarray) and weights.ndim == 0
+        if single or not isinstance(cast(object, weights), Iterable):
+            raise DataError(f"weights is {weights!r}; pass one item an episode, or a function of an Episode")
         given = list(cast("Sequence[ArrayLike]", weights))
         if len(given) != len(episodes):
             raise ShapeError(

@@ -256,6 +256,8 @@ def test_weights_that_do_not_fit_are_refused() -> None:
         ShapeError, match=r"the weight of episode 1 has shape \(5,\), expected \(4,\) or a scalar"
     ):
         moments(data, State(), weights=[1.0, np.ones(5)])
+    with pytest.raises(DataError, match=r"weights is array\(3\.\); pass one item an episode, or a function"):
+        moments(data, State(), weights=np.array(3.0))
     with pytest.raises(DataError, match="the weight of episode 0 is -1; weights are 0 or above"):
         moments(data, State(), weights=[-1.0, 1.0])
     with pytest.raises(DataError, match="the weight of episode 1 holds 1 NaN or inf"):
