@@ -52,8 +52,8 @@ def _bilinear_mpc(parts: Prepared, limits: Limits) -> Controller:
 
 
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the model itself, the best of four starts: the oracle where the model is the truth."""
-    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=4)
+    """MPC on the model itself, the best of twelve starts: the oracle where the model is the truth."""
+    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
 
 
 CONTROLLERS: dict[str, Build] = {
