@@ -142,7 +142,9 @@ class Solve:
             scale = program.scale[rows]
             lowest = np.minimum(low[rows], room.high[which] * scale)
             highest = np.maximum(high[rows], room.low[which] * scale)
-            past = np.maximum(low[rows] - lowest, highest - high[rows])
+            below, above = lowest < low[rows], highest > high[rows]  # never where there is no limit
+            past = np.where(below, low[rows], 0.0) - np.where(below, lowest, 0.0)
+            past += np.where(above, highest, 0.0) - np.where(above, high[rows], 0.0)
             conflict = float((past / scale)[past > 1e-9].max(initial=0.0))
             low[rows], high[rows] = lowest, highest
             solver.update(low - moved, high - moved)

@@ -51,9 +51,10 @@ def test_every_controller_says_what_the_plan_of_the_problem_breaks(x: list[float
             assert abs(np.abs(mpc.plan().X[1:, 1]).max() - 0.3 - expected) < 1e-4
 
 
-def test_a_rate_that_the_box_overrules_is_told_in_its_unit() -> None:
+@pytest.mark.parametrize("up", [0.5, np.inf])
+def test_a_rate_that_the_box_overrules_is_told_in_its_unit(up: float) -> None:
     """u = 3 was applied, the limit is 1, and the rate allows 0.5: it is exceeded by 1.5."""
-    limits = Limits(-1, 1, du_min=-0.5, du_max=0.5)
+    limits = Limits(-1, 1, du_min=-0.5, du_max=up)
     for mpc in (
         KoopmanMPC(MODEL, COST, limits, N),
         BilinearMPC(MODEL, COST, limits, N),
