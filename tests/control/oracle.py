@@ -1,5 +1,7 @@
 """The whole problem of KoopmanMPC written again in CVXPY, its states, inputs and slacks as variables."""
 
+import warnings
+
 import numpy as np
 
 TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
@@ -83,7 +85,9 @@ def oracle(model, cost, limits, z0, R, targets, *, P, u_prev, W=None, d=None, bl
 
     problem = cp.Problem(cp.Minimize(objective), held)
     try:
-        problem.solve(cp.CLARABEL, **TIGHT)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Solution may be inaccurate", UserWarning)  # its status says so
+            problem.solve(cp.CLARABEL, **TIGHT)
     except cp.error.SolverError:
         return None
     return (U.value, problem.value) if problem.status in ("optimal", "optimal_inaccurate") else None
