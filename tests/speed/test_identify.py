@@ -158,8 +158,8 @@ def cluster(workers: int) -> Iterator[str]:
 
 def test_two_dask_workers_against_one(benchmark, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    for i in range(24):
-        episode = Episode(X=rng.standard_normal((80_001, 8)), U=rng.standard_normal((80_000, 1)))
+    for i in range(12):
+        episode = Episode(X=rng.standard_normal((240_001, 8)), U=rng.standard_normal((240_000, 1)))
         Episodes([episode], 0.1).save(tmp_path / f"{i:02}.npz")
     lifting = State() + Gaussian(rng.standard_normal((92, 8)), 2.0)
     source, pairs = Files(tmp_path), []
