@@ -5,7 +5,7 @@ import shlex
 import shutil
 import sys
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -133,17 +133,13 @@ def fit(
     name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "fit",
 ) -> None:
     """Choose a model for logged data, fit it, and say whether to trust it; no option is needed."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from koopmpc.bench.fit import fit_data
 
     out, err = _console(), Console(stderr=True)
-    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with _friendly():
         folder = _new_folder(logs, name)
         try:
-            with Progress(*columns, console=err, transient=True) as bar:
-                task = bar.add_task("reading", total=None)
+            with _bar("reading") as progress:
                 done = fit_data(
                     data[0] if len(data) == 1 else data,
                     folder,
@@ -156,9 +152,7 @@ def fit(
                     workers=workers,
                     scheduler=scheduler,
                     say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
-                    progress=lambda what, done, total: bar.update(
-                        task, description=what[:40], completed=done, total=total
-                    ),
+                    progress=progress,
                 )
         except KoopmpcError:
             if not any(folder.iterdir()):
@@ -231,8 +225,6 @@ def _sweep(
     what: str,
 ) -> None:
     """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from koopmpc.bench.controllers import chosen
     from koopmpc.bench.results import telling
     from koopmpc.bench.sweep import sweep
@@ -240,18 +232,14 @@ def _sweep(
 
     chosen(controllers)
     folder = _new_folder(logs, what)
-    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
+    with _bar("") as progress:
         rows = sweep(
             problems,
             controllers,
             folder=folder,
             faults=faults,
             live=live,
-            progress=lambda what, done, total: bar.update(
-                task, description=what, completed=done, total=total
-            ),
+            progress=progress,
         )
     out = _console()
     out.print(table(rows))
@@ -283,6 +271,17 @@ def _near(path: str) -> str:
         return min(os.path.relpath(path), path, key=len)
     except ValueError:  # on another drive
         return path
+
+
+@contextmanager
+def _bar(first: str) -> Generator[Callable[[str, int, int | None], None]]:
+    """Show a progress bar on stderr, and hand out what moves it: (what, done, total)."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda what, done, total: bar.update(task, description=what[:40], completed=done, total=total)
 
 
 def _console() -> Console:

@@ -187,7 +187,7 @@ class BilinearMPC(Receding):
         self._iteration.theta[:] = self._map.theta
         self._equilibria.adopt(self._map)
         self._origin.adopt(self._map)
-        self._origin.observer.adopt(self._map)  # pyright: ignore[reportArgumentType]
+        self._origin.observer.adopt(self._map)
         self._reference_key = self._goal = None
 
     def plan(self) -> Plan | None:

@@ -1,7 +1,7 @@
 """Origin: where a plan starts, from what is measured and through the inputs that are still to act."""
 
 from collections import deque
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -10,25 +10,11 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Observer
+from koopmpc.estimate.state import Model
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.linear import LinearPredictor
 
 _VIEWS = ("z", "u_prev", "drive", "W", "d")
-
-
-@runtime_checkable
-class Model(Protocol):
-    """What an origin asks of a model."""
-
-    def advance(
-        self,
-        z: Float[np.ndarray, " nz"],
-        u: Float[np.ndarray, " nu"],
-        w: Float[np.ndarray, " nw"],
-        d: Float[np.ndarray, " nz"],
-    ) -> Float[np.ndarray, " nz"]:
-        """Return z⁺."""
-        ...
 
 
 class Lifted(NamedTuple):

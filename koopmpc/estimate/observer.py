@@ -1,6 +1,6 @@
 """What a controller asks of an estimator: the lifted state z and the disturbance d of z⁺ = A z + B u + d."""
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -35,8 +35,8 @@ class Observer(Protocol):
         """Forget everything; the run starts at x0, where it is known."""
         ...
 
-    def adopt(self, predictor: LinearPredictor) -> None:
-        """Go on with another model of the same lifting."""
+    def adopt(self, predictor: Any) -> None:
+        """Go on with another model, of the kind and the lifting that it was started with."""
         ...
 
     def update(

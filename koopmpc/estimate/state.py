@@ -14,7 +14,22 @@ from koopmpc.estimate.history import history_of
 
 
 @runtime_checkable
-class Map(Protocol):
+class Model(Protocol):
+    """What moves a state, or a lifted one."""
+
+    def advance(
+        self,
+        z: Float[np.ndarray, " nz"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+        d: Float[np.ndarray, " nz"],
+    ) -> Float[np.ndarray, " nz"]:
+        """Return z⁺ = F(z, u) + E w + d."""
+        ...
+
+
+@runtime_checkable
+class Map(Model, Protocol):
     """What an observer asks of a model: nx entries of x, of which the first ny are the plant's states."""
 
     @property
@@ -30,16 +45,6 @@ class Map(Protocol):
     @property
     def embedding(self) -> Delay | None:
         """What makes x of the plant's state and its past."""
-        ...
-
-    def advance(
-        self,
-        z: Float[np.ndarray, " nz"],
-        u: Float[np.ndarray, " nu"],
-        w: Float[np.ndarray, " nw"],
-        d: Float[np.ndarray, " nz"],
-    ) -> Float[np.ndarray, " nz"]:
-        """Return x⁺ = F(x, u) + E w + d."""
         ...
 
 
