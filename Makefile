@@ -5,21 +5,30 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 # One BLAS thread: timings that can be compared, and the same bits on every run.
 PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+PYTEST := $(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable
+TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
 
-.PHONY: bench test full speed check format clean
+.PHONY: bench test typed full loops speed check format clean
 
 bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
 
+# What users run, with every QP checked against its KKT conditions.
 test: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable --cov --cov-report=term
+	$(PYTEST)
+
+# The same tests with shapes checked by the type hook, and coverage.
+typed: $(VENV)/installed-dev
+	$(TYPED)
 
 full: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable -m "(slow or not slow) and not speed" --cov --cov-report=term
+	$(TYPED) -m "(slow or not slow) and not speed and not loops"
+
+loops: $(VENV)/installed-dev
+	$(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m loops tests/closed_loop
 
 speed: $(VENV)/installed-dev
-	KOOPMPC_NO_TYPE_HOOK=1 $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
-
+	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .

@@ -1,275 +1,184 @@
 """koopmpc: from a CasADi model, or only data, to a constrained controller with a lifted linear predictor.
 
-This file is the table of contents; see README.md for ten lines that use it.
+This file is the table of contents: names of daily work here, the rest one level down in `km.faults`, `km.plot`,
+`km.scene`, `km.validate`, `km.spectrum`, `km.moments` and `km.errors`. A name is imported when it is first asked for
+(PEP 562).
+README.md has ten lines that use it.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from koopmpc.bench.library import list_problems, load_problem
-from koopmpc.bench.problem import Case, Problem, Training
-from koopmpc.bench.sweep import sweep
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.control.linear_mpc import LinearMPC
-from koopmpc.control.lqr import LQR
-from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.control.riccati import Gain, dlqr, lqr
-from koopmpc.data.collect import Uniform, collect
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes, Snapshots
-from koopmpc.data.excitation import PRBS, Chirp, Feedback, Multisine, Noise
-from koopmpc.data.folder import Files
-from koopmpc.data.source import Source
-from koopmpc.data.storage import load_episodes
-from koopmpc.data.stream import Stream
-from koopmpc.errors import (
-    DataError,
-    DefinitenessError,
-    FitWarning,
-    KoopmpcError,
-    LogError,
-    ObservableError,
-    ProblemError,
-    ShapeError,
-)
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.estimate.kalman import LiftedKalman
-from koopmpc.estimate.observer import Estimator
-from koopmpc.identify.bilinear import bilinear_edmd
-from koopmpc.identify.candidates import Candidate
-from koopmpc.identify.constrained import constrained_edmd
-from koopmpc.identify.coverage import Coverage, coverage
-from koopmpc.identify.dmd import dmd, dmdc
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.excitation import Persistency, feedback_share, persistency
-from koopmpc.identify.gather import moments
-from koopmpc.identify.invariance import Invariance, invariance
-from koopmpc.identify.moments import Moments
-from koopmpc.identify.online import OnlineEDMD
-from koopmpc.identify.prior import Combination, Prior, Storage
-from koopmpc.identify.residual_dmd import ResidualDMD, residual_dmd
-from koopmpc.identify.select import select
-from koopmpc.identify.selection import Selection
-from koopmpc.identify.sparse import sparse_edmd
-from koopmpc.identify.stable import stable_edmd
-from koopmpc.identify.trust import TrustReport, trust
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.gaussian import Gaussian
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.random_fourier import RandomFourier
-from koopmpc.lifting.standardized import Standardized
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
-from koopmpc.loop.faults import (
-    ActuatorDelay,
-    ActuatorLoss,
-    DroppedSamples,
-    FrozenSensor,
-    NaNSensor,
-    SensorDelay,
-    SolverFailure,
-)
-from koopmpc.loop.injection import Fault, Injection
-from koopmpc.loop.metrics import Metrics, metrics
-from koopmpc.loop.run import Plans, Run
-from koopmpc.loop.simulate import Step, simulate
-from koopmpc.plant.dynamics import Dynamics
-from koopmpc.plant.integrators import CVODES, RK4, Collocation, Euler, ImplicitMidpoint
-from koopmpc.plant.simulated import Plant, SimulatedPlant
-from koopmpc.plant.step_map import Affine, StepMap, discretize
-from koopmpc.predict.bilinear import BilinearPredictor, load_bilinear_predictor
-from koopmpc.predict.conformal import ConformalBand, conformal
-from koopmpc.predict.evolution import evolution_error
-from koopmpc.predict.linear import LinearPredictor, load_predictor
-from koopmpc.predict.report import FitReport
-from koopmpc.predict.score import Score, score
-from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
-from koopmpc.recording.episodes import run_episodes
-from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder, record
-from koopmpc.recording.scene import Box, Disk, Line
-from koopmpc.recording.viewer import view
+from koopmpc.lazy import attach
 
-if TYPE_CHECKING:
-    from koopmpc.figures.eigenfunctions import plot_eigenfunctions
-    from koopmpc.figures.error import plot_error
-    from koopmpc.figures.reconstruction import plot_reconstruction
-    from koopmpc.figures.runs import plot_runs
-    from koopmpc.figures.series import plot_rollout, plot_run
-    from koopmpc.figures.spectrum import plot_spectrum
-    from koopmpc.figures.style import save as save_figure
-    from koopmpc.identify.regressor import KoopmanRegressor as KoopmanRegressor
-    from koopmpc.recording.model import record_model
-
-_LATER = {  # imported when they are asked for: what draws, and what needs an extra
-    "KoopmanRegressor": ("koopmpc.identify.regressor", "KoopmanRegressor"),
-    "plot_eigenfunctions": ("koopmpc.figures.eigenfunctions", "plot_eigenfunctions"),
-    "plot_error": ("koopmpc.figures.error", "plot_error"),
-    "plot_reconstruction": ("koopmpc.figures.reconstruction", "plot_reconstruction"),
-    "plot_rollout": ("koopmpc.figures.series", "plot_rollout"),
-    "plot_run": ("koopmpc.figures.series", "plot_run"),
-    "plot_runs": ("koopmpc.figures.runs", "plot_runs"),
-    "plot_spectrum": ("koopmpc.figures.spectrum", "plot_spectrum"),
-    "record_model": ("koopmpc.recording.model", "record_model"),
-    "save_figure": ("koopmpc.figures.style", "save"),
-}
-
-__all__ = [
-    "CVODES",
-    "LQR",
-    "PRBS",
-    "RK4",
-    "ActuatorDelay",
-    "ActuatorLoss",
-    "Affine",
-    "BilinearMPC",
-    "BilinearPredictor",
-    "Box",
-    "Candidate",
-    "Case",
-    "Chirp",
-    "Collocation",
-    "Combination",
-    "ConformalBand",
-    "Constant",
-    "Controller",
-    "Cost",
-    "Coverage",
-    "DataError",
-    "DefinitenessError",
-    "Delay",
-    "Disk",
-    "DroppedSamples",
-    "Dynamics",
-    "Episode",
-    "Episodes",
-    "Estimator",
-    "Euler",
-    "Expressions",
-    "Fallback",
-    "Fault",
-    "Feedback",
-    "Files",
-    "FitReport",
-    "FitWarning",
-    "Fourier",
-    "FrozenSensor",
-    "Gain",
-    "Gaussian",
-    "ImplicitMidpoint",
-    "Injection",
-    "Invariance",
-    "KoopmanMPC",
-    "KoopmpcError",
-    "LiftedDisturbance",
-    "LiftedKalman",
-    "Lifting",
-    "Limits",
-    "Line",
-    "LinearMPC",
-    "LinearPredictor",
-    "LogError",
-    "Metrics",
-    "Moments",
-    "Monomials",
-    "Move",
-    "Multisine",
-    "NaNSensor",
-    "Noise",
-    "NonlinearMPC",
-    "ObservableError",
-    "OnlineEDMD",
-    "Persistency",
-    "Plan",
-    "Plans",
-    "Plant",
-    "Prior",
-    "Problem",
-    "ProblemError",
-    "RandomFourier",
-    "Recorder",
-    "ResidualDMD",
-    "Run",
-    "Score",
-    "Selection",
-    "SensorDelay",
-    "ShapeError",
-    "SimulatedPlant",
-    "Snapshots",
-    "SolverFailure",
-    "Source",
-    "Standardized",
-    "State",
-    "Status",
-    "Step",
-    "StepMap",
-    "Storage",
-    "Stream",
-    "ThinPlate",
-    "Training",
-    "TrustReport",
-    "Uniform",
-    "amplitudes",
-    "bilinear_edmd",
-    "collect",
-    "conformal",
-    "constrained_edmd",
-    "continuous_eigenvalues",
-    "coverage",
-    "discretize",
-    "dlqr",
-    "dmd",
-    "dmdc",
-    "edmd",
-    "evolution_error",
-    "feedback_share",
-    "invariance",
-    "linearity_error",
-    "list_problems",
-    "load_bilinear_predictor",
-    "load_episodes",
-    "load_predictor",
-    "load_problem",
-    "load_run",
-    "lqr",
-    "metrics",
-    "moments",
-    "persistency",
-    "plot_eigenfunctions",
-    "plot_error",
-    "plot_reconstruction",
-    "plot_rollout",
-    "plot_run",
-    "plot_runs",
-    "plot_spectrum",
-    "reconstruct",
-    "record",
-    "record_model",
-    "residual_dmd",
-    "run_episodes",
-    "save_figure",
-    "score",
-    "select",
-    "simulate",
-    "sparse_edmd",
-    "stable_edmd",
-    "sweep",
-    "trust",
-    "view",
-]
-
-
-def __getattr__(name: str) -> Any:
-    """Return what is imported only when it is asked for."""
-    if name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, attribute = _LATER[name]
-    found = globals()[name] = getattr(import_module(module), attribute)
-    return found
+if TYPE_CHECKING:  # the same table for type checkers and editors; a test compares the two
+    from koopmpc import bench as bench
+    from koopmpc import control as control
+    from koopmpc import data as data
+    from koopmpc import errors as errors
+    from koopmpc import estimate as estimate
+    from koopmpc import identify as identify
+    from koopmpc import loop as loop
+    from koopmpc import plants as plants
+    from koopmpc import predict as predict
+    from koopmpc import recording as recording
+    from koopmpc import scene as scene
+    from koopmpc import synthesis as synthesis
+    from koopmpc import validate as validate
+    from koopmpc.bench.library import load_problem as load_problem
+    from koopmpc.bench.problem import Case as Case
+    from koopmpc.bench.problem import Problem as Problem
+    from koopmpc.bench.problem import Training as Training
+    from koopmpc.bench.sweep import sweep as sweep
+    from koopmpc.control.cost import Cost as Cost
+    from koopmpc.control.limits import Limits as Limits
+    from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
+    from koopmpc.control.linear.linear_mpc import LinearMPC as LinearMPC
+    from koopmpc.control.lqr import LQR as LQR
+    from koopmpc.control.move import Move as Move
+    from koopmpc.control.move import Status as Status
+    from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC as BilinearMPC
+    from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC as NonlinearMPC
+    from koopmpc.control.riccati import dlqr as dlqr
+    from koopmpc.control.riccati import lqr as lqr
+    from koopmpc.data.collect import Uniform as Uniform
+    from koopmpc.data.collect import collect as collect
+    from koopmpc.data.delay import Delay as Delay
+    from koopmpc.data.episodes import Episode as Episode
+    from koopmpc.data.episodes import Episodes as Episodes
+    from koopmpc.data.excitation import PRBS as PRBS
+    from koopmpc.data.excitation import Chirp as Chirp
+    from koopmpc.data.excitation import Feedback as Feedback
+    from koopmpc.data.excitation import Multisine as Multisine
+    from koopmpc.data.excitation import Noise as Noise
+    from koopmpc.data.files.folder import Files as Files
+    from koopmpc.data.files.storage import load_episodes as load_episodes
+    from koopmpc.data.source import Stream as Stream
+    from koopmpc.errors import FitWarning as FitWarning
+    from koopmpc.errors import KoopmpcError as KoopmpcError
+    from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
+    from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
+    from koopmpc.figures import plot as plot
+    from koopmpc.identify import moments as moments
+    from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
+    from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
+    from koopmpc.identify.fits.dmd import dmd as dmd
+    from koopmpc.identify.fits.dmd import dmdc as dmdc
+    from koopmpc.identify.fits.edmd import edmd as edmd
+    from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
+    from koopmpc.identify.fits.prior import Prior as Prior
+    from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
+    from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
+    from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
+    from koopmpc.lifting.base import Lifting as Lifting
+    from koopmpc.lifting.expressions import Expressions as Expressions
+    from koopmpc.lifting.fourier import Fourier as Fourier
+    from koopmpc.lifting.monomials import Monomials as Monomials
+    from koopmpc.lifting.radial import Gaussian as Gaussian
+    from koopmpc.lifting.radial import ThinPlate as ThinPlate
+    from koopmpc.lifting.random_fourier import RandomFourier as RandomFourier
+    from koopmpc.lifting.standardized import Standardized as Standardized
+    from koopmpc.lifting.state import Constant as Constant
+    from koopmpc.lifting.state import State as State
+    from koopmpc.loop import faults as faults
+    from koopmpc.loop.metrics import metrics as metrics
+    from koopmpc.loop.run import Run as Run
+    from koopmpc.loop.simulate import simulate as simulate
+    from koopmpc.plants.dynamics import Dynamics as Dynamics
+    from koopmpc.plants.integrators import CVODES as CVODES
+    from koopmpc.plants.integrators import RK4 as RK4
+    from koopmpc.plants.integrators import Collocation as Collocation
+    from koopmpc.plants.integrators import Euler as Euler
+    from koopmpc.plants.integrators import ImplicitMidpoint as ImplicitMidpoint
+    from koopmpc.plants.simulated import Plant as Plant
+    from koopmpc.plants.step_map import StepMap as StepMap
+    from koopmpc.plants.step_map import discretize as discretize
+    from koopmpc.predict import spectrum as spectrum
+    from koopmpc.predict.bilinear import BilinearPredictor as BilinearPredictor
+    from koopmpc.predict.bilinear import load_model as load_model
+    from koopmpc.predict.linear import LinearPredictor as LinearPredictor
+    from koopmpc.recording.format.reader import load_run as load_run
+    from koopmpc.recording.recorder import Recorder as Recorder
+    from koopmpc.recording.recorder import record as record
+    from koopmpc.recording.viewer import view as view
+    from koopmpc.synthesis.select import select as select
+    from koopmpc.validate.report import trust as trust
+    from koopmpc.validate.scoring import score as score
+else:
+    __getattr__, __dir__, __all__ = attach(
+        __name__,
+        {
+            "bench.library": "load_problem",
+            "bench.problem": "Case Problem Training",
+            "bench.sweep": "sweep",
+            "control.cost": "Cost",
+            "control.limits": "Limits",
+            "control.linear.koopman_mpc": "KoopmanMPC",
+            "control.linear.linear_mpc": "LinearMPC",
+            "control.lqr": "LQR",
+            "control.move": "Move Status",
+            "control.nonlinear.bilinear_mpc": "BilinearMPC",
+            "control.nonlinear.nonlinear_mpc": "NonlinearMPC",
+            "control.riccati": "dlqr lqr",
+            "data.collect": "Uniform collect",
+            "data.delay": "Delay",
+            "data.episodes": "Episode Episodes",
+            "data.excitation": "PRBS Chirp Feedback Multisine Noise",
+            "data.files.folder": "Files",
+            "data.files.storage": "load_episodes",
+            "data.source": "Stream",
+            "errors": "FitWarning KoopmpcError",
+            "estimate.disturbance": "LiftedDisturbance",
+            "estimate.kalman": "LiftedKalman",
+            "identify.fits.bilinear": "bilinear_edmd",
+            "identify.fits.constrained": "constrained_edmd",
+            "identify.fits.dmd": "dmd dmdc",
+            "identify.fits.edmd": "edmd",
+            "identify.fits.online": "OnlineEDMD",
+            "identify.fits.prior": "Prior",
+            "identify.fits.regressor": "KoopmanRegressor",
+            "identify.fits.sparse": "sparse_edmd",
+            "identify.fits.stable": "stable_edmd",
+            "lifting.base": "Lifting",
+            "lifting.expressions": "Expressions",
+            "lifting.fourier": "Fourier",
+            "lifting.monomials": "Monomials",
+            "lifting.radial": "Gaussian ThinPlate",
+            "lifting.random_fourier": "RandomFourier",
+            "lifting.standardized": "Standardized",
+            "lifting.state": "Constant State",
+            "loop.metrics": "metrics",
+            "loop.run": "Run",
+            "loop.simulate": "simulate",
+            "plants.dynamics": "Dynamics",
+            "plants.integrators": "CVODES RK4 Collocation Euler ImplicitMidpoint",
+            "plants.simulated": "Plant",
+            "plants.step_map": "StepMap discretize",
+            "predict.bilinear": "BilinearPredictor load_model",
+            "predict.linear": "LinearPredictor",
+            "recording.format.reader": "load_run",
+            "recording.recorder": "Recorder record",
+            "recording.viewer": "view",
+            "synthesis.select": "select",
+            "validate.report": "trust",
+            "validate.scoring": "score",
+        },
+        modules={
+            "bench": "bench",
+            "control": "control",
+            "data": "data",
+            "estimate": "estimate",
+            "identify": "identify",
+            "loop": "loop",
+            "plants": "plants",
+            "predict": "predict",
+            "recording": "recording",
+            "synthesis": "synthesis",
+            "errors": "errors",
+            "faults": "loop.faults",
+            "moments": "identify.moments",
+            "plot": "figures.plot",
+            "scene": "scene",
+            "spectrum": "predict.spectrum",
+            "validate": "validate",
+        },
+    )

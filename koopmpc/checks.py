@@ -1,7 +1,8 @@
 """The one place that words messages about shapes, dtypes, NaN, definiteness and paths."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -57,18 +58,14 @@ def array(
             f"{name} is not an array of numbers: got {type(value).__name__}, {error}; pass numbers of one shape"
         ) from error
     if shape is not None and shape != result.shape:
-        fits = len(shape) == result.ndim and all(
-            n is None or n == m for n, m in zip(shape, result.shape, strict=True)
-        )
+        fits = len(shape) == result.ndim and all(n is None or n == m for n, m in zip(shape, result.shape, strict=True))
         if not fits:
             raise ShapeError(f"{name} has shape {result.shape}, expected {_written(shape)}")
     if finite and not np.isfinite(result).all():
         if not infinite:
             bad = np.argwhere(~np.isfinite(result))
             where = tuple(int(i) for i in bad[0])
-            raise DataError(
-                f"{name} holds {len(bad)} NaN or inf, the first at {where}; remove or repair them first"
-            )
+            raise DataError(f"{name} holds {len(bad)} NaN or inf, the first at {where}; remove or repair them first")
         if np.isnan(result).any():
             raise DataError(f"{name} holds NaN; use ±inf where there is no limit")
     return result
@@ -84,9 +81,7 @@ def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) 
     return result
 
 
-def weight(
-    value: ArrayLike, name: str, size: int | None = None, *, definite: bool = False
-) -> Float[np.ndarray, "n n"]:
+def weight(value: ArrayLike, name: str, size: int | None = None, *, definite: bool = False) -> Float[np.ndarray, "n n"]:
     """Return a symmetric positive (semi)definite matrix; a scalar or a 1-D `value` is a diagonal."""
     result = array(value, name)
     got = result.shape
@@ -104,13 +99,9 @@ def weight(
     result = 0.5 * (result + result.T)
     smallest = float(np.linalg.eigvalsh(result).min(initial=np.inf))
     if smallest < -1e-9 * scale:
-        raise DefinitenessError(
-            f"{name} is indefinite: its least eigenvalue is {smallest:.3g}; weights must be ⪰ 0"
-        )
+        raise DefinitenessError(f"{name} is indefinite: its least eigenvalue is {smallest:.3g}; weights must be ⪰ 0")
     if definite and smallest <= 0:
-        raise DefinitenessError(
-            f"{name} is not positive definite: its least eigenvalue is {smallest:.3g}; raise it"
-        )
+        raise DefinitenessError(f"{name} is not positive definite: its least eigenvalue is {smallest:.3g}; raise it")
     return result
 
 
@@ -192,3 +183,9 @@ def writing(path: str | PathLike[str], mode: str = "wb") -> Generator[BinaryIO]:
 def _written(shape: Sequence[int | None]) -> str:
     sizes = ["any" if n is None else str(n) for n in shape]
     return "(" + ", ".join(sizes) + (",)" if len(sizes) == 1 else ")")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return ``", did you mean 'pendulum'?"`` for the known name nearest to `name`; empty where none is near."""
+    close = get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f", did you mean {close[0]!r}?" if close else ""

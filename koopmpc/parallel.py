@@ -30,9 +30,7 @@ _PATIENCE = 30.0  # [s] without any Dask worker
 _ANSWER = 10.0  # [s] for a Dask scheduler to answer
 _ANY_PORT = "127.0.0.1:0"
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-_GUARD = (
-    'put what the script runs under `if __name__ == "__main__":`, for each worker imports the script first'
-)
+_GUARD = 'put what the script runs under `if __name__ == "__main__":`, for each worker imports the script first'
 
 
 def map_tasks(
@@ -112,9 +110,7 @@ class _Worker:
     ready: bool = False
 
 
-def _on_processes(
-    function: Callable[[Task], Result], tasks: Iterator[Task], workers: int
-) -> Generator[Result]:
+def _on_processes(function: Callable[[Task], Result], tasks: Iterator[Task], workers: int) -> Generator[Result]:
     """Yield the results of `workers` processes in order."""
     fresh = (_Job(i, task) for i, task in enumerate(tasks))
     waiting = deque(islice(fresh, workers))
@@ -171,9 +167,7 @@ def _answered(worker: _Worker, done: dict[int, tuple[bool, Any]], waiting: deque
         _dismiss(worker)
         job.deaths += 1
         if job.deaths == _TRIES:
-            raise KoopmpcError(
-                _died(str(job), f"{_TRIES} times, exit code {worker.process.exitcode}")
-            ) from error
+            raise KoopmpcError(_died(str(job), f"{_TRIES} times, exit code {worker.process.exitcode}")) from error
         waiting.appendleft(job)
         return False
     return True
@@ -269,9 +263,7 @@ def _address(scheduler: str, workers: int | None) -> str:
         if scheduler != "local" and workers is not None:
             raise DataError(f"the cluster at {scheduler} has its own workers; leave out workers={workers}")
         return scheduler
-    raise DataError(
-        f'scheduler is {scheduler!r}; pass "local", or the address "tcp://host:port" of a Dask scheduler'
-    )
+    raise DataError(f'scheduler is {scheduler!r}; pass "local", or the address "tcp://host:port" of a Dask scheduler')
 
 
 def _on_dask(

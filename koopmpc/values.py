@@ -96,9 +96,7 @@ def to_data(value: Any, arrays: Arrays | None = None) -> Any:
             items = cast("dict[Any, Any]", value)
             return {"kind": "dict", "items": [[str(k), to_data(v, arrays)] for k, v in items.items()]}
         case _:
-            raise DataError(
-                f"a {type(value).__name__} cannot be saved as data; use numbers, names and arrays"
-            )
+            raise DataError(f"a {type(value).__name__} cannot be saved as data; use numbers, names and arrays")
 
 
 def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Sequence[type[Enum]] = ()) -> Any:

@@ -40,17 +40,17 @@ class CartPole(km.Dynamics):
 cart_pole = CartPole()
 
 
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
+def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
     """Draw the rail with a tick at each metre, the cart, the pole, and the force as a bar of 1 m for 40 N."""
     position, theta, L = float(x[0]), float(x[2]), cart_pole.L
     tip = (position + L * float(np.sin(theta)), -L * float(np.cos(theta)))
     ticks = [(float(metre), depth) for metre in range(-3, 8) for depth in (-0.2, -0.35, -0.2)]
     return [
-        km.Line("rail", ticks, width=0.03, color=(150, 160, 170)),
-        km.Box("cart", (position, 0.0), (0.8, 0.4)),
-        km.Line("pole", [(position, 0.0), tip], width=0.06, color=(120, 130, 150)),
-        km.Disk("tip", tip, 0.14),
-        km.Line(
+        km.scene.Line("rail", ticks, width=0.03, color=(150, 160, 170)),
+        km.scene.Box("cart", (position, 0.0), (0.8, 0.4)),
+        km.scene.Line("pole", [(position, 0.0), tip], width=0.06, color=(120, 130, 150)),
+        km.scene.Disk("tip", tip, 0.14),
+        km.scene.Line(
             "force", [(position, 0.0), (position + float(u[0]) / 40.0, 0.0)], width=0.08, color=(40, 120, 200)
         ),
     ]
@@ -64,9 +64,7 @@ problem = km.Problem(
     # that limit the pole falls from many of these starts, and data of falling spoil the fit.
     training=km.Training(
         x0=km.Uniform([-2.0, -1.0, np.pi - 0.7, -0.7], [2.0, 1.0, np.pi + 0.7, 0.7]),
-        excitation=km.Feedback(
-            [[-2.2, -8.0, 176.0, 75.0]], km.Noise(-10.0, 10.0), x_ref=[0.0, 0.0, np.pi, 0.0]
-        ),
+        excitation=km.Feedback([[-2.2, -8.0, 176.0, 75.0]], km.Noise(-10.0, 10.0), x_ref=[0.0, 0.0, np.pi, 0.0]),
         episodes=300,
         steps=60,
     ),

@@ -50,17 +50,17 @@ names = [f"omega^{n} {f}({k} theta)" for n in (1, 2) for k in HARMONICS for f in
 tracked = ("position [m]", "velocity [m/s]", "sin(theta)", "cos(theta)", "omega [rad/s]")
 
 
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
+def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
     """Draw the rail with its ends, the cart, the pole, and the force as a bar of 1 m for 12 N."""
     position, theta, L = float(x[0]), float(x[2]), cart_pole.L
     tip = (position + L * float(np.sin(theta)), L * float(np.cos(theta)))
     rail = [(-2.4, 0.15), (-2.4, -0.1), (2.4, -0.1), (2.4, 0.15)]
     return [
-        km.Line("rail", rail, width=0.02, color=(150, 160, 170)),
-        km.Box("cart", (position, 0.0), (0.3, 0.15)),
-        km.Line("pole", [(position, 0.0), tip], width=0.03, color=(120, 130, 150)),
-        km.Disk("tip", tip, 0.05),
-        km.Line(
+        km.scene.Line("rail", rail, width=0.02, color=(150, 160, 170)),
+        km.scene.Box("cart", (position, 0.0), (0.3, 0.15)),
+        km.scene.Line("pole", [(position, 0.0), tip], width=0.03, color=(120, 130, 150)),
+        km.scene.Disk("tip", tip, 0.05),
+        km.scene.Line(
             "force", [(position, 0.0), (position + float(u[0]) / 12.0, 0.0)], width=0.04, color=(40, 120, 200)
         ),
     ]
@@ -83,9 +83,7 @@ problem = km.Problem(
     cost=km.Cost(
         Q=[1.0, 0.1, 5.0, 5.0, 0.1],
         R=0.01,
-        of=km.Expressions(lambda x: [x[0], x[1], ca.sin(x[2]), ca.cos(x[2]), x[3]], tracked).bind(
-            CartPole.states
-        ),
+        of=km.Expressions(lambda x: [x[0], x[1], ca.sin(x[2]), ca.cos(x[2]), x[3]], tracked).bind(CartPole.states),
     ),
     limits=km.Limits(
         u_min=-12.0,

@@ -48,18 +48,18 @@ def products(x: ca.SX) -> list[ca.SX]:
 names = ["omega sin(theta)", "omega cos(theta)", "omega sin(2 theta)", "omega cos(2 theta)", "omega²"]
 
 
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
+def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
     """Draw the rod, the bob, the pivot, the place to be, and the torque as an arc."""
     theta, L = float(x[0]), pendulum.L
     bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
     sweep = np.linspace(0.0, float(np.clip(u[0] / 25.0, -1.0, 1.0)) * np.pi, 24)
     arc = [(0.5 * float(np.sin(a)), 0.5 * float(np.cos(a))) for a in sweep]
     return [
-        km.Disk("target", (0.0, L), 0.2, color=(200, 215, 200)),
-        km.Line("rod", [(0.0, 0.0), bob], width=0.05),
-        km.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
-        km.Disk("bob", bob, 0.16),
-        km.Line("torque", arc, width=0.05, color=(40, 120, 200)),
+        km.scene.Disk("target", (0.0, L), 0.2, color=(200, 215, 200)),
+        km.scene.Line("rod", [(0.0, 0.0), bob], width=0.05),
+        km.scene.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
+        km.scene.Disk("bob", bob, 0.16),
+        km.scene.Line("torque", arc, width=0.05, color=(40, 120, 200)),
     ]
 
 
@@ -80,9 +80,7 @@ problem = km.Problem(
     horizon=40,
     cases={
         "upright": km.Case(x0=[np.pi / 4, 0.0], reference=[0.0, 0.0], steps=200),
-        "hang": km.Case(
-            x0=[np.pi, 0.0], reference=[0.0, 0.0], steps=300, limits=km.Limits(u_min=-10.0, u_max=10.0)
-        ),
+        "hang": km.Case(x0=[np.pi, 0.0], reference=[0.0, 0.0], steps=300, limits=km.Limits(u_min=-10.0, u_max=10.0)),
         # 17 N m hold the bob there, which weighs a fifth more than anybody was told
         "hold": km.Case(x0=[np.pi / 4, 0.0], reference=[0.8, 0.0], steps=200, plant=Pendulum(m=1.2)),
     },

@@ -45,18 +45,18 @@ names = [f"omega^{n} {f}({k} theta)" for n in (1, 2) for k in (1, 2) for f in ("
 tracked = ("sin(theta)", "cos(theta)", "omega [rad/s]")
 
 
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.Line | km.Box | km.Disk]:
+def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
     """Draw the rod, the bob, the pivot, the place to be, and the torque as an arc."""
     theta, L = float(x[0]), pendulum.L
     bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
     sweep = np.linspace(0.0, float(np.clip(u[0] / 10.0, -1.0, 1.0)) * np.pi, 24)
     arc = [(0.5 * float(np.sin(a)), 0.5 * float(np.cos(a))) for a in sweep]
     return [
-        km.Disk("target", (0.0, L), 0.2, color=(200, 215, 200)),
-        km.Line("rod", [(0.0, 0.0), bob], width=0.05),
-        km.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
-        km.Disk("bob", bob, 0.16),
-        km.Line("torque", arc, width=0.05, color=(40, 120, 200)),
+        km.scene.Disk("target", (0.0, L), 0.2, color=(200, 215, 200)),
+        km.scene.Line("rod", [(0.0, 0.0), bob], width=0.05),
+        km.scene.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
+        km.scene.Disk("bob", bob, 0.16),
+        km.scene.Line("torque", arc, width=0.05, color=(40, 120, 200)),
     ]
 
 
@@ -70,10 +70,7 @@ problem = km.Problem(
         episodes=2000,
         steps=10,
     ),
-    lifting=km.State()
-    + km.Fourier(2, states="theta")
-    + km.Expressions(products, [*names, "omega^2"])
-    + km.Constant(),
+    lifting=km.State() + km.Fourier(2, states="theta") + km.Expressions(products, [*names, "omega^2"]) + km.Constant(),
     cost=km.Cost(
         Q=[5.0, 5.0, 0.1],
         R=0.01,

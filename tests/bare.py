@@ -18,7 +18,7 @@ def show(call):
 
 def shown(code):
     """Return what `show(call)` prints for each call of `code`, line by line."""
-    environment = {**os.environ, "KOOPMPC_NO_TYPE_HOOK": "1"}
+    environment = {**os.environ, "KOOPMPC_TESTS": "bare"}
     done = subprocess.run(
         [sys.executable, "-c", PRELUDE + code], capture_output=True, text=True, check=True, env=environment
     )

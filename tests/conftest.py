@@ -1,6 +1,7 @@
-"""Tests run with every jaxtyping shape checked, and every QP that one solves against its KKT conditions.
+"""Tests run what users run, and check every QP that a controller solves against its KKT conditions.
 
-The hook must come before the first import of koopmpc. tests/speed measures what users run, without either.
+With KOOPMPC_TESTS=typed every jaxtyping shape is checked too; that hook must come before the first import of koopmpc.
+With KOOPMPC_TESTS=bare nothing is checked: tests/speed measures what users run.
 """
 
 import os
@@ -14,8 +15,8 @@ from jaxtyping import install_import_hook
 
 import tests.typecheck  # noqa: F401  # the hook looks it up by name
 
-CHECKED = not os.environ.get("KOOPMPC_NO_TYPE_HOOK")
-if CHECKED:
+MODE = os.environ.get("KOOPMPC_TESTS", "")
+if MODE == "typed":
     install_import_hook("koopmpc", "tests.typecheck.beartyped")
 
 settings.register_profile("default", deadline=None, max_examples=30, derandomize=True)
@@ -24,7 +25,7 @@ settings.load_profile("default")
 
 @pytest.fixture(autouse=True, scope="session")
 def _every_qp_meets_kkt():
-    if not CHECKED:
+    if MODE == "bare":
         yield
         return
     import koopmpc.control.target

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.storage import load_episodes
-from koopmpc.errors import DataError
+import koopmpc as km
 
 
 def square(x: int) -> int:
@@ -35,7 +33,7 @@ def die_once(task: tuple[str, int]) -> int:
 
 def fail(i: int) -> int:
     if i == 1:
-        raise DataError("the second task is wrong")
+        raise km.errors.DataError("the second task is wrong")
     return i
 
 
@@ -54,14 +52,14 @@ def unsendable(_: int) -> object:
     return lambda: 0
 
 
-def dying_reader(path: Path) -> Episodes:
+def dying_reader(path: Path) -> km.Episodes:
     """Read the file; kill the worker that reads 1.npz the first time."""
     mark = path.with_suffix(".died")
     if path.name == "1.npz" and not mark.exists():
         mark.touch()
         die(path)
-    return load_episodes(path)
+    return km.load_episodes(path)
 
 
-def by_first_state(episode: Episode) -> float:
+def by_first_state(episode: km.Episode) -> float:
     return float(np.abs(episode.X[0, 0]))

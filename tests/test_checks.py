@@ -27,35 +27,35 @@ def test_other_numbers_are_numbers():
 
 def test_arrays():
     for value, kwargs, error, text in (
-        (np.zeros(3), {"shape": (2,)}, km.ShapeError, r"x0 has shape \(3,\), expected \(2,\)"),
+        (np.zeros(3), {"shape": (2,)}, km.errors.ShapeError, r"x0 has shape \(3,\), expected \(2,\)"),
         (
             np.zeros((3, 2)),
             {"shape": (None, 4)},
-            km.ShapeError,
+            km.errors.ShapeError,
             r"x0 has shape \(3, 2\), expected \(any, 4\)",
         ),
-        ([1, 2], {"shape": ()}, km.ShapeError, r"x0 has shape \(2,\), expected \(\)"),
+        ([1, 2], {"shape": ()}, km.errors.ShapeError, r"x0 has shape \(2,\), expected \(\)"),
         (
             [[0, 1], [np.nan, np.inf]],
             {},
-            km.DataError,
+            km.errors.DataError,
             r"x0 holds 2 NaN or inf, the first at \(1, 0\); remove or repair",
         ),
         (
             [np.inf, np.nan],
             {"infinite": True},
-            km.DataError,
+            km.errors.DataError,
             r"x0 holds NaN; use ±inf where there is no limit",
         ),
-        ([1j], {}, km.DataError, r"x0 is complex; pass real numbers"),
+        ([1j], {}, km.errors.DataError, r"x0 is complex; pass real numbers"),
         (
             [[1], [1, 2]],
             {},
-            km.DataError,
+            km.errors.DataError,
             r"x0 is not an array of numbers: got list, .*; pass numbers of one shape",
         ),
-        ("12", {}, km.DataError, r"x0 is not an array of numbers: got str, None and text are no numbers"),
-        ([1, None], {}, km.DataError, r"x0 is not an array of numbers: got list, None and text"),
+        ("12", {}, km.errors.DataError, r"x0 is not an array of numbers: got str, None and text are no numbers"),
+        ([1, None], {}, km.errors.DataError, r"x0 is not an array of numbers: got list, None and text"),
     ):
         with pytest.raises(error, match=text):
             checks.array(value, "x0", **kwargs)
@@ -67,7 +67,7 @@ def test_vectors():
     np.testing.assert_array_equal(checks.vector(2, "u", 3), [2, 2, 2])
     np.testing.assert_array_equal(checks.vector([1, 2], "u", 2), [1, 2])
     for wrong in ([1, 2], [[1, 2, 3]], [1]):
-        with pytest.raises(km.ShapeError, match=r"u has shape \(.*\), expected \(3,\) or a scalar"):
+        with pytest.raises(km.errors.ShapeError, match=r"u has shape \(.*\), expected \(3,\) or a scalar"):
             checks.vector(wrong, "u", 3)
 
 
@@ -76,22 +76,22 @@ def test_weights():
     np.testing.assert_array_equal(checks.weight([1, 2], "Q"), np.diag([1, 2]))
     checks.weight(np.zeros((2, 2)), "Q")
     for value, kwargs, error, text in (
-        ([1, 2, 3], {"size": 2}, km.ShapeError, r"Q has shape \(3,\), expected \(2, 2\) or its diagonal"),
-        (np.eye(3), {"size": 2}, km.ShapeError, r"Q has shape \(3, 3\), expected \(2, 2\) or its diagonal"),
+        ([1, 2, 3], {"size": 2}, km.errors.ShapeError, r"Q has shape \(3,\), expected \(2, 2\) or its diagonal"),
+        (np.eye(3), {"size": 2}, km.errors.ShapeError, r"Q has shape \(3, 3\), expected \(2, 2\) or its diagonal"),
         (
             np.ones((1, 2)),
             {},
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q has shape \(1, 2\), expected a square matrix or its diagonal",
         ),
-        ([[1, 1e-3], [0, 1]], {}, km.DefinitenessError, r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"),
+        ([[1, 1e-3], [0, 1]], {}, km.errors.DefinitenessError, r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"),
         (
             [[1, 2], [2, 1]],
             {},
-            km.DefinitenessError,
+            km.errors.DefinitenessError,
             r"Q is indefinite: its least eigenvalue is -1; weights must be ⪰ 0",
         ),
-        ([1, 0], {"definite": True}, km.DefinitenessError, r"Q is not positive definite: .* is 0; raise it"),
+        ([1, 0], {"definite": True}, km.errors.DefinitenessError, r"Q is not positive definite: .* is 0; raise it"),
     ):
         with pytest.raises(error, match=text):
             checks.weight(value, "Q", **kwargs)
@@ -108,12 +108,12 @@ def test_numbers():
     assert checks.positive(2, "dt") == 2.0
     assert checks.count(3, "steps") == 3
     for call, error, text in (
-        (lambda: checks.positive(0, "dt", "s"), km.DataError, r"dt is 0 s; it must be above zero"),
-        (lambda: checks.positive(-1.5, "dt"), km.DataError, r"dt is -1.5; it must be above zero"),
-        (lambda: checks.positive(np.nan, "dt"), km.DataError, r"dt holds 1 NaN or inf"),
-        (lambda: checks.count(0, "horizon"), km.DataError, r"horizon is 0; it must be at least 1"),
-        (lambda: checks.count(1, "steps", 2), km.DataError, r"steps is 1; it must be at least 2"),
-        (lambda: checks.count(True, "steps"), km.DataError, r"steps is True; pass a whole number"),
+        (lambda: checks.positive(0, "dt", "s"), km.errors.DataError, r"dt is 0 s; it must be above zero"),
+        (lambda: checks.positive(-1.5, "dt"), km.errors.DataError, r"dt is -1.5; it must be above zero"),
+        (lambda: checks.positive(np.nan, "dt"), km.errors.DataError, r"dt holds 1 NaN or inf"),
+        (lambda: checks.count(0, "horizon"), km.errors.DataError, r"horizon is 0; it must be at least 1"),
+        (lambda: checks.count(1, "steps", 2), km.errors.DataError, r"steps is 1; it must be at least 2"),
+        (lambda: checks.count(True, "steps"), km.errors.DataError, r"steps is True; pass a whole number"),
     ):
         with pytest.raises(error, match=text):
             call()
@@ -123,7 +123,7 @@ def test_crossed_limits():
     checks.crossed(np.zeros(2), np.zeros(2), "input")
     checks.crossed(np.full(1, -np.inf), np.full(1, np.inf), "input")
     with pytest.raises(
-        km.DataError, match=r"input limits cross at index 1: lower 2 is above upper 1; swap or widen"
+        km.errors.DataError, match=r"input limits cross at index 1: lower 2 is above upper 1; swap or widen"
     ):
         checks.crossed(np.array([0.0, 2]), np.array([0.0, 1]), "input")
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+import koopmpc as km
 from koopmpc.bench.controllers import CONTROLLERS
 from koopmpc.bench.faults import FAULTS
-from koopmpc.cli import _program, app
-from koopmpc.loop.metrics import metrics
-from koopmpc.recording.reader import load_run
+from koopmpc.cli.app import _program, app
 from tests.bench.tiny import write
 
 TWO = ["-c", "lqr", "-c", "koopman-mpc"]
@@ -168,7 +167,7 @@ def test_inspect_recomputes_the_metrics_from_the_log_alone(call, tmp_path):
     log = folders(tmp_path)[0] / "tiny-near-lqr.rrd"
     result = call("inspect", log)
     assert result.exit_code == 0, result.output
-    expected = metrics(load_run(log))
+    expected = km.metrics(km.load_run(log))
     assert "tiny near lqr" in result.stdout
     assert f"{expected.cost:.6g}" in result.stdout
     assert f"{expected.settling_time:.3g} s" in result.stdout

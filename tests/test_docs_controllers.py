@@ -43,8 +43,6 @@ def test_every_row_of_the_table_leads_to_a_part_of_the_page():
 
 def test_every_source_that_the_table_names_is_at_its_foot():
     table, foot = TEXT.split("## Sources")
-    named = {
-        key for group in re.findall(r"\[([mdal]\d+(?:, [mdal]\d+)*)\]", table) for key in group.split(", ")
-    }
+    named = {key for group in re.findall(r"\[([mdal]\d+(?:, [mdal]\d+)*)\]", table) for key in group.split(", ")}
     given = set(re.findall(r"\b([mdal]\d+)\b", foot))
     assert named == given

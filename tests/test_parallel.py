@@ -8,7 +8,7 @@ from textwrap import dedent
 
 import pytest
 
-from koopmpc.errors import DataError, KoopmpcError
+import koopmpc as km
 from koopmpc.parallel import map_tasks
 from tests import tasks
 from tests.cluster import two_workers
@@ -64,9 +64,7 @@ def test_a_lost_worker_costs_its_task_nothing(where: dict, tmp_path: Path) -> No
 
 @AWAY
 def test_a_task_that_kills_each_worker_is_named(where: dict) -> None:
-    with pytest.raises(
-        KoopmpcError, match=r"task 0, the first: each worker that did it died .*workers=1 to see"
-    ):
+    with pytest.raises(km.KoopmpcError, match=r"task 0, the first: each worker that did it died .*workers=1 to see"):
         list(map_tasks(tasks.die, ["the first"], **where))
 
 
@@ -74,20 +72,20 @@ def test_a_task_that_kills_each_worker_is_named(where: dict) -> None:
 def test_what_a_task_raises_is_raised_after_the_results_before_it(where: dict) -> None:
     results = map_tasks(tasks.fail, range(5), **where)
     assert next(results) == 0
-    with pytest.raises(DataError, match="the second task is wrong"):
+    with pytest.raises(km.errors.DataError, match="the second task is wrong"):
         next(results)
 
 
 def test_a_worker_tells_where_it_failed_even_if_the_exception_does_not_pickle() -> None:
-    with pytest.raises(KoopmpcError, match="OddError: 1 and 2") as caught:
+    with pytest.raises(km.KoopmpcError, match="OddError: 1 and 2") as caught:
         list(map_tasks(tasks.odd, [0], **PROCESSES))
     assert "in odd" in caught.value.__notes__[0]
 
 
 def test_what_does_not_pickle_is_told() -> None:
-    with pytest.raises(DataError, match=r"task 0, <function .*cannot be sent to a worker.*in a module"):
+    with pytest.raises(km.errors.DataError, match=r"task 0, <function .*cannot be sent to a worker.*in a module"):
         list(map_tasks(tasks.square, [lambda: 0], **PROCESSES))
-    with pytest.raises(DataError, match="the result of 3 cannot be sent back"):
+    with pytest.raises(km.errors.DataError, match="the result of 3 cannot be sent back"):
         list(map_tasks(tasks.unsendable, [3], **PROCESSES))
 
 
@@ -120,17 +118,17 @@ def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
 
 
 def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
-    with pytest.raises(DataError, match="workers is 0; it must be at least 1"):
+    with pytest.raises(km.errors.DataError, match="workers is 0; it must be at least 1"):
         map_tasks(tasks.square, [1], workers=0)
-    with pytest.raises(DataError, match=r"""scheduler is 'here'; pass "local", or the address "tcp://"""):
+    with pytest.raises(km.errors.DataError, match=r"""scheduler is 'here'; pass "local", or the address "tcp://"""):
         map_tasks(tasks.square, [1], scheduler="here")
-    with pytest.raises(DataError, match="has its own workers; leave out workers=2"):
+    with pytest.raises(km.errors.DataError, match="has its own workers; leave out workers=2"):
         map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:8786", workers=2)
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("koopmpc.parallel._ANSWER", 0.5)
-    with pytest.raises(KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9; start one"):
+    with pytest.raises(km.KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9; start one"):
         list(map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:9"))
 
 
@@ -150,11 +148,11 @@ def test_a_cluster_is_reached_by_its_address_and_one_without_workers_is_told(
         assert list(map_tasks(tasks.square, range(3), scheduler=address)) == [0, 1, 4]
         cluster.scale(0)
         monkeypatch.setattr("koopmpc.parallel._PATIENCE", 1.0)
-        with pytest.raises(KoopmpcError, match="task 0, 5: the cluster has had no worker for 1 s"):
+        with pytest.raises(km.KoopmpcError, match="task 0, 5: the cluster has had no worker for 1 s"):
             list(map_tasks(tasks.square, [5], scheduler=address))
 
 
 def test_without_dask_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(KoopmpcError, match=r"install it with: pip install 'koopmpc\[dask\]'"):
+    with pytest.raises(km.KoopmpcError, match=r"install it with: pip install 'koopmpc\[dask\]'"):
         list(map_tasks(tasks.square, [1], scheduler="local"))

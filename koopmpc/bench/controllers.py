@@ -1,19 +1,118 @@
-"""The seven controllers of the bench: one cost, one set of limits and one horizon for all."""
+"""What the controllers and cases of one problem share, built once: the step map, the truth, the data, the model."""
 
+import time
 from collections.abc import Callable, Iterable
+from functools import cached_property
 
-from koopmpc.bench.names import nearest
-from koopmpc.bench.prepare import Prepared
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.koopman_mpc import KoopmanMPC
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.bench.problem import Problem
+from koopmpc.checks import nearest
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear_mpc import LinearMPC
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.linear.linear_mpc import LinearMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.control.nonlinear.model import learned_map
+from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
+from koopmpc.control.nonlinear.terminal import Equilibria
+from koopmpc.control.tracking import outputs
+from koopmpc.data.collect import collect
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import ProblemError
 from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.identify.fits.bilinear import bilinear_edmd
+from koopmpc.identify.fits.edmd import edmd
+from koopmpc.plants.dynamics import Dynamics
+from koopmpc.plants.simulated import Plant, SimulatedPlant
+from koopmpc.plants.step_map import StepMap, discretize
+from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
+
+
+class Prepared:
+    """The parts of a problem, each built when it is first asked for and then kept.
+
+    `model` is made from data alone; `step_map` is what linear and nonlinear controllers are given.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.training_time = 0.0
+        self._held: dict[str, Float[np.ndarray, "T nu"]] = {}
+
+    @cached_property
+    def step_map(self) -> StepMap:
+        """x⁺ = F(x, u) of the problem's dynamics."""
+        return discretize(self.problem.dynamics, self.problem.dt, self.problem.integrator)
+
+    @cached_property
+    def truth(self) -> StepMap | Plant:
+        """The plant that is driven: the problem's `plant`, or its model where there is none."""
+        return self._driven(self.problem.plant)
+
+    def truth_of(self, case: str) -> StepMap | Plant:
+        """Return the plant that is driven in this case: its own, or the problem's."""
+        plant = self.problem.cases[case].plant
+        return self.truth if plant is None else self._driven(plant)
+
+    def _driven(self, plant: Dynamics | StepMap | Plant | None) -> StepMap | Plant:
+        if plant is None:
+            return self.step_map
+        if isinstance(plant, Dynamics):
+            return discretize(plant, self.problem.dt, self.problem.integrator)
+        return plant
+
+    def u_reference(self, case: str) -> Float[np.ndarray, "T nu"]:
+        """Return the inputs that hold the references of a case, found on the truth; kept for the next controller.
+
+        On a plant without equations they are the model's, and zero where the cost's u_target is "zero".
+        """
+        if case not in self._held:
+            self._held[case] = self._find(case)
+        return self._held[case]
+
+    def _find(self, case: str) -> Float[np.ndarray, "T nu"]:
+        problem, steps = self.problem, self.problem.cases[case].steps
+        truth = self.truth_of(case)
+        truth = truth.step_map if isinstance(truth, SimulatedPlant) else truth
+        plant = truth if isinstance(truth, StepMap) else self.step_map
+        if problem.cost.u_target == "zero":
+            return np.zeros((steps, plant.nu))
+        seen = outputs(plant.states, plant.nu, problem.cost, problem.limits_of(case))
+        equilibria = Equilibria(learned_map(plant), problem.cost, seen, 10 * problem.horizon)
+        rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
+        distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
+        return np.array([equilibria.rests.find(row).u for row in distinct])[of.ravel()]
+
+    @cached_property
+    def data(self) -> Episodes:
+        """Episodes of the truth under the problem's excitation."""
+        training = self.problem.training
+        return collect(
+            self.truth,
+            training.x0,
+            training.excitation,
+            episodes=training.episodes,
+            steps=training.steps,
+            rng=training.seed,
+        )
+
+    @cached_property
+    def model(self) -> LinearPredictor:
+        """z⁺ = A z + B u fitted to the data; `training_time` [s] is what data and fit took."""
+        start = time.perf_counter()
+        model = edmd(self.data, self.problem.lifting, ridge=self.problem.ridge)
+        self.training_time = time.perf_counter() - start
+        return model
+
+    @cached_property
+    def bilinear(self) -> BilinearPredictor:
+        """z⁺ = A z + B u + Σ uᵢ Nᵢ z fitted to the same data with the same lifting."""
+        return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True)
+
 
 Build = Callable[[Prepared, Limits], Controller]
 

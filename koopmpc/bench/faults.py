@@ -3,14 +3,7 @@
 import numpy as np
 
 from koopmpc.control.limits import Limits
-from koopmpc.loop.faults import (
-    ActuatorDelay,
-    ActuatorLoss,
-    DroppedSamples,
-    FrozenSensor,
-    NaNSensor,
-    SolverFailure,
-)
+from koopmpc.loop.faults import ActuatorDelay, ActuatorLoss, DroppedSamples, FrozenSensor, NaNSensor, SolverFailure
 from koopmpc.loop.injection import Fault
 
 FAULTS: dict[str, Fault] = {

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from koopmpc.bench.names import nearest
 from koopmpc.bench.problem import Problem
+from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
 
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -74,9 +74,7 @@ def _unknown(text: str) -> str:
         inside = ", ".join(str(path) for path in _files(Path(text))) or "there is none in it"
         return f"{text} is a folder; pass the path of one problem file: {inside}"
     if text.endswith(".py") or "/" in text or "\\" in text:
-        return (
-            f"there is no file {text}; pass the path of a problem file, or a name that `koopmpc list` shows"
-        )
+        return f"there is no file {text}; pass the path of a problem file, or a name that `koopmpc list` shows"
     names = [entry.name for entry in list_problems()]
     return f"there is no problem {text!r}{nearest(text, names)}; there are {', '.join(names)}, or pass a path"
 
@@ -98,18 +96,14 @@ def _load(path: Path) -> Problem:
     loaded = module.__dict__.get("problem")
     if not isinstance(loaded, Problem):
         got = "nothing of that name" if loaded is None else f"a {type(loaded).__name__}"
-        raise ProblemError(
-            f"{path} must define `problem = km.Problem(...)`, but holds {got}; see a file in problems/"
-        )
+        raise ProblemError(f"{path} must define `problem = km.Problem(...)`, but holds {got}; see a file in problems/")
     return replace(loaded, name=path.stem, title=_first_line(module.__doc__))
 
 
 def _line(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError):
         return f", line {error.lineno}"
-    lines = [
-        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
-    ]
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
     return f", line {lines[-1]}" if lines else ""
 
 

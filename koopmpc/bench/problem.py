@@ -8,18 +8,18 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.bench.names import nearest
+from koopmpc.checks import nearest
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.collect import InputFunction, Uniform
-from koopmpc.data.policy import Excitation
+from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.plant.dynamics import Dynamics
-from koopmpc.plant.integrators import RK4, Integrator
-from koopmpc.plant.simulated import Plant
-from koopmpc.plant.step_map import StepMap
-from koopmpc.recording.scene import Shape
+from koopmpc.plants.dynamics import Dynamics
+from koopmpc.plants.integrators import RK4, Integrator
+from koopmpc.plants.simulated import Plant
+from koopmpc.plants.step_map import StepMap
+from koopmpc.scene import Shape
 
 Scene = Callable[[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]], Sequence[Shape]]
 
@@ -148,9 +148,7 @@ class Problem:
         if self.ridge < 0:
             raise DataError(f"ridge is {self.ridge:g}; it must be zero or above")
         if not self.cases:
-            raise DataError(
-                'a problem needs at least one case: cases={"name": km.Case(x0, reference, steps)}'
-            )
+            raise DataError('a problem needs at least one case: cases={"name": km.Case(x0, reference, steps)}')
         nr = self.cost.of.bind(self.dynamics.states).nz
         self.cost.matrices(nr, nu)
         _fits(self.limits, self.dynamics, "limits")
@@ -161,9 +159,7 @@ class Problem:
                 )
             size = np.shape(case.x0)
             if size != (nx,):
-                raise ShapeError(
-                    f"case {name!r}: x0 has shape {size}, expected ({nx},): {self.dynamics.states}"
-                )
+                raise ShapeError(f"case {name!r}: x0 has shape {size}, expected ({nx},): {self.dynamics.states}")
             size = np.shape(case.reference) or (1,)
             if size not in ((nr,), (case.steps + 1, nr)):
                 raise ShapeError(

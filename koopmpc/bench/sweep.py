@@ -8,21 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from koopmpc.bench.controllers import CONTROLLERS, LEARNED, chosen
+from koopmpc.bench.controllers import CONTROLLERS, LEARNED, Prepared, chosen
 from koopmpc.bench.faults import FAULTS, possible
-from koopmpc.bench.parquet import write_results
-from koopmpc.bench.prepare import Prepared
 from koopmpc.bench.problem import Case, Problem
-from koopmpc.bench.results import Row, failures, reached
+from koopmpc.bench.results import Row, failures, reached, write_results
 from koopmpc.control.move import Controller
 from koopmpc.errors import ProblemError
 from koopmpc.loop.injection import Fault, named
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import Observer, simulate
-from koopmpc.recording.connect import find_viewer, why_none
-from koopmpc.recording.reader import load_run
+from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
+from koopmpc.recording.viewer import find_viewer, why_none
 
 RESULTS = "results.parquet"  # beside the logs of the runs
 Progress = Callable[[str, int, int], None]
@@ -76,9 +74,7 @@ def sweep(
     cases = [f"{problem.name}:{case}" for problem in problems for case in problem.cases]
     twice = next((case for case in cases if cases.count(case) > 1), None)
     if twice is not None:
-        raise ProblemError(
-            f"{twice} comes twice, and its logs would have one name; run it once, or rename a file"
-        )
+        raise ProblemError(f"{twice} comes twice, and its logs would have one name; run it once, or rename a file")
     folder.mkdir(parents=True, exist_ok=True)
     if live and find_viewer() is None:
         live = False

@@ -1,1 +1,13 @@
-"""LQR, Koopman MPC, nonlinear MPC."""
+"""LQR, Koopman MPC, bilinear and nonlinear MPC."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.control.move import Controller as Controller
+    from koopmpc.control.move import Fallback as Fallback
+    from koopmpc.control.move import Plan as Plan
+    from koopmpc.control.riccati import Gain as Gain
+else:
+    __getattr__, __dir__, __all__ = attach(__name__, {"move": "Controller Fallback Plan", "riccati": "Gain"})

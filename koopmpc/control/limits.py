@@ -93,17 +93,13 @@ class Limits(Value):
                     object.__setattr__(self, end, checks.array(value, end, infinite=True))
             _require_room(getattr(self, low), getattr(self, high), low, high, name)
         if (self.y_min is not None or self.y_max is not None) and self.of is None:
-            raise DataError(
-                "y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)"
-            )
+            raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
         if self.of is not None:
             checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
         for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
             value = getattr(self, end)
             if value is not None and (sign * value > 0).any():
-                raise DataError(
-                    f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates"
-                )
+                raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
         for name in ("slack", "du_slack"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _weights(getattr(self, name), name))
@@ -183,15 +179,11 @@ def _softness(slack: Slack | None, name: str, n: int, what: str) -> Softness:
     parts = [checks.array(weight, name, infinite=True) for weight in slack]
     for part in parts:
         if part.ndim and part.shape != (n,):
-            raise ShapeError(
-                f"{name} has a weight of shape {part.shape}, expected ({n},), {what}, or a scalar"
-            )
+            raise ShapeError(f"{name} has a weight of shape {part.shape}, expected ({n},), {what}, or a scalar")
     linear, quadratic = (np.broadcast_to(part, (n,)).copy() for part in parts)
     free = np.flatnonzero(linear + quadratic == 0)
     if free.size:
-        raise DataError(
-            f"{name} has both weights zero at index {int(free[0])}; a limit that costs nothing is none"
-        )
+        raise DataError(f"{name} has both weights zero at index {int(free[0])}; a limit that costs nothing is none")
     return Softness(linear, quadratic)
 
 
@@ -214,9 +206,7 @@ def _require_room(
     a, b = np.broadcast_arrays(lower, upper)
     checks.crossed(a, b, name)
     if (lower == np.inf).any() or (upper == -np.inf).any():
-        raise DataError(
-            f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit"
-        )
+        raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
 
 
 def _box(low: ArrayLike | None, high: ArrayLike | None, low_name: str, high_name: str, n: int) -> Box:

@@ -7,13 +7,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.base import admitted
 from koopmpc.control.cost import Cost
-from koopmpc.control.fallback import admitted
-from koopmpc.control.horizon import one_step
-from koopmpc.control.lifted import reference_rows, tracking
 from koopmpc.control.limits import Limits
+from koopmpc.control.linear.horizon import one_step
 from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.control.stationary import stationary
+from koopmpc.control.riccati import stationary
+from koopmpc.control.tracking import reference_rows, tracking
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.measured import Measured
 from koopmpc.lifting.buffered import HUGE
@@ -54,9 +54,7 @@ class LQR:
         track = tracking(predictor, cost, Limits() if limits is None else limits)
         step = one_step(predictor.A, predictor.B, track.C.T @ track.Q @ track.C, track.R, track.R_delta)
         self.gain = stationary(step.A, step.B, step.Q, step.R, ITERATIONS, step.M)
-        self._K, self._K_rate = np.split(
-            self.gain.K, [predictor.nz], axis=1
-        )  # the second is of u_{k−1} − u_r
+        self._K, self._K_rate = np.split(self.gain.K, [predictor.nz], axis=1)  # the second is of u_{k−1} − u_r
         self._targets, self._inputs, self._nr = track.targets, track.inputs, len(track.C)
         self._rates = track.rates
         self._observer = Measured(predictor)

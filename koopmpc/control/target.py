@@ -39,9 +39,7 @@ class Targets:
     hard: int
     weighted: Float[np.ndarray, "nr na"]
     from_push: Float[np.ndarray, "na nz"]
-    _known: dict[bytes, Float[np.ndarray, " na"]] = field(
-        default_factory=dict[bytes, Float[np.ndarray, " na"]]
-    )
+    _known: dict[bytes, Float[np.ndarray, " na"]] = field(default_factory=dict[bytes, Float[np.ndarray, " na"]])
     _solvers: dict[int, QPSolver] = field(default_factory=dict[int, QPSolver])
 
     def nearest(

@@ -1,1 +1,11 @@
 """Episodes: excitation, collection, files."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.data.episodes import Snapshots as Snapshots
+    from koopmpc.data.source import Source as Source
+else:
+    __getattr__, __dir__, __all__ = attach(__name__, {"episodes": "Snapshots", "source": "Source"})

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.policy import Excitation, OpenLoop, Policy
+from koopmpc.data.excitation import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plant.simulated import Plant, require_plant
-from koopmpc.plant.step_map import StepMap
+from koopmpc.plants.simulated import Plant, require_plant
+from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value
 
 # u = function(k, y, rng): a user's own excitation
@@ -84,10 +84,7 @@ def collect(
     with np.errstate(over="ignore", invalid="ignore"):  # what diverges is reported by `_finite`
         if not isinstance(plant, StepMap):
             policies = [_start(excitation, length, plant.dt, nu, own) for own in streams]
-            runs = [
-                _drive(plant, *each, length)
-                for each in zip(range(count), starts, policies, streams, strict=True)
-            ]
+            runs = [_drive(plant, *each, length) for each in zip(range(count), starts, policies, streams, strict=True)]
         else:
             X, U = _batch(plant, starts, excitation, length, streams)
             Y = _measured(plant, X)
@@ -142,18 +139,14 @@ def _measured(plant: StepMap, X: Float[np.ndarray, "E rows nx"]) -> Float[np.nda
     return np.stack([plant.measure(row) for row in X.reshape(-1, plant.nx)]).reshape(*X.shape[:2], plant.ny)
 
 
-def _start(
-    excitation: Excitation | InputFunction, steps: int, dt: float, nu: int, rng: np.random.Generator
-) -> Policy:
+def _start(excitation: Excitation | InputFunction, steps: int, dt: float, nu: int, rng: np.random.Generator) -> Policy:
     """Return the policy of one episode."""
     if isinstance(excitation, Excitation):
         return excitation.start(steps, dt, rng)
     return lambda k, y: checks.vector(excitation(k, y, rng), "the excitation's u", nu)
 
 
-def _starts(
-    x0: Uniform | ArrayLike, nx: int, count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "count nx"]:
+def _starts(x0: Uniform | ArrayLike, nx: int, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count nx"]:
     """Return one initial state for each episode."""
     rows = x0.sample(count, rng) if isinstance(x0, Uniform) else checks.array(x0, "x0")
     if rows.ndim == 1:

@@ -84,9 +84,7 @@ class Delay(Value):
     @property
     def _bound(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if self.bound is None:
-            raise DataError(
-                "Delay does not know its plant yet; call .bind(states, inputs) or pass it to edmd"
-            )
+            raise DataError("Delay does not know its plant yet; call .bind(states, inputs) or pass it to edmd")
         return self.bound
 
     @property
@@ -142,9 +140,7 @@ class Delay(Value):
                 f"{len(inputs)}"
             )
         if len(history) < self.steps:
-            raise DataError(
-                f"history has {len(history)} steps, Delay({self.steps}) needs the last {self.steps}"
-            )
+            raise DataError(f"history has {len(history)} steps, Delay({self.steps}) needs the last {self.steps}")
         if not np.array_equal(history.X[-1], x):
             raise DataError("history does not end at x; its last row of X is x itself")
         first = len(history) - self.steps

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import isclose
 from os import PathLike
 from typing import cast, overload
 
@@ -179,18 +180,14 @@ class Episodes(Value):
     def __add__(self, other: "Episodes") -> "Episodes":
         """Return both sets as one; they must agree in dt and in names."""
         if self.dt != other.dt:
-            raise DataError(
-                f"the episodes have unequal dt: {self.dt!r} s and {other.dt!r} s; resample one of them"
-            )
+            raise DataError(f"the episodes have unequal dt: {self.dt!r} s and {other.dt!r} s; resample one of them")
         for mine, theirs, what in (
             (self.states, other.states, "states"),
             (self.inputs, other.inputs, "inputs"),
             (self.disturbances, other.disturbances, "disturbances"),
         ):
             if mine != theirs:
-                raise DataError(
-                    f"the episodes differ in {what}: {', '.join(mine)} and {', '.join(theirs)}; rename one"
-                )
+                raise DataError(f"the episodes differ in {what}: {', '.join(mine)} and {', '.join(theirs)}; rename one")
         return self._of(self.episodes + other.episodes)
 
     def snapshots(self) -> Snapshots:
@@ -239,7 +236,7 @@ class Episodes(Value):
         LogError
             The path cannot be written.
         """
-        from koopmpc.data.storage import save_episodes  # storage builds Episodes, so it imports this file
+        from koopmpc.data.files.storage import save_episodes  # storage builds Episodes, so it imports this file
 
         save_episodes(self, path)
 
@@ -270,3 +267,56 @@ def episodes_of(given: object) -> Episodes:
     raise DataError(
         f"episodes is a {type(given).__name__}; pass Episodes([Episode(X=…, U=…), …], dt), or what collect returns"
     )
+
+
+_CLOSE = 1e-6  # relative; clocks that wrote the files round
+
+
+@dataclass(frozen=True)
+class About:
+    """What the first set says: its sample time [s] and names, and where it is from."""
+
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    place: str
+
+    def check(self, episodes: Episodes, place: str) -> None:
+        """Raise where the episodes at `place` are not of the same plant.
+
+        Raises
+        ------
+        DataError
+            They differ in dt or in names.
+        """
+        if not isclose(self.dt, episodes.dt, rel_tol=_CLOSE):
+            raise DataError(f"{place} has dt = {episodes.dt!r} s, {self.place} has {self.dt!r} s; resample one of them")
+        for mine, theirs, what in (
+            (self.states, episodes.states, "states"),
+            (self.inputs, episodes.inputs, "inputs"),
+            (self.disturbances, episodes.disturbances, "disturbances"),
+        ):
+            if mine != theirs:
+                raise DataError(
+                    f"{place} names the {what} {_listed(theirs)}, {self.place} {_listed(mine)}; "
+                    "rename them, or leave it out"
+                )
+
+
+def about(episodes: Episodes, place: str) -> About:
+    """Return what the episodes at `place` say."""
+    return About(episodes.dt, episodes.states, episodes.inputs, episodes.disturbances, place)
+
+
+def joined(sets: Sequence[Episodes]) -> Episodes:
+    """Return sets of one plant as one, dt and names those of the first."""
+    first = sets[0]
+    if len(sets) == 1:
+        return first
+    every = [episode for one in sets for episode in one]
+    return Episodes(every, first.dt, first.states, first.inputs, first.disturbances)
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(map(repr, names)) or "none"

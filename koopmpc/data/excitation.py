@@ -1,16 +1,81 @@
 """Inputs that make a plant show what it does: noise, PRBS, sines, a sweep, and feedback with noise."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.policy import Excitation, OpenLoop, Policy
-from koopmpc.data.shift_register import ORDERS, maximal_length
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import Value
+
+Policy = Callable[[int, Float[np.ndarray, " ny"]], Float[np.ndarray, " nu"]]
+
+
+class Excitation(Value, ABC):
+    """A frozen description of inputs, with `nu` of them."""
+
+    @property
+    @abstractmethod
+    def nu(self) -> int:
+        """Number of inputs."""
+
+    @abstractmethod
+    def start(self, steps: int, dt: float, rng: np.random.Generator) -> Policy:
+        """Return the policy u_k = policy(k, y) of one episode of `steps` steps of dt [s]."""
+
+
+class OpenLoop(Excitation):
+    """An excitation that does not look at y."""
+
+    @abstractmethod
+    def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
+        """Return all inputs of one episode, (steps, nu)."""
+
+    def start(self, steps: int, dt: float, rng: np.random.Generator) -> Policy:
+        """Return the policy that reads out the sequence."""
+        U = self.sequence(steps, dt, rng)
+        return lambda k, _: U[k]
+
+
+# Feedback taps of a primitive polynomial for each order (Golomb, Shift Register Sequences, 1967).
+_TAPS = {
+    3: (3, 2),
+    4: (4, 3),
+    5: (5, 3),
+    6: (6, 5),
+    7: (7, 6),
+    8: (8, 6, 5, 4),
+    9: (9, 5),
+    10: (10, 7),
+    11: (11, 9),
+    12: (12, 6, 4, 1),
+    13: (13, 4, 3, 1),
+    14: (14, 5, 3, 1),
+    15: (15, 14),
+    16: (16, 15, 13, 4),
+}
+ORDERS = tuple(_TAPS)
+
+
+@lru_cache
+def maximal_length(order: int) -> Bool[np.ndarray, " period"]:
+    """Return one period b_k = b_{k−t₁} ⊕ b_{k−t₂} ⊕ …, of 2^order − 1 bits, read-only.
+
+    Its ones exceed its zeros by one and its periodic autocorrelation is −1 off zero (levels ±1): the spectrum
+    is flat but for the mean.
+    """
+    period = 2**order - 1
+    bits = [True] * order
+    for k in range(order, period):
+        bits.append(sum(bits[k - tap] for tap in _TAPS[order]) % 2 == 1)
+    sequence = np.array(bits)
+    sequence.flags.writeable = False
+    return sequence
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -98,9 +163,7 @@ class Multisine(OpenLoop):
     def __init__(
         self, amplitude: ArrayLike, period: float, harmonics: int | Sequence[int], offset: ArrayLike = 0.0
     ) -> None:
-        chosen = (
-            range(1, checks.count(harmonics, "harmonics") + 1) if isinstance(harmonics, int) else harmonics
-        )
+        chosen = range(1, checks.count(harmonics, "harmonics") + 1) if isinstance(harmonics, int) else harmonics
         object.__setattr__(self, "amplitude", _inputs(amplitude, "amplitude"))
         object.__setattr__(self, "period", checks.positive(period, "period", "s"))
         object.__setattr__(self, "harmonics", tuple(checks.count(j, "harmonic") for j in chosen))
@@ -115,9 +178,7 @@ class Multisine(OpenLoop):
         """Return the periods, all alike, with phases of this episode."""
         samples = round(self.period / dt)
         if samples < 1 or abs(samples * dt - self.period) > 1e-9 * self.period:
-            raise DataError(
-                f"period is {self.period:g} s, no multiple of dt {dt:g} s; choose {max(samples, 1) * dt:g}"
-            )
+            raise DataError(f"period is {self.period:g} s, no multiple of dt {dt:g} s; choose {max(samples, 1) * dt:g}")
         if 2 * max(self.harmonics) >= samples:
             raise DataError(
                 f"harmonic {max(self.harmonics)} of {samples} samples a period is not below the Nyquist "
@@ -150,9 +211,7 @@ class Chirp(OpenLoop):
     duration: float
     offset: Float[np.ndarray, " nu"]
 
-    def __init__(
-        self, amplitude: ArrayLike, f0: float, f1: float, duration: float, offset: ArrayLike = 0.0
-    ) -> None:
+    def __init__(self, amplitude: ArrayLike, f0: float, f1: float, duration: float, offset: ArrayLike = 0.0) -> None:
         object.__setattr__(self, "amplitude", _inputs(amplitude, "amplitude"))
         object.__setattr__(self, "f0", checks.positive(f0, "f0", "Hz"))
         object.__setattr__(self, "f1", checks.positive(f1, "f1", "Hz"))
@@ -210,9 +269,7 @@ class Feedback(Excitation):
     ) -> None:
         gain = checks.array(K, "K", (None, None))
         if noise is not None and noise.nu != len(gain):
-            raise ShapeError(
-                f"noise has {noise.nu} inputs and K {len(gain)} rows; pass one level for each input"
-            )
+            raise ShapeError(f"noise has {noise.nu} inputs and K {len(gain)} rows; pass one level for each input")
         object.__setattr__(self, "K", gain)
         object.__setattr__(self, "noise", noise)
         object.__setattr__(self, "x_ref", checks.vector(x_ref, "x_ref", gain.shape[1]))

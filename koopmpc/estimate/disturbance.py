@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.estimate.history import history_of
-from koopmpc.estimate.observer import constant_index
-from koopmpc.estimate.state import FilteredState, Map
+from koopmpc.estimate.measured import FilteredState, Map
+from koopmpc.estimate.observer import constant_index, history_of
 from koopmpc.lifting.buffered import buffered
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.values import Value
@@ -76,9 +75,7 @@ class Relifted:
         """Go on with another model; d takes as long to follow as it took to come."""
         self._predictor = predictor
 
-    def update(
-        self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
-    ) -> bool:
+    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Lift y, and move d towards the misfit of the step that led here."""
         (x,), (lifted,), lift, _ = self._lift.slot()
         x[:] = y if self._history is None else self._history.take(y, u)

@@ -2,20 +2,48 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.detectable import Hidden, hidden
-from koopmpc.estimate.filter import Augmented, Kalman, Model
+from koopmpc.estimate.filtered import Augmented, Kalman, Model
 from koopmpc.estimate.observer import constant_index, places
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.values import Value
+
+TOLERANCE = 1e-6  # singular values below this share of the largest, or of |λ|; |λ| as near to 1 does not die out
+
+
+class Hidden(NamedTuple):
+    """A mode that y does not show: λ, and its direction s, of length 1."""
+
+    eigenvalue: complex
+    direction: Complex[np.ndarray, " n"]
+
+
+def hidden(F: Float[np.ndarray, "n n"], M: Float[np.ndarray, "ny n"]) -> Hidden | None:
+    """Return a mode with |λ| ≥ 1 for which [F − λ I; M] has less than full rank; None where (F, M) is detectable.
+
+    For F = [A, B_d; 0, I] and M = [C, C_d], λ = 1 is the rank condition on [A − I, B_d; C, C_d]. Rows of M are
+    scaled to length 1, so that units of y do not decide.
+
+    References
+    ----------
+    Pannocchia & Rawlings, "Disturbance models for offset-free model-predictive control", AIChE Journal 49, 2003.
+    """
+    scaled = M / np.maximum(np.linalg.norm(M, axis=1, keepdims=True), 1e-300)
+    for value in np.linalg.eigvals(F):
+        if abs(value) < 1 - TOLERANCE:
+            continue
+        sigma, right = np.linalg.svd(np.vstack([F - value * np.eye(len(F)), scaled]))[1:]
+        if sigma[-1] < TOLERANCE * max(sigma[0], abs(value)):
+            return Hidden(complex(value), np.conj(np.asarray(right[-1], complex)))
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +99,7 @@ class LiftedKalman(Value):
         elif isinstance(given, Sequence) and given and all(isinstance(name, str) for name in given):
             object.__setattr__(self, "outputs", tuple(given))
         else:
-            object.__setattr__(
-                self, "outputs", checks.array(cast("ArrayLike", given), "outputs", (None, None))
-            )
+            object.__setattr__(self, "outputs", checks.array(cast("ArrayLike", given), "outputs", (None, None)))
         if self.disturbance not in ("input", "output"):
             raise DataError(f'disturbance is {self.disturbance!r}; pass "input" or "output"')
         for name in ("process", "drift", "noise"):
@@ -118,9 +144,7 @@ class LiftedKalman(Value):
         if lost is not None:
             raise DataError(self._words(predictor, model, lost))
         n = len(kept)
-        Q = scipy.linalg.block_diag(
-            checks.weight(self.process, "process", n), checks.weight(self.drift, "drift", ny)
-        )
+        Q = scipy.linalg.block_diag(checks.weight(self.process, "process", n), checks.weight(self.drift, "drift", ny))
         R = checks.weight(self.noise, "noise", ny)
         return Model(model, _stationary(model.F, model.M, Q, R), R)
 
@@ -129,9 +153,7 @@ class LiftedKalman(Value):
             return np.eye(predictor.nz)[places(predictor.lifting, cast("tuple[str, ...]", self.outputs))]
         H = cast("Float[np.ndarray, 'ny nz']", self.outputs)
         if H.shape[1] != predictor.nz or not len(H):
-            raise ShapeError(
-                f"outputs has shape {H.shape}, expected (ny, {predictor.nz}), one column an observable"
-            )
+            raise ShapeError(f"outputs has shape {H.shape}, expected (ny, {predictor.nz}), one column an observable")
         return H
 
     def _words(self, predictor: LinearPredictor, model: Augmented, lost: Hidden) -> str:

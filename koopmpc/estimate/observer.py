@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc.data.delay import Delay
 from koopmpc.errors import ObservableError
 from koopmpc.lifting.base import Lifting, short
-from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.state import Constant
 from koopmpc.predict.linear import LinearPredictor
 
 
@@ -39,9 +40,7 @@ class Observer(Protocol):
         """Go on with another model, of the kind and the lifting that it was started with."""
         ...
 
-    def update(
-        self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
-    ) -> bool:
+    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y; u and w acted since the last call. Return whether z and d can be used."""
         ...
 
@@ -78,3 +77,40 @@ def places(lifting: Lifting, names: tuple[str, ...]) -> list[int]:
                 f"the lifting lacks {name!r}; add it to the lifting: it holds {', '.join(lifting.names)}"
             )
     return [place[name] for name in names]
+
+
+class History:
+    """ζ_k = [x_k, u_{k−1}, x_{k−1}, …] of a run.
+
+    The first measurement stands in for what was before it. A missed one makes the x_k of its own ζ_k NaN; in those that
+    follow, the last state that was measured stands in.
+
+    Parameters
+    ----------
+    embedding
+        Bound.
+    """
+
+    def __init__(self, embedding: Delay) -> None:
+        self._embedding, self._nx = embedding, len(embedding.states)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._zeta: Float[np.ndarray, " nzeta"] | None = None
+
+    def take(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ after the step that led to x under u."""
+        known, embedding = bool(np.isfinite(x).all()), self._embedding
+        if self._zeta is None:
+            zeta = embedding.held(x, u)
+            self._zeta = zeta if known else None
+            return zeta
+        zeta = embedding.shifted(self._zeta, u, x)
+        self._zeta = zeta if known else embedding.shifted(self._zeta, u, self._zeta[: self._nx])
+        return zeta
+
+
+def history_of(embedding: Delay | None) -> History | None:
+    """Return the history that an observer keeps; None without an embedding."""
+    return None if embedding is None else History(embedding)

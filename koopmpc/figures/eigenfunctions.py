@@ -1,5 +1,5 @@
-"""plot_eigenfunctions: φ_j over a plane of two states, magnitude and phase."""
 # pyright: basic
+"""plot_eigenfunctions: φ_j over a plane of two states, magnitude and phase."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -103,9 +103,7 @@ def _subscript(j: int) -> str:
 
 def _surface(made: Any, axes: Any, plane: Plane, values: np.ndarray, label: str) -> None:
     """Draw the values as shades, and lines of equal value that are labelled; dashed below zero."""
-    mesh = axes.pcolormesh(
-        plane.across, plane.up, values, cmap=SEQUENTIAL, shading="gouraud", rasterized=True
-    )
+    mesh = axes.pcolormesh(plane.across, plane.up, values, cmap=SEQUENTIAL, shading="gouraud", rasterized=True)
     made.colorbar(mesh, ax=axes, label=label)
     if np.ptp(values) > 1e-9:
         lines = axes.contour(plane.across, plane.up, values, levels=6, colors="white", linewidths=0.7)

@@ -1,5 +1,5 @@
-"""plot_error: the error of a prediction against how far ahead it looks, of one model or of several."""
 # pyright: basic
+"""plot_error: the error of a prediction against how far ahead it looks, of one model or of several."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -9,8 +9,8 @@ import numpy as np
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.figures.series import _chosen
 from koopmpc.figures.style import Width, band, figure, line, styled
-from koopmpc.lifting.chosen import Chosen
-from koopmpc.predict.score import Score
+from koopmpc.lifting.base import Chosen
+from koopmpc.validate.scoring import Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,9 +71,7 @@ def plot_error(
         panel.tick_params(labelbottom=True)
     most = 2 if width == "one column" else 4  # models beside one another, each a column of its own
     handles, labels = axes.flat[0].get_legend_handles_labels()
-    made.legend(
-        handles, labels, loc="outside upper center", ncols=2 if len(named) == 1 else min(len(named), most)
-    )
+    made.legend(handles, labels, loc="outside upper center", ncols=2 if len(named) == 1 else min(len(named), most))
     return made
 
 

@@ -1,5 +1,5 @@
-"""plot_reconstruction: trajectories that models tell from the first state, over the truth, and their errors."""
 # pyright: basic
+"""plot_reconstruction: trajectories that models tell from the first state, over the truth, and their errors."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -63,9 +63,7 @@ def plot_reconstruction(
     for column, (title, (given, curves)) in enumerate(cases.items()):
         truth = checks.array(given, f"the truth of {title!r}", (None, nx))
         t = np.arange(len(truth)) * dt
-        _column(
-            grid[:, column], t, truth, {name: _fitting(curves[name], name, truth) for name in curves}, names
-        )
+        _column(grid[:, column], t, truth, {name: _fitting(curves[name], name, truth) for name in curves}, names)
         grid[0, column].set_title(title)
         grid[-1, column].set(xlabel="time [s]", xlim=(0.0, t[-1]))
     for row, label in enumerate([*states, "relative error"]):
@@ -100,9 +98,7 @@ def _column(
         panels[-1].semilogy(t, np.clip(error, _LEAST, 10 * _HIGHEST), **line(names.index(name), len(t)))
         errors.append(error[1:])
     if errors:
-        usual = min(
-            float(np.quantile(error, 0.02)) for error in errors
-        )  # it starts at rounding, and passes through 0
+        usual = min(float(np.quantile(error, 0.02)) for error in errors)  # it starts at rounding, and passes through 0
         highest = max(float(error.max()) for error in errors)
         low, high = (float(np.log10(np.clip(v, _LEAST, _HIGHEST))) for v in (usual, highest))
         panels[-1].set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
@@ -113,7 +109,5 @@ def _column(
 def _fitting(curve: ArrayLike, name: str, truth: np.ndarray) -> np.ndarray:
     X = checks.array(curve, name, finite=False)
     if X.shape != truth.shape:
-        raise ShapeError(
-            f"{name} has shape {X.shape}, the truth {truth.shape}; pass the same steps and states"
-        )
+        raise ShapeError(f"{name} has shape {X.shape}, the truth {truth.shape}; pass the same steps and states")
     return X

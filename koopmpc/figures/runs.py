@@ -1,5 +1,5 @@
-"""plot_runs: several closed loops over each other, states and inputs, a column a task."""
 # pyright: basic
+"""plot_runs: several closed loops over each other, states and inputs, a column a task."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -69,9 +69,7 @@ def _column(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
             panel.plot(first.time, first.reference[:, i], **REFERENCE, label="reference")
             extra = first.reference[:, i]
         elif i >= nx and first.limits is not None:
-            extra = np.array(
-                [v[i - nx] for v in first.limits.inputs(len(first.inputs)) if np.isfinite(v[i - nx])]
-            )
+            extra = np.array([v[i - nx] for v in first.limits.inputs(len(first.inputs)) if np.isfinite(v[i - nx])])
             for value in extra:
                 panel.axhline(value, **LIMIT, label="limit")
         panel.set_ylim(*_room(drawn, extra))

@@ -1,5 +1,5 @@
-"""plot_rollout and plot_run: states and inputs over time, a panel each, the time below."""
 # pyright: basic
+"""plot_rollout and plot_run: states and inputs over time, a panel each, the time below."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -10,10 +10,10 @@ from koopmpc.control.move import Fallback
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError
 from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, Width, band, figure, line, styled
-from koopmpc.lifting.chosen import Chosen, indices
+from koopmpc.lifting.base import Chosen, indices
 from koopmpc.loop.run import Run
-from koopmpc.predict.forecast import Bands, forecast
-from koopmpc.predict.score import Predictor
+from koopmpc.validate.forecast import Bands, forecast
+from koopmpc.validate.scoring import Predictor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -118,9 +118,7 @@ def _chosen(states: Chosen | None, names: Sequence[str]) -> list[int]:
 
 def _panels(nx: int, nu: int, more: int, width: Width) -> "tuple[Figure, list[Any]]":
     heights = [_STATE] * nx + [_INPUT] * nu + [0.6 * _INPUT] * more
-    made, axes = figure(
-        len(heights), width=width, height=0.7 + sum(heights), sharex=True, height_ratios=heights
-    )
+    made, axes = figure(len(heights), width=width, height=0.7 + sum(heights), sharex=True, height_ratios=heights)
     made.align_ylabels(list(axes[:, 0]))
     return made, list(axes[:, 0])
 

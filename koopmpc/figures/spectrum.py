@@ -1,14 +1,13 @@
-"""plot_spectrum: the eigenvalues of A over the unit circle, and how far each can be trusted."""
 # pyright: basic
+"""plot_spectrum: the eigenvalues of A over the unit circle, and how far each can be trusted."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from koopmpc.figures.style import SEQUENTIAL, figure, styled
-from koopmpc.identify.eigenpairs import Residuals, eigenpairs
-from koopmpc.identify.residual_dmd import ResidualDMD
-from koopmpc.predict.score import Predictor
+from koopmpc.validate.residuals import ResidualDMD, Residuals, eigenpairs
+from koopmpc.validate.scoring import Predictor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,9 +53,7 @@ def plot_spectrum(predictor: Predictor, residuals: Residuals | None = None) -> "
     for axes, (x, y, size) in zip(grid[0], views, strict=True):
         axes.plot(np.cos(turn), np.sin(turn), color="#555555", linewidth=0.9, gid="unit circle")
         if known is None:
-            axes.plot(
-                values.real, values.imag, "o", color="#0072b2", markeredgecolor="black", gid="eigenvalues"
-            )
+            axes.plot(values.real, values.imag, "o", color="#0072b2", markeredgecolor="black", gid="eigenvalues")
         else:
             points = _with_residuals(axes, values, known)
         axes.set(xlim=(x - size, x + size), ylim=(y - size, y + size), aspect="equal")
@@ -89,9 +86,7 @@ def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
     low, high = min(float(shown.min()), known.tolerance / 10), max(float(shown.max()), known.tolerance * 10)
     norm = LogNorm(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
     sizes = 12.0 + 40.0 * (1.0 - np.asarray(norm(shown)))
-    shades = ListedColormap(
-        mpl.colormaps[SEQUENTIAL](np.linspace(0, 0.85, 256))
-    )  # its end is too light for points
+    shades = ListedColormap(mpl.colormaps[SEQUENTIAL](np.linspace(0, 0.85, 256)))  # its end is too light for points
     points = None
     for chosen, marker in ((~known.spurious, "o"), (known.spurious, "x")):
         look: dict[str, Any] = {"edgecolors": "black"} if marker == "o" else {}

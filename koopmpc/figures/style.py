@@ -1,9 +1,9 @@
+# pyright: basic
 """How every figure looks: for one column or two of a page, to be read in black and white, the same bytes each time.
 
 A figure is a `matplotlib.figure.Figure` of its own: nothing of pyplot, so no display, no backend, and nothing that
 stays when it is let go. matplotlib is imported where it is used.
 """
-# pyright: basic
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,1 +1,11 @@
-"""From episodes to predictors: moments, DMD, DMDc, EDMD."""
+"""From episodes to predictors: one regression a file, on second moments that they share."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.identify.fits.prior import Combination as Combination
+    from koopmpc.identify.fits.prior import Storage as Storage
+else:
+    __getattr__, __dir__, __all__ = attach(__name__, {"fits.prior": "Combination Storage"})

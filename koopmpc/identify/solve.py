@@ -2,11 +2,89 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.identify.ridge import Ridge, cross_validated
+from koopmpc import checks
+from koopmpc.errors import DataError
+
+Ridge = float | Literal["gcv"]
+
+_ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
+_NOTHING = 1e-14
+_LARGEST = 1e3  # times σ₁²: beyond it next to nothing is left of K
+_POINTS = 300  # of the first grid, about ten a decade
+_ZOOMS = 5  # each ten times finer than the one before
+
+
+def ridge_of(given: object) -> Ridge:
+    """Return a ridge that is 0 or above, or "gcv"; raise DataError for anything else."""
+    if isinstance(given, str):
+        if given != "gcv":
+            raise DataError(f'ridge is {given!r}; pass a number, or "gcv"')
+        return "gcv"
+    ridge = float(checks.array(given, "ridge", ()))  # pyright: ignore[reportArgumentType]  # array refuses what is none
+    if ridge < 0:
+        raise DataError(f"ridge is {ridge:g}; it must be 0 or above")
+    return ridge
+
+
+def cross_validated(
+    s: Float[np.ndarray, " k"],
+    shares: Float[np.ndarray, "k nt"],
+    outside: Float[np.ndarray, " nt"],
+    samples: int,
+    cut: float,
+) -> float:
+    """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
+
+    Each target counts relative to its own size, so that units mean nothing. Where P holds all of them to
+    rounding there is no noise, and λ is 0.
+
+    Parameters
+    ----------
+    s
+        Singular values of P on unit-norm columns.
+    shares
+        Uᵀ T.
+    outside
+        Energy of each target that P cannot reach.
+    samples
+        M.
+    cut
+        Singular values below cut · σ₁ are rounding.
+
+    References
+    ----------
+    Golub, Heath & Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",
+    Technometrics 21, 1979.
+    """
+    live = s > cut * s.max(initial=0.0)
+    energy = np.sum(shares**2, axis=0) + outside
+    lost = outside + np.sum(shares[~live] ** 2, axis=0)
+    exact = samples > live.sum() and not (lost > _ROUNDING * energy).any()
+    if exact or not live.any():
+        return 0.0
+    size = np.where(energy > 0, energy, 1.0)
+    power = np.sum(shares**2 / size, axis=1)
+    rest = float(np.sum(outside / size))
+    squares = s**2
+
+    def score(ridge: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        left = ridge[:, None] / (squares + ridge[:, None])  # I − H along each singular direction
+        free = samples - len(s) + np.sum(left, axis=1)
+        return samples * (left**2 @ power + rest) / free**2
+
+    smallest = float(s[live].min())  # a ridge far below its square changes nothing
+    low, high, points = np.log(_NOTHING * smallest**2), np.log(_LARGEST * float(s[0]) ** 2), _POINTS
+    for _ in range(_ZOOMS):
+        grid = np.linspace(low, high, points)
+        best = int(np.argmin(score(np.exp(grid))))
+        low, high, points = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, points - 1)]), 21
+    return float(np.exp(0.5 * (low + high)))
+
 
 _CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
 
@@ -32,9 +110,7 @@ class Rows:
     rest: Float[np.ndarray, " nt"]
     samples: int
 
-    def residual(
-        self, columns: Int[np.ndarray, " c"], K: Float[np.ndarray, "n c"]
-    ) -> Float[np.ndarray, " c"]:
+    def residual(self, columns: Int[np.ndarray, " c"], K: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " c"]:
         """Return the root-mean-square of T − P K for these columns of T."""
         error = self.P @ K
         np.subtract(self.T[:, columns], error, out=error)

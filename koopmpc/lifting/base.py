@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ObservableError, ShapeError
-from koopmpc.plant.graph import Graph
+from koopmpc.plants.graph import Graph
 from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
@@ -117,12 +117,10 @@ class Lifting(Value, ABC):
 
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return both liftings one under the other; an observable that both name is held once."""
-        from koopmpc.lifting.sum import Sum  # which is a Lifting itself
+        from koopmpc.lifting.algebra import Sum  # which is a Lifting itself
 
         other = lifting_of(other)
-        parts = [
-            part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))
-        ]
+        parts = [part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))]
         bound = self._common(other)
         if bound is None:
             return Sum(tuple(parts))
@@ -130,7 +128,7 @@ class Lifting(Value, ABC):
 
     def __mul__(self, other: "Lifting") -> "Lifting":
         """Return all products of this lifting's observables with the other's."""
-        from koopmpc.lifting.product import Product  # which is a Lifting itself
+        from koopmpc.lifting.algebra import Product  # which is a Lifting itself
 
         product = Product(self, lifting_of(other))
         bound = self._common(other)
@@ -227,3 +225,39 @@ def rows(lifting: Lifting, wanted: Lifting) -> Indices:
                 f"the lifting lacks {name!r}; add it to the lifting: it holds {', '.join(lifting.names)}"
             )
     return np.array([place[name] for name in wanted.names], dtype=np.intp)
+
+
+Chosen = int | str | Sequence[int | str]
+
+
+def index(state: int | str, states: Sequence[str], who: str) -> int:
+    """Return the index of a state given by its index, or by its name with or without the unit.
+
+    Raises
+    ------
+    DataError
+        There is no such state; `who` asked for it.
+    """
+    if isinstance(state, str):
+        found = [i for i, name in enumerate(states) if state in (name, short(name))]
+        if len(found) == 1:
+            return found[0]
+    elif -len(states) <= state < len(states):
+        return state % len(states)
+    raise DataError(f"{who} is asked for state {state!r}; the states are {', '.join(states)}, or 0 … {len(states) - 1}")
+
+
+def indices(chosen: Chosen | None, states: Sequence[str], who: str) -> list[int]:
+    """Return the indices of the chosen states; of all of them where `chosen` is None."""
+    if chosen is None:
+        return list(range(len(states)))
+    some = [chosen] if isinstance(chosen, int | str) else chosen
+    return [index(state, states, who) for state in some]
+
+
+def frozen(chosen: Chosen | None) -> tuple[int | str, ...] | None:
+    """Return what a frozen dataclass keeps of a choice: a tuple of ints and names, or None for all."""
+    if chosen is None:
+        return None
+    some = [chosen] if isinstance(chosen, int | str | np.integer) else chosen
+    return tuple(state if isinstance(state, str) else int(state) for state in some)

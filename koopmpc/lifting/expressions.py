@@ -7,7 +7,7 @@ import casadi as ca
 
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, Traced
-from koopmpc.plant.graph import Graph
+from koopmpc.plants.graph import Graph
 from koopmpc.values import Value
 
 
@@ -47,9 +47,7 @@ class Expressions(Lifting):
 
     def as_saved(self) -> Value:
         """Refuse: a file holds the traced operations, never `fn`."""
-        raise DataError(
-            "Expressions holds a Python function; call .bind(states), which traces it, and save that"
-        )
+        raise DataError("Expressions holds a Python function; call .bind(states), which traces it, and save that")
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names given."""

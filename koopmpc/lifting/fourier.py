@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.lifting.base import Lifting, short
-from koopmpc.lifting.chosen import Chosen, frozen, indices
+from koopmpc.lifting.base import Chosen, Lifting, frozen, indices, short
 
 
 @dataclass(frozen=True, eq=False)

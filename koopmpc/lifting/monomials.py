@@ -29,9 +29,7 @@ class Monomials(Lifting):
         """Return names such as ``"theta^2*omega"``."""
         names = [short(state) for state in states]
         powers = (Counter(factors) for factors in _factors(len(states), self.degree))
-        return tuple(
-            "*".join(names[i] + (f"^{p}" if p > 1 else "") for i, p in each.items()) for each in powers
-        )
+        return tuple("*".join(names[i] + (f"^{p}" if p > 1 else "") for i, p in each.items()) for each in powers)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return each monomial as one of a degree less times a state."""

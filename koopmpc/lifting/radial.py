@@ -1,5 +1,7 @@
 """What the radial families share: centres, distances to them, names."""
 
+from dataclasses import dataclass
+
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
@@ -7,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import Lifting
 
 _CANCELS = 1e-3  # share of ‖x‖² + ‖c‖² below which a distance squared has lost three digits
 
@@ -62,3 +65,75 @@ def symbolic_squared_distances(x: ca.SX, centers: Float[np.ndarray, "nc nx"]) ->
 
 def _number(value: float) -> str:
     return repr(value).removesuffix(".0")
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Gaussian(Lifting):
+    """ψ(x) = exp(−‖x − c‖² / (2 width²)) for each centre c.
+
+    Parameters
+    ----------
+    centers
+        (nc, nx), one centre a row.
+    width
+        Standard deviation of the bell, in the unit of the states; scale states that differ much.
+    """
+
+    centers: Float[np.ndarray, "nc nx"]
+    width: float
+
+    def __init__(self, centers: ArrayLike, width: float, *, bound: tuple[str, ...] | None = None) -> None:
+        object.__setattr__(self, "centers", checked_centers(centers))
+        object.__setattr__(self, "width", checks.positive(width, "width"))
+        object.__setattr__(self, "bound", bound)
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"gaussian(0.5, -1; 0.3)"``, which hold the centre and the width."""
+        return center_names("gaussian", self.centers, states, f"; {self.width!r}")
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the bells."""
+        return ca.vertcat(*(ca.exp(self._rate * r2) for r2 in symbolic_squared_distances(x, self.centers)))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        squared_distances(x, self.centers, Z)
+        np.multiply(Z, self._rate, out=Z)
+        np.exp(Z, out=Z)
+
+    @property
+    def _rate(self) -> float:
+        return -0.5 / self.width**2
+
+
+_TINY = 1e-100  # keeps ln, its first and its second derivative finite at the centre; no other value feels it
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class ThinPlate(Lifting):
+    """ψ(x) = r² ln r with r = ‖x − c‖ for each centre c; 0 at the centre.
+
+    Parameters
+    ----------
+    centers
+        (nc, nx), one centre a row.
+    """
+
+    centers: Float[np.ndarray, "nc nx"]
+
+    def __init__(self, centers: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
+        object.__setattr__(self, "centers", checked_centers(centers))
+        object.__setattr__(self, "bound", bound)
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"thinplate(0.5, -1)"``, which hold the centre."""
+        return center_names("thinplate", self.centers, states)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return ½ r² ln r²."""
+        return ca.vertcat(*(0.5 * r2 * ca.log(r2 + _TINY) for r2 in symbolic_squared_distances(x, self.centers)))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        squared_distances(x, self.centers, Z)
+        logarithm = np.log(Z + _TINY)
+        np.multiply(Z, 0.5, out=Z)
+        np.multiply(Z, logarithm, out=Z)

@@ -87,9 +87,7 @@ class RandomFourier(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``."""
-        return tuple(
-            f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng})" for j in range(self.count)
-        )
+        return tuple(f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng})" for j in range(self.count))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the cosines."""
@@ -99,9 +97,7 @@ class RandomFourier(Lifting):
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         frequencies, phases = self._drawn
         Z[:] = phases
-        for values, coordinates in zip(
-            x, frequencies.T, strict=True
-        ):  # in one order for one row and for many
+        for values, coordinates in zip(x, frequencies.T, strict=True):  # in one order for one row and for many
             Z += values[:, None] * coordinates
         np.cos(Z, out=Z)
         Z *= self._amplitude

@@ -14,7 +14,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, lifting_of
-from koopmpc.lifting.constant import Constant
+from koopmpc.lifting.state import Constant
 
 _ONE = Constant().bind(()).names[0]
 
@@ -72,14 +72,10 @@ class Standardized(Lifting):
         """
         source = source_of(episodes)
         if not source.replayable:
-            raise DataError(
-                "a stream is read once, by the fit; take Standardized.of from some episodes of it"
-            )
+            raise DataError("a stream is read once, by the fit; take Standardized.of from some episodes of it")
         rows, mean, squares = 0, np.zeros(source.nx), np.zeros(source.nx)
         for part in source.parts():
-            for (
-                episode
-            ) in part.load():  # Chan, Golub & LeVeque 1983: two means and sums of squares become one
+            for episode in part.load():  # Chan, Golub & LeVeque 1983: two means and sums of squares become one
                 X = episode.X[:-1]
                 own, rows = X.mean(axis=0), rows + len(X)
                 step = (own - mean) * len(X) / rows

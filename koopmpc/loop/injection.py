@@ -67,7 +67,7 @@ class Injections(Injection):
             raise DataError(f"faults is {faults}; pass a list of faults, for example faults=[{faults}]")
         for fault in faults:
             if not isinstance(cast(object, fault), Fault):
-                raise DataError(f"faults holds {fault!r}; pass objects, for example faults=[km.NaNSensor()]")
+                raise DataError(f"faults holds {fault!r}; pass objects, for example faults=[km.faults.NaNSensor()]")
         streams = rng.spawn(len(faults))
         self._parts = [fault.start(wiring, own) for fault, own in zip(faults, streams, strict=True)]
 

@@ -89,9 +89,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 1e-6:.3g} µs"
 
 
-@np.errstate(
-    invalid="ignore", over="ignore"
-)  # a state that diverged, a sensor that showed inf: the cost says so
+@np.errstate(invalid="ignore", over="ignore")  # a state that diverged, a sensor that showed inf: the cost says so
 def metrics(run: Run) -> Metrics:
     """Return the closed-loop figures of `run`: cost, tracking, violation, effort, settling and solve times."""
     checks.kind(run, "run", Run, "simulate returns one")
@@ -162,9 +160,7 @@ def _violation(run: Run) -> float:
     return worst
 
 
-def _excess(
-    values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
-) -> float:
+def _excess(values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]) -> float:
     under, over = np.isfinite(low), np.isfinite(high)  # where there is no limit, not even inf is beyond it
     beyond = np.hstack([low[under] - values[:, under], values[:, over] - high[over]])
     return float(np.maximum(beyond, 0.0).max(initial=0.0))

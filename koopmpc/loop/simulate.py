@@ -15,13 +15,72 @@ from koopmpc.control.move import Controller, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.injection import Fault, Injections, Wiring, call, named
 from koopmpc.loop.run import Plans, Run
-from koopmpc.loop.signals import Signal, held_inputs, measured_rows, noise_of, reference_rows, signal_of
-from koopmpc.plant.simulated import Plant, SimulatedPlant, require_plant
-from koopmpc.plant.step_map import StepMap
+from koopmpc.plants.simulated import Plant, SimulatedPlant, require_plant
+from koopmpc.plants.step_map import StepMap
+
+Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
+
+
+def reference_rows(reference: ArrayLike, steps: int, horizon: int) -> Float[np.ndarray, "T nr"]:
+    """Return steps + horizon + 1 rows, the last one repeated."""
+    rows = checks.array(reference, "reference")
+    rows = np.atleast_1d(rows)
+    if rows.ndim == 1:
+        rows = np.broadcast_to(rows, (steps + 1, len(rows)))
+    if rows.shape[0] != steps + 1:
+        raise ShapeError(f"reference has shape {rows.shape}, expected (nr,) or (steps+1, nr) = ({steps + 1}, nr)")
+    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
+
+
+def held_inputs(u_reference: ArrayLike | None, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
+    """Return one row a step of the inputs that hold the reference; zeros where there are none."""
+    if u_reference is None:
+        return np.zeros((steps, nu))
+    values = checks.array(u_reference, "u_reference")
+    if values.ndim < 2:
+        return np.tile(checks.vector(values, "u_reference", nu), (steps, 1))
+    return checks.array(values, "u_reference", (steps, nu))
+
+
+def measured_rows(measured: ArrayLike, steps: int, horizon: int) -> Float[np.ndarray, "T nw"]:
+    """Return steps + horizon rows of measured disturbances, the last one repeated."""
+    rows = np.atleast_1d(checks.array(measured, "measured"))
+    if rows.ndim == 1:
+        rows = np.broadcast_to(rows, (steps, len(rows)))
+    if rows.ndim != 2 or len(rows) != steps:
+        raise ShapeError(f"measured has shape {rows.shape}, expected (nw,) or (steps, nw) = ({steps}, nw)")
+    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
+
+
+def signal_of(
+    signal: Signal | None, name: str, rows: int, n: int
+) -> Callable[[int, np.random.Generator], Float[np.ndarray, " n"]] | None:
+    """Return the signal as a function of (k, rng); None where there is none."""
+    if signal is None:
+        return None
+    if callable(signal):
+        return lambda k, rng: checks.array(signal(k, rng), name, (n,))
+    values = checks.array(signal, name)
+    if values.ndim < 2:
+        constant = checks.vector(values, name, n)
+        return lambda k, rng: constant
+    values = checks.array(values, name, (rows, n))
+    return lambda k, rng: values[k]
+
+
+def noise_of(
+    noise: Signal | None, steps: int, ny: int
+) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
+    """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
+    if noise is None or callable(noise) or np.ndim(noise) == 2:
+        return signal_of(noise, "noise", steps + 1, ny)
+    deviation = checks.vector(noise, "noise", ny)
+    return lambda k, rng: deviation * rng.standard_normal(ny)
+
 
 _CONTROLLER = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
-    "controller(y, reference, applied) -> Move; make it a class, see km.Controller"
+    "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller"
 )
 _MOVE = ("status", "fallback", "solve_time", "iterations", "slack")
 
@@ -117,22 +176,16 @@ def simulate(
     require_plant(plant)
     checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
-        raise DataError(
-            f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both"
-        )
+        raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
     x0 = checks.array(x0, "x0", (None,))
     y = _measured(plant.reset(x0, rng))
     nx, ny, nu = len(plant.states), len(y), controller.nu
     if nu != len(plant.inputs):
-        raise ShapeError(
-            f"the controller returns {nu} inputs, the plant takes {len(plant.inputs)} ({plant.inputs})"
-        )
+        raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(plant.inputs)} ({plant.inputs})")
     rows = reference_rows(reference, steps, controller.horizon)
     nr = rows.shape[1] if cost is None else cost.of.bind(plant.states).nz
     if rows.shape[1] != nr:
-        raise ShapeError(
-            f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column"
-        )
+        raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
@@ -169,9 +222,7 @@ def simulate(
         if k == 0:
             checks.members(move, "what the controller returned", ("u", *_MOVE), "return a km.Move")
         if np.shape(move.u) != (nu,):
-            raise ShapeError(
-                f"the controller returned u of shape {np.shape(move.u)} at step {k}, expected ({nu},)"
-            )
+            raise ShapeError(f"the controller returned u of shape {np.shape(move.u)} at step {k}, expected ({nu},)")
         if not np.isfinite(move.u).all():
             raise DataError(f"the controller returned u = {move.u} at step {k}; every input must be finite")
         U[k] = move.u if injected is None else injected.applied(k, move.u)
@@ -214,9 +265,7 @@ def simulate(
 
 
 def _measured(y: Any) -> Float[np.ndarray, " ny"]:
-    return np.array(
-        y, dtype=np.float64
-    )  # NaN passes: a sensor may fail, and the controller says BAD_MEASUREMENT
+    return np.array(y, dtype=np.float64)  # NaN passes: a sensor may fail, and the controller says BAD_MEASUREMENT
 
 
 def _store(X: Float[np.ndarray, "T1 nx"], k: int, state: Float[np.ndarray, " nx"] | None) -> None:

@@ -1,8 +1,10 @@
 """What all lifted predictors share: x ≈ C z, z₀ = ψ(x₀), names, an embedding, and files."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -12,12 +14,104 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.data.files.npz import read_arrays
+from koopmpc.errors import DataError, LogError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.files import save_value
-from koopmpc.predict.report import FitReport
-from koopmpc.values import Value
+from koopmpc.plants.step_map import StepMap
+from koopmpc.values import Arrays, Value, from_data, to_data
+
+
+@dataclass(frozen=True, eq=False)
+class FitReport(Value):
+    """How z⁺ = A z + B u was fitted, and how far the fit can be trusted.
+
+    Attributes
+    ----------
+    method
+        The function that made it: "dmd", "dmdc", "edmd", "bilinear_edmd".
+    route
+        How the least squares was solved: "gram", "qr", "svd", and what was cut or added.
+    samples
+        Snapshot pairs M.
+    condition
+        Condition number of the regressors on unit-norm columns; inf where they are dependent.
+    rank, columns
+        Numerical rank of the regressors, and how many columns they have.
+    ridge
+        The Tikhonov weight on unit-norm columns.
+    residual
+        Root-mean-square one-step residual of each state, in the state's unit; the "gram" route resolves it to
+        about 1e-8 of the state's size.
+    state_residual
+        Root-mean-square of x − C ψ(x) for each state: zero where the lifting holds the state itself.
+    warnings
+        Sentences, one for each doubt.
+    changes
+        Sentences, one for each thing that a prior, a limit on the spectral radius or a penalty changed.
+    """
+
+    method: str
+    route: str
+    samples: int
+    condition: float
+    rank: int
+    columns: int
+    ridge: float
+    residual: Float[np.ndarray, " nx"]
+    state_residual: Float[np.ndarray, " nx"]
+    warnings: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
+
+
+V = TypeVar("V", bound=Value)
+_FORMAT = "koopmpc-1"
+
+
+def save_value(value: Value, path: str | Path) -> None:
+    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled.
+
+    Raises
+    ------
+    LogError
+        The path cannot be written.
+    """
+    arrays: Arrays = {}
+    tree = {"format": _FORMAT, "value": to_data(value, arrays)}
+    text = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
+    with checks.writing(path) as file:
+        np.savez_compressed(file, allow_pickle=False, tree=text, **arrays)
+
+
+def load_value(path: str | Path, *kinds: type[V]) -> V:
+    """Read a Value of one of these kinds that `save_value` wrote.
+
+    Raises
+    ------
+    LogError
+        The file is missing, a folder, damaged, or holds something else.
+    """
+    wanted = " or ".join(kind.__name__ for kind in kinds)
+    advice = f"pass the .npz of a saved {wanted}"
+    source = checks.existing(path, advice)
+    try:
+        arrays = read_arrays(source, ("tree",))
+        tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise LogError(f"{path} is damaged: the text in it cannot be read; {advice}") from error
+    except (OSError, ValueError) as error:
+        raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}; {advice}") from error
+    node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
+    if node.get("format") != _FORMAT:
+        raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")
+    try:
+        value = from_data(node.get("value"), arrays)
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    except Exception as error:  # a class met something that it was never meant to hold
+        raise LogError(f"{path} is damaged, or was made by hand: {error}") from error
+    if not isinstance(value, kinds):
+        raise LogError(f"{path} holds a {type(value).__name__}, not a {wanted}")
+    return value
 
 
 @dataclass(frozen=True, eq=False, init=False)

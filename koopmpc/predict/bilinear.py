@@ -14,11 +14,9 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.lifting.base import Lifting
-from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.base import Predictor
-from koopmpc.predict.files import load_value
-from koopmpc.predict.linear import eigen
-from koopmpc.predict.report import FitReport
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.base import FitReport, Predictor, load_value
+from koopmpc.predict.linear import LinearPredictor, eigen
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -78,9 +76,7 @@ class BilinearPredictor(Predictor):
         super().__init__(A, B, C, lifting, dt, states, inputs, report, embedding)
         self._set(N=checks.array(N, "N", (self.nu, self.nz, self.nz)))
 
-    def rollout(
-        self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None
-    ) -> Float[np.ndarray, "steps nx"]:
+    def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
 
         Parameters
@@ -117,12 +113,12 @@ class BilinearPredictor(Predictor):
         return eigen(self.A)[0]
 
 
-def load_bilinear_predictor(path: str | Path) -> BilinearPredictor:
-    """Read a predictor that `BilinearPredictor.save` wrote; runs no code of the file.
+def load_model(path: str | Path) -> LinearPredictor | BilinearPredictor:
+    """Read a predictor that its `save` wrote, of whichever kind; runs no code of the file.
 
     Raises
     ------
     LogError
-        The file is missing, damaged, or no bilinear predictor.
+        The file is missing, damaged, or no predictor.
     """
-    return load_value(path, BilinearPredictor)
+    return load_value(path, LinearPredictor, BilinearPredictor)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -17,13 +16,10 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.projected import Projected
-from koopmpc.lifting.state import State
-from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.base import Predictor
-from koopmpc.predict.files import load_value
-from koopmpc.predict.report import FitReport
+from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.state import Constant, State
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.base import FitReport, Predictor
 
 _DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent
 
@@ -222,14 +218,3 @@ def eigen(
     values, vectors = np.asarray(result.eigenvalues, complex), np.asarray(result.eigenvectors, complex)
     order = np.lexsort((np.imag(values), -np.abs(values)))
     return values[order], vectors[:, order]
-
-
-def load_predictor(path: str | Path) -> LinearPredictor:
-    """Read a predictor that `LinearPredictor.save` wrote; runs no code of the file.
-
-    Raises
-    ------
-    LogError
-        The file is missing, damaged, or no predictor.
-    """
-    return load_value(path, LinearPredictor)

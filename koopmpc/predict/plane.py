@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.lifting.chosen import index
+from koopmpc.lifting.base import index
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.values import Value
 

@@ -15,7 +15,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.projected import Projected
+from koopmpc.lifting.reduced import Projected
 from koopmpc.predict.bilinear import BilinearPredictor
 from koopmpc.predict.linear import LinearPredictor
 
@@ -112,9 +112,7 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
             error += np.sum(np.abs(gap) ** 2, axis=0)
             size += np.sum(np.abs(phi[:-1]) ** 2, axis=0)
     if (size == 0).any():
-        raise DataError(
-            f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it"
-        )
+        raise DataError(f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it")
     return np.sqrt(error / size)
 
 
@@ -141,3 +139,45 @@ def _lifted_modes(predictor: LinearPredictor) -> tuple[Complex[np.ndarray, "nl n
     if predictor.exact_modes is not None and isinstance(predictor.lifting, Projected):
         return predictor.exact_modes, predictor.lifting.lifting
     return predictor.eigenvectors, predictor.lifting
+
+
+def evolution_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.ndarray, " nz"]:
+    """Return ‖φ(x_k) − λᵏ φ(x₀)‖ / ‖φ(x_k)‖, k = 0 … T, for each eigenfunction: 0 where it evolves linearly.
+
+    The norm runs over all steps of all episodes; the order is that of ``predictor.eigenvalues``. One step is what
+    `linearity_error` checks; here errors add up over the run.
+
+    Parameters
+    ----------
+    predictor
+        Autonomous: φ = ξᴴ ψ with ξᴴ A = λ ξᴴ.
+    episodes
+        Data of the same states, without inputs.
+
+    Raises
+    ------
+    ShapeError
+        The data have other states or inputs.
+    DataError
+        The predictor has inputs, an eigenfunction is 0 on all data, dt differs, or A is defective.
+
+    References
+    ----------
+    Snyder & Song, "Koopman operator theory for nonlinear dynamic modeling using dynamic mode decomposition", 2021.
+    """
+    if predictor.nu + predictor.nw:
+        raise DataError(
+            "the predictor has inputs, and φ(x_k) = λᵏ φ(x₀) holds without; pass an autonomous fit, or use "
+            "linearity_error"
+        )
+    same_names(predictor, episodes)
+    error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
+    for episode in episodes:
+        phi = predictor.eigenfunctions(episode.X)
+        with np.errstate(over="ignore", invalid="ignore"):
+            promised = predictor.eigenvalues ** np.arange(len(phi))[:, None] * phi[0]
+            error += np.sum(np.abs(phi - promised) ** 2, axis=0)
+        size += np.sum(np.abs(phi) ** 2, axis=0)
+    if (size == 0).any():
+        raise DataError(f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it")
+    return np.sqrt(error / size)

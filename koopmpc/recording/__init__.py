@@ -1,1 +1,11 @@
-"""Everything that touches Rerun."""
+"""Everything that touches Rerun; `km.recording.record_model` and `km.recording.run_episodes` beside what `km` has."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.recording.format.reader import run_episodes as run_episodes
+    from koopmpc.recording.model import record_model as record_model
+else:
+    __getattr__, __dir__, __all__ = attach(__name__, {"format.reader": "run_episodes", "model": "record_model"})

@@ -1,5 +1,5 @@
-"""record_model: a predictor and how far it can be trusted, as one Rerun log."""
 # pyright: basic
+"""record_model: a predictor and how far it can be trusted, as one Rerun log."""
 
 import re
 import uuid
@@ -13,15 +13,72 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.identify.trust import TrustReport
-from koopmpc.predict.forecast import Forecast, forecast
 from koopmpc.predict.linear import LinearPredictor
 from koopmpc.predict.plane import Axes, Plane, plane_through
-from koopmpc.predict.score import Predictor, score
-from koopmpc.recording.eigenvalues import draw_eigenvalues, eigenvalue_views
-from koopmpc.recording.forecasts import error_series, forecast_series, input_series
-from koopmpc.recording.glyphs import drawable
-from koopmpc.recording.planes import draw_eigenfunctions, plane_view
+from koopmpc.recording.description import drawable
+from koopmpc.recording.views.blueprint import PALETTE
+from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
+from koopmpc.scene import Color
+from koopmpc.validate.forecast import Forecast, forecast
+from koopmpc.validate.report import TrustReport
+from koopmpc.validate.scoring import Predictor, Score, score
+
+_TRUTH: Color = (225, 228, 232)
+_PREDICTED = PALETTE[0]
+_BAND: Color = (70, 125, 185)
+
+
+class Series:
+    """One entity: rows of several curves at steps of dt, with names, colours and widths."""
+
+    def __init__(self, values: np.ndarray, first: int, dt: float, curves: list[tuple[str, Color, float]]) -> None:
+        self.values, self.first, self.dt, self.curves = values, first, dt, curves
+
+    def send(self, rec: Any, entity: str, *, steps: bool = False) -> None:
+        """Write the style and the columns."""
+        import rerun as rr
+
+        names, colors, widths = (list(part) for part in zip(*self.curves, strict=True))
+        more: dict[str, Any] = {"interpolation_mode": "StepAfter"} if steps else {}
+        drawn = [drawable(name) for name in names]
+        rec.log(entity, rr.SeriesLines(names=drawn, colors=colors, widths=widths, **more), static=True)
+        k = self.first + np.arange(len(self.values))
+        nanoseconds = np.rint(k * self.dt * 1e9).astype("timedelta64[ns]")
+        columns = rr.Scalars.columns(scalars=self.values.ravel()).partition([len(names)] * len(k))
+        rec.send_columns(
+            entity,
+            [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)],
+            columns,
+        )
+
+
+def forecast_series(ahead: Forecast, i: int) -> Series:
+    """Return truth, prediction and, where it is finite, the band of the i-th state."""
+    curves = [("truth", _TRUTH, 2.0), ("prediction", _PREDICTED, 2.0)]
+    columns = [ahead.truth[:, i], ahead.predicted[:, i]]
+    known = np.isfinite(ahead.predicted[:, i])
+    if ahead.band and np.isfinite(ahead.low[known, i]).all() and np.isfinite(ahead.high[known, i]).all():
+        curves += [(f"{ahead.band}, low", _BAND, 1.0), (f"{ahead.band}, high", _BAND, 1.0)]
+        columns += [ahead.low[:, i], ahead.high[:, i]]
+    return Series(np.column_stack(columns), 0, ahead.dt, curves)
+
+
+def input_series(ahead: Forecast) -> Series:
+    """Return the inputs of the forecast, each held for a step."""
+    curves = [(name, PALETTE[(1 + j) % len(PALETTE)], 2.0) for j, name in enumerate(ahead.inputs)]
+    return Series(ahead.U, 0, ahead.dt, curves)
+
+
+def error_series(score: Score, i: int, dt: float) -> Series:
+    """Return the root-mean-square error of the i-th state and the 5 and 95 % quantiles of its errors."""
+    values = np.column_stack([score.rmse[:, i], score.low[:, i], score.high[:, i]])
+    curves = [
+        ("RMSE", _PREDICTED, 2.5),
+        ("5 % of the errors", _BAND, 1.0),
+        ("95 % of the errors", _BAND, 1.0),
+    ]
+    return Series(values, 1, dt, curves)
+
 
 _ESCAPED, _BEFORE = re.compile(r"([|*_`])"), r"\\\1"  # what Markdown would not take as it stands
 _FLUSH = 10.0  # longest wait for the file [s]
@@ -77,11 +134,7 @@ def record_model(
     import rerun as rr
 
     if horizon is None:
-        horizon = (
-            min(len(episode) for episode in predictor.embed(episodes))
-            if report is None
-            else report.score.horizon
-        )
+        horizon = min(len(episode) for episode in predictor.embed(episodes)) if report is None else report.score.horizon
     errors = score(predictor, episodes, horizon) if report is None else report.score
     bands = errors if report is None else report.band
     count = checks.count(rollouts, "rollouts")
@@ -125,11 +178,7 @@ def _pictures(
 ) -> tuple[list[Picture], Plane | None, str]:
     """Return the eigenfunctions, their plane, and why there are none where nobody asked for some."""
     if not isinstance(predictor, LinearPredictor) or (predictor.nx < 2 and which is None):
-        why = (
-            "has no eigenfunctions"
-            if predictor.nx > 1
-            else "has one state: there is no plane to draw them on"
-        )
+        why = "has no eigenfunctions" if predictor.nx > 1 else "has one state: there is no plane to draw them on"
         if which is not None:
             raise DataError("a bilinear predictor has no eigenfunctions; leave `which` out")
         return [], None, f"The predictor {why}."
@@ -150,9 +199,7 @@ def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int
     if report is not None:
         near = np.abs(values[:, None] - report.residuals.eigenvalues).argmin(axis=1)
         order = np.argsort(report.residuals.residuals[near], kind="stable")
-    moving = [
-        int(j) for j in order if values[j].imag >= 0 and abs(values[j] - 1) > 1e-9
-    ]  # λ = 1: often φ = 1
+    moving = [int(j) for j in order if values[j].imag >= 0 and abs(values[j] - 1) > 1e-9]  # λ = 1: often φ = 1
     return moving[:_EIGENFUNCTIONS] or [0]
 
 

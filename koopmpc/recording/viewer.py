@@ -1,14 +1,92 @@
-"""view: logs in one Rerun viewer; screenshot: a picture of a log without a screen."""
 # pyright: basic
+"""view: logs in one Rerun viewer; screenshot: a picture of a log without a screen."""
 
+import os
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from time import sleep
 
 from koopmpc.errors import LogError
-from koopmpc.recording.columns import check_log
-from koopmpc.recording.connect import has_display, open_viewer, program, start_viewer
+from koopmpc.recording.format.columns import check_log
+
+PORT = 9876
+_START = 15.0  # longest wait for a viewer that was opened [s]
+
+
+def find_viewer(port: int = PORT) -> str | None:
+    """Return the address of the viewer at `port`, opened if there is none yet; None where there is no display."""
+    if not is_up(port) and not (has_display() and open_viewer([], port)):
+        return None
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def why_none(port: int = PORT) -> str:
+    """Return in words why `find_viewer` found none."""
+    listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and"
+    if not has_display():
+        return f"{listens} there is no display to open one on"
+    return f"{listens} the one that was opened did not start; run `{program()}` to see what it says"
+
+
+def is_up(port: int) -> bool:
+    """Return whether something listens at `port` of this machine."""
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=0.2):
+            return True
+    except OSError:
+        return False
+
+
+def has_display() -> bool:
+    """Return whether a window can be opened."""
+    if sys.platform.startswith("linux"):
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return True
+
+
+def open_viewer(logs: Sequence[str], port: int = PORT) -> bool:
+    """Start a viewer that lives on by itself and listens to this machine alone; return whether it came up."""
+    viewer = start_viewer(*logs, port=port)
+    if viewer is not None:
+        viewer.returncode = 0  # nobody waits for it
+    return viewer is not None
+
+
+def start_viewer(*arguments: str, port: int) -> "subprocess.Popen[bytes] | None":
+    """Start the viewer's process and return it as soon as it listens; None where it ends before, or never does."""
+    command = [str(program()), "--bind", "127.0.0.1", "--port", str(port), *arguments]
+    quiet = subprocess.DEVNULL
+    viewer = subprocess.Popen(
+        command,
+        stdin=quiet,
+        stdout=quiet,
+        stderr=quiet,
+        start_new_session=True,
+        env=os.environ | {"RUST_LOG": "error"},  # its notes would cover the picture
+    )
+    deadline = time.monotonic() + _START
+    while time.monotonic() < deadline and viewer.poll() is None:
+        if is_up(port):
+            return viewer
+        time.sleep(0.05)
+    viewer.kill()
+    viewer.wait()
+    return None
+
+
+def program() -> Path:
+    """Return the viewer itself, not the script that starts it: that one would leave it behind when it ends."""
+    import rerun_cli
+
+    folder = Path(rerun_cli.__file__).parent
+    if sys.platform == "darwin" and (app := folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun").exists():
+        return app
+    return folder / ("rerun.exe" if sys.platform.startswith("win") else "rerun")
+
 
 _SETTLE = 2.5  # until plots have found their ranges [s]
 
@@ -31,9 +109,7 @@ def view(logs: str | Path | Sequence[str | Path]) -> None:
         raise LogError(f"the viewer did not start; run `{program()} {paths[0]}` to see what it says")
 
 
-def screenshot(
-    log: str | Path, picture: str | Path, *, time: float, size: tuple[int, int] = (1600, 1000)
-) -> None:
+def screenshot(log: str | Path, picture: str | Path, *, time: float, size: tuple[int, int] = (1600, 1000)) -> None:
     """Write `picture` (.png) of `log` at `time` [s], as its blueprint lays it out; needs no screen, but Vulkan.
 
     Raises
@@ -45,9 +121,7 @@ def screenshot(
 
     (path,) = _existing(log)
     port = free_port()
-    viewer = start_viewer(
-        "--headless", "--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", port=port
-    )
+    viewer = start_viewer("--headless", "--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", port=port)
     if viewer is None:
         raise LogError(f"no picture of {path}: the viewer did not start; is a Vulkan driver installed?")
     try:

@@ -5,12 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+import koopmpc as km
 from koopmpc.bench.faults import FAULTS
-from koopmpc.bench.library import load_problem
 from koopmpc.bench.results import reached
-from koopmpc.bench.sweep import sweep
-from koopmpc.loop.metrics import metrics
-from koopmpc.recording.reader import load_run
 
 
 def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypatch, capsys):
@@ -20,8 +17,8 @@ def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypa
     found = {}
     exec(source, found)
     run = found["run"]
-    assert load_run("pendulum.rrd") == run
-    assert capsys.readouterr().out == f"{metrics(run)}\n"
+    assert km.load_run("pendulum.rrd") == run
+    assert capsys.readouterr().out == f"{km.metrics(run)}\n"
     assert reached(run)
     assert np.abs(run.U).max() <= 25
     assert {status.name for status in run.status} <= {"UNCONSTRAINED", "OPTIMAL"}
@@ -32,7 +29,7 @@ def test_the_example_of_the_documentation_runs_and_reaches(tmp_path):
     (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     path = tmp_path / "spring.py"
     path.write_text(source)
-    rows = sweep([load_problem(path)], folder=tmp_path / "logs")
+    rows = km.sweep([km.load_problem(path)], folder=tmp_path / "logs")
     assert [row.failure for row in rows] == [None] * len(rows)
     push = {row.controller: row for row in rows if row.case == "push"}
     for row in rows:

@@ -4,63 +4,58 @@ from dataclasses import replace
 
 import pytest
 
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.problem import Case, Training
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
-from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
-from koopmpc.lifting.fourier import Fourier
+import koopmpc as km
 from tests.bench.tiny import write
 
 
 @pytest.fixture
 def problem(tmp_path):
-    return load_problem(write(tmp_path))
+    return km.load_problem(write(tmp_path))
 
 
 @pytest.mark.parametrize(
     ("change", "error", "text"),
     [
-        ({"cases": {}}, DataError, "needs at least one case"),
+        ({"cases": {}}, km.errors.DataError, "needs at least one case"),
         (
-            {"cases": {"bad": Case([1.0, 2.0], [0.0], 3)}},
-            ShapeError,
+            {"cases": {"bad": km.Case([1.0, 2.0], [0.0], 3)}},
+            km.errors.ShapeError,
             r"case 'bad': x0 has shape \(2,\), expected \(1,\)",
         ),
-        ({"equilibrium": ([0.0, 0.0], [0.0])}, ShapeError, r"equilibrium x has shape \(2,\)"),
-        ({"equilibrium": ([float("nan")], [0.0])}, DataError, "equilibrium x holds 1 NaN"),
-        ({"dt": 0.0}, DataError, "dt is 0 s; it must be above zero"),
-        ({"horizon": 0}, DataError, "horizon is 0; it must be at least 1"),
-        ({"ridge": -1.0}, DataError, "ridge is -1; it must be zero or above"),
-        ({"angles": (1,)}, DataError, "angles holds 1; pass indices of states, 0 to 0"),
+        ({"equilibrium": ([0.0, 0.0], [0.0])}, km.errors.ShapeError, r"equilibrium x has shape \(2,\)"),
+        ({"equilibrium": ([float("nan")], [0.0])}, km.errors.DataError, "equilibrium x holds 1 NaN"),
+        ({"dt": 0.0}, km.errors.DataError, "dt is 0 s; it must be above zero"),
+        ({"horizon": 0}, km.errors.DataError, "horizon is 0; it must be at least 1"),
+        ({"ridge": -1.0}, km.errors.DataError, "ridge is -1; it must be zero or above"),
+        ({"angles": (1,)}, km.errors.DataError, "angles holds 1; pass indices of states, 0 to 0"),
         (
-            {"cases": {"bad": Case([1.0], [0.0, 0.0], 3)}},
-            ShapeError,
+            {"cases": {"bad": km.Case([1.0], [0.0, 0.0], 3)}},
+            km.errors.ShapeError,
             r"case 'bad': reference has shape \(2,\), expected \(1,\) or \(steps\+1, nr\) = \(4, 1\)",
         ),
         (
-            {"cases": {"bad": Case([1.0], [[0.0]] * 3, 3)}},
-            ShapeError,
+            {"cases": {"bad": km.Case([1.0], [[0.0]] * 3, 3)}},
+            km.errors.ShapeError,
             r"case 'bad': reference has shape \(3, 1\), expected",
         ),
-        ({"cost": Cost(Q=[1.0, 2.0], R=1.0)}, ShapeError, r"Q has shape \(2,\), expected \(1, 1\)"),
-        ({"cost": Cost(Q=1.0, R=[1.0, 2.0])}, ShapeError, r"R has shape \(2,\)"),
+        ({"cost": km.Cost(Q=[1.0, 2.0], R=1.0)}, km.errors.ShapeError, r"Q has shape \(2,\), expected \(1, 1\)"),
+        ({"cost": km.Cost(Q=1.0, R=[1.0, 2.0])}, km.errors.ShapeError, r"R has shape \(2,\)"),
         (
-            {"cost": Cost(Q=1.0, R=1.0, of=Fourier(1, ["speed"]))},
-            KoopmpcError,
+            {"cost": km.Cost(Q=1.0, R=1.0, of=km.Fourier(1, ["speed"]))},
+            km.KoopmpcError,
             "speed",
         ),
-        ({"limits": Limits(u_max=[1.0, 2.0])}, ShapeError, r"limits: u_max has shape \(2,\)"),
-        ({"limits": Limits(du_max=[1.0, 2.0])}, ShapeError, r"limits: du_m.. has shape \(2,\)"),
-        ({"limits": Limits(x_min=[0.0, 0.0])}, ShapeError, r"limits: x_min has shape \(2,\)"),
+        ({"limits": km.Limits(u_max=[1.0, 2.0])}, km.errors.ShapeError, r"limits: u_max has shape \(2,\)"),
+        ({"limits": km.Limits(du_max=[1.0, 2.0])}, km.errors.ShapeError, r"limits: du_m.. has shape \(2,\)"),
+        ({"limits": km.Limits(x_min=[0.0, 0.0])}, km.errors.ShapeError, r"limits: x_min has shape \(2,\)"),
         (
-            {"limits": Limits(of=Fourier(1), y_max=[1.0, 1.0, 1.0])},
-            ShapeError,
+            {"limits": km.Limits(of=km.Fourier(1), y_max=[1.0, 1.0, 1.0])},
+            km.errors.ShapeError,
             r"limits: y_max has shape \(3,\), expected \(2,\)",
         ),
         (
-            {"cases": {"bad": Case([1.0], [0.0], 3, limits=Limits(u_max=[1.0, 2.0]))}},
-            ShapeError,
+            {"cases": {"bad": km.Case([1.0], [0.0], 3, limits=km.Limits(u_max=[1.0, 2.0]))}},
+            km.errors.ShapeError,
             r"case 'bad': limits: u_max has shape \(2,\)",
         ),
     ],
@@ -72,30 +67,30 @@ def test_what_does_not_fit_is_refused(problem, change, error, text):
 
 @pytest.mark.parametrize("name", ["up/down", "up\\down", "a:b", "two words", "line\nend", ""])
 def test_a_case_is_named_as_a_file_can_be(problem, name):
-    with pytest.raises(DataError, match="its logs are named after it: leave out spaces"):
-        replace(problem, cases={name: Case([1.0], [0.0], 3)})
+    with pytest.raises(km.errors.DataError, match="its logs are named after it: leave out spaces"):
+        replace(problem, cases={name: km.Case([1.0], [0.0], 3)})
 
 
 @pytest.mark.parametrize("reference", [0.0, [0.0], [[0.0]] * 4])
 def test_every_form_of_a_reference_that_simulate_takes_fits(problem, reference):
-    assert replace(problem, cases={"good": Case([1.0], reference, 3)}).cases.keys() == {"good"}
+    assert replace(problem, cases={"good": km.Case([1.0], reference, 3)}).cases.keys() == {"good"}
 
 
 def test_a_case_needs_steps_and_numbers():
-    with pytest.raises(DataError, match=r"Case\.steps is 0; it must be at least 1"):
-        Case([0.0], [0.0], 0)
-    with pytest.raises(DataError, match=r"Case\.x0 holds 1 NaN"):
-        Case([float("nan")], [0.0], 3)
+    with pytest.raises(km.errors.DataError, match=r"Case\.steps is 0; it must be at least 1"):
+        km.Case([0.0], [0.0], 0)
+    with pytest.raises(km.errors.DataError, match=r"Case\.x0 holds 1 NaN"):
+        km.Case([float("nan")], [0.0], 3)
 
 
 def test_training_needs_episodes():
-    with pytest.raises(DataError, match=r"Training\.episodes is 0"):
-        Training([0.0], lambda k, y, rng: [0.0], episodes=0, steps=3)
+    with pytest.raises(km.errors.DataError, match=r"Training\.episodes is 0"):
+        km.Training([0.0], lambda k, y, rng: [0.0], episodes=0, steps=3)
 
 
 def test_select_keeps_all_but_the_other_cases(problem):
     one = problem.select("far")
     assert list(one.cases) == ["far"]
     assert one.dynamics is problem.dynamics
-    with pytest.raises(ProblemError, match=r"'tiny' has no case 'fra', did you mean 'far'\?"):
+    with pytest.raises(km.errors.ProblemError, match=r"'tiny' has no case 'fra', did you mean 'far'\?"):
         problem.select("fra")

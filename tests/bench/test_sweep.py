@@ -7,19 +7,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from koopmpc.bench.controllers import CONTROLLERS, chosen
+import koopmpc as km
+from koopmpc.bench.controllers import CONTROLLERS, Prepared, chosen
 from koopmpc.bench.faults import FAULTS, possible
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.prepare import Prepared
 from koopmpc.bench.results import Row, failures, reached, telling
-from koopmpc.bench.sweep import sweep
-from koopmpc.control.limits import Limits
-from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.errors import ProblemError
-from koopmpc.loop.metrics import metrics
-from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder
-from koopmpc.recording.scene import Disk
+from koopmpc.control.move import Fallback
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
 
@@ -29,9 +21,9 @@ SEVEN = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "bili
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
     folder = tmp_path_factory.mktemp("swept")
-    problem = load_problem(write(folder))
+    problem = km.load_problem(write(folder))
     told = []
-    rows = sweep([problem], folder=folder / "logs", progress=lambda *step: told.append(step))
+    rows = km.sweep([problem], folder=folder / "logs", progress=lambda *step: told.append(step))
     return problem, rows, folder / "logs", told
 
 
@@ -48,21 +40,19 @@ def test_all_end_as_they_should_and_the_short_case_is_no_failure(swept):
     _, rows, _, _ = swept
     assert [row.failure for row in rows] == [None] * 14
     assert all(row.reached for row in rows if row.case == "near")
-    assert not any(
-        row.reached for row in rows if row.case == "far"
-    )  # 6 steps are too few: a result, not a failure
+    assert not any(row.reached for row in rows if row.case == "far")  # 6 steps are too few: a result, not a failure
 
 
 def test_figures_are_those_of_the_log_alone(swept):
     _, rows, _, _ = swept
     for row in rows:
-        assert metrics(load_run(row.log)) == row.metrics
+        assert km.metrics(km.load_run(row.log)) == row.metrics
 
 
 def test_the_same_cost_and_limits_judge_every_controller(swept):
     problem, rows, _, _ = swept
     for row in rows:
-        run = load_run(row.log)
+        run = km.load_run(row.log)
         assert run.cost == problem.cost
         assert run.limits == problem.limits_of(row.case)
         assert np.abs(run.U).max() <= (2.0 if row.case == "near" else 1.0)
@@ -86,19 +76,19 @@ def test_the_table_on_disk_has_a_row_a_run(swept):
         assert line["cost"] == row.metrics.cost
         assert line["final_error"] == row.metrics.final_error.tolist()
         assert sum(line["status"].values()) == 40 if row.case == "near" else 6
-        assert set(line["status"]) == {s.name for s in Status}
+        assert set(line["status"]) == {s.name for s in km.Status}
 
 
 def test_a_run_is_the_same_when_it_is_repeated(swept, tmp_path):
     problem, rows, _, _ = swept
-    again = sweep([problem.select("near")], ["koopman-mpc"], folder=tmp_path)
+    again = km.sweep([problem.select("near")], ["koopman-mpc"], folder=tmp_path)
     first = next(row for row in rows if (row.case, row.controller) == ("near", "koopman-mpc"))
-    assert np.array_equal(load_run(again[0].log).U, load_run(first.log).U)
+    assert np.array_equal(km.load_run(again[0].log).U, km.load_run(first.log).U)
 
 
 def test_the_qps_of_a_sweep_are_held_to_their_kkt_conditions(swept, tmp_path):
     before = CheckedOSQP.checked
-    sweep([swept[0].select("far")], ["koopman-mpc", "linear-mpc"], folder=tmp_path)
+    km.sweep([swept[0].select("far")], ["koopman-mpc", "linear-mpc"], folder=tmp_path)
     assert CheckedOSQP.checked > before
 
 
@@ -124,7 +114,7 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
         raise RuntimeError("no such gain")
 
     monkeypatch.setitem(CONTROLLERS, "koopman-lqr", broken)
-    rows = sweep([swept[0].select("far")], folder=tmp_path)
+    rows = km.sweep([swept[0].select("far")], folder=tmp_path)
     assert [row.controller for row in rows if row.failure] == ["koopman-lqr"]
     (row,) = (row for row in rows if row.failure)
     assert row.failure.startswith("RuntimeError: no such gain (the whole traceback is in")
@@ -136,7 +126,7 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
 
 def test_a_model_that_cannot_be_learned_takes_only_its_own_controllers(tmp_path):
     broken = write(tmp_path, **{"km.Noise(-2.0, 2.0)": "lambda k, y, rng: [float('nan')]"})
-    rows = sweep([load_problem(f"{broken}:far")], folder=tmp_path)
+    rows = km.sweep([km.load_problem(f"{broken}:far")], folder=tmp_path)
     assert [row.controller for row in rows if row.failure] == [
         "koopman-lqr",
         "koopman-mpc",
@@ -157,25 +147,25 @@ class Cheat:
         """Nothing to forget."""
 
     def __call__(self, y, reference, applied=None):
-        return Move(np.array([self.u]), Status.OPTIMAL, Fallback.NONE, 0.0, 0)
+        return km.Move(np.array([self.u]), km.Status.OPTIMAL, Fallback.NONE, 0.0, 0)
 
 
 def test_an_input_beyond_its_limit_is_a_failure(swept, tmp_path, monkeypatch):
     monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, 1.5))
-    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure == "u = [1.5] at step 0 is 0.5 beyond a hard limit"
     assert row.metrics is not None
 
 
 def test_an_input_that_is_not_finite_is_a_failure(swept, tmp_path, monkeypatch):
     monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, np.nan))
-    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert "every input must be finite" in row.failure
 
 
 def test_a_log_that_differs_is_a_failure(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.load_run", lambda path: None)
-    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure == "tiny-far-lqr.rrd does not read back equal to the run"
 
 
@@ -184,17 +174,17 @@ def test_a_scene_that_cannot_be_drawn_costs_the_drawing_and_nothing_else(swept, 
     def drawn(x, u):
         if scene == "raises" and x[0] < 0.9:
             raise ZeroDivisionError("division by [zero]")
-        disk = Disk("b" if scene == "renames" and x[0] < 0.9 else "a", (0.0, 0.0), 0.1)
+        disk = km.scene.Disk("b" if scene == "renames" and x[0] < 0.9 else "a", (0.0, 0.0), 0.1)
         return 3 if scene == "is no list" else [disk]
 
     problem = replace(swept[0].select("far"), scene=drawn)
-    rows = sweep([problem], ["lqr", "koopman-mpc"], folder=tmp_path)
+    rows = km.sweep([problem], ["lqr", "koopman-mpc"], folder=tmp_path)
     whole = {row.controller: row for row in swept[1] if row.case == "far"}
     for row in rows:
         assert row.failure.startswith("the log is without its scene: drawing scene(x, u) raised ")
         assert scene != "raises" or "ZeroDivisionError: division by [zero]" in row.failure
         assert row.metrics.cost == whole[row.controller].metrics.cost
-        assert np.array_equal(load_run(row.log).U, load_run(whole[row.controller].log).U)
+        assert np.array_equal(km.load_run(row.log).U, km.load_run(whole[row.controller].log).U)
         assert "drawn" in row.log.with_suffix(".txt").read_text() or scene != "raises"
 
 
@@ -204,7 +194,7 @@ def test_a_log_that_cannot_be_written_takes_no_figures_and_is_not_offered(swept,
         raise OSError("no space left")
 
     monkeypatch.setattr("koopmpc.bench.sweep.record", full)
-    (row,) = sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
+    (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure.startswith("OSError: no space left (the whole traceback is in ")
     assert row.metrics is not None
     assert row.log is None
@@ -234,7 +224,7 @@ def test_the_run_to_look_at_is_the_hardest_that_koopman_mpc_manages(swept):
     assert telling([]) is None
 
 
-class Unseen(Recorder):
+class Unseen(km.Recorder):
     """A Recorder that streams nowhere."""
 
     def __init__(self, *, live, **about):
@@ -250,10 +240,10 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
     problem, rows, _, _ = swept
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
-    (row,) = sweep([problem.select("far")], ["koopman-mpc"], folder=tmp_path, live=True)
+    (row,) = km.sweep([problem.select("far")], ["koopman-mpc"], folder=tmp_path, live=True)
     assert row.failure is None
-    live = load_run(row.log)
-    kept = load_run(next(r.log for r in rows if (r.case, r.controller) == ("far", "koopman-mpc")))
+    live = km.load_run(row.log)
+    kept = km.load_run(next(r.log for r in rows if (r.case, r.controller) == ("far", "koopman-mpc")))
     assert np.array_equal(live.U, kept.U)
     assert live.plans == kept.plans
     assert live.metadata == kept.metadata
@@ -262,13 +252,13 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
 def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: None)
     with pytest.warns(UserWarning, match="no Rerun viewer listens at") as caught:
-        rows = sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, live=True)
+        rows = km.sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, live=True)
     assert len(caught) == 1
     assert [row.failure for row in rows] == [None, None]
 
 
 def test_missing_steps_and_statuses_are_failures(swept):
-    run = load_run(next(row.log for row in swept[1] if row.case == "far"))
+    run = km.load_run(next(row.log for row in swept[1] if row.case == "far"))
     assert failures(run, 6) == []
     assert failures(run, 7) == ["it took 6 of 7 steps"]
     assert failures(replace(run, status=run.status[:-1]), 6) == ["5 of 6 steps have a status"]
@@ -276,7 +266,7 @@ def test_missing_steps_and_statuses_are_failures(swept):
 
 
 def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
-    run = load_run(next(row.log for row in swept[1] if row.case == "near"))
+    run = km.load_run(next(row.log for row in swept[1] if row.case == "near"))
     X = np.full_like(run.X, 1.0)
     X[1:] = 0.049
     assert reached(replace(run, X=X))
@@ -288,26 +278,26 @@ def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
 
 def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
     with pytest.raises(
-        ProblemError,
+        km.errors.ProblemError,
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
-        sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
+        km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
     assert list(chosen(None)) == SEVEN
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
     both = [swept[0], swept[0].select("far")]
-    with pytest.raises(ProblemError, match=r"tiny:far comes twice, and its logs would have one name"):
-        sweep(both, folder=tmp_path / "none")
+    with pytest.raises(km.errors.ProblemError, match=r"tiny:far comes twice, and its logs would have one name"):
+        km.sweep(both, folder=tmp_path / "none")
     assert not (tmp_path / "none").exists()
-    rows = sweep([swept[0].select("near"), swept[0].select("far")], ["lqr"], folder=tmp_path)
+    rows = km.sweep([swept[0].select("near"), swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert [row.failure for row in rows] == [None, None]
 
 
 @pytest.fixture(scope="module")
 def faulty(swept, tmp_path_factory):
     folder = tmp_path_factory.mktemp("faulty")
-    return sweep([swept[0]], folder=folder, faults=True), folder
+    return km.sweep([swept[0]], folder=folder, faults=True), folder
 
 
 def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(faulty):
@@ -323,7 +313,7 @@ def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(
 
 def test_a_fault_is_named_in_its_log_and_in_no_other(faulty):
     for row in faulty[0]:
-        metadata = load_run(row.log).metadata
+        metadata = km.load_run(row.log).metadata
         if row.fault is None:
             assert not metadata.keys() & {"fault", "faults"}
         else:
@@ -335,13 +325,13 @@ def test_a_fault_is_named_in_its_log_and_in_no_other(faulty):
 def test_rows_without_a_fault_are_those_of_a_sweep_without_faults(swept, faulty):
     bare = [row for row in faulty[0] if row.fault is None]
     for row, other in zip(bare, swept[1], strict=True):
-        assert np.array_equal(load_run(row.log).U, load_run(other.log).U)
+        assert np.array_equal(km.load_run(row.log).U, km.load_run(other.log).U)
 
 
 def test_all_controllers_meet_the_same_faults(faulty):
     hidden, lost = [], []
     for row in faulty[0]:
-        run = load_run(row.log)
+        run = km.load_run(row.log)
         if row.fault == "nan-sensor" and row.case == "near":
             hidden.append(np.isnan(run.Y))
         if row.fault == "actuator-loss":
@@ -354,24 +344,24 @@ def test_all_controllers_meet_the_same_faults(faulty):
 def test_a_live_faulty_run_leaves_the_same_log(swept, faulty, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
-    rows = sweep([swept[0].select("far")], ["koopman-mpc"], folder=tmp_path, live=True, faults=True)
+    rows = km.sweep([swept[0].select("far")], ["koopman-mpc"], folder=tmp_path, live=True, faults=True)
     assert [row.failure for row in rows] == [None] * (1 + len(FAULTS))
     for row in rows:
         same = (row.case, row.controller, row.fault)
         kept = next(r for r in faulty[0] if (r.case, r.controller, r.fault) == same)
-        assert np.array_equal(load_run(row.log).U, load_run(kept.log).U)
+        assert np.array_equal(km.load_run(row.log).U, km.load_run(kept.log).U)
 
 
 def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path):
-    free = replace(swept[0].select("near"), limits=Limits(x_max=5.0))
-    rows = sweep([free], ["lqr"], folder=tmp_path, faults=True)
+    free = replace(swept[0].select("near"), limits=km.Limits(x_max=5.0))
+    rows = km.sweep([free], ["lqr"], folder=tmp_path, faults=True)
     assert [row.fault for row in rows] == [None, *(name for name in FAULTS if name != "actuator-loss")]
     assert not any(row.failure for row in rows)
-    assert possible(Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
-    assert "actuator-loss" not in possible(Limits(u_min=-np.inf))
+    assert possible(km.Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
+    assert "actuator-loss" not in possible(km.Limits(u_min=-np.inf))
 
 
 def test_a_run_that_diverged_reaches_nothing_and_warns_of_nothing(swept):
-    run = load_run(next(row.log for row in swept[1] if row.case == "far"))
+    run = km.load_run(next(row.log for row in swept[1] if row.case == "far"))
     for value in (np.inf, np.nan, 1e200):
         assert not reached(replace(run, X=np.full_like(run.X, value)))

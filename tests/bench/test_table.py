@@ -98,9 +98,7 @@ def faulty_rows():
 def test_faults_are_a_line_each_under_the_table_of_their_case():
     text = printed(table(faulty_rows()))
     assert text.index("plant:case ") < text.index("plant:case under faults")
-    line = {
-        name: next(t for t in text.split("\n") if t.strip().startswith(name)) for name in ("nan-", "delay")
-    }
+    line = {name: next(t for t in text.split("\n") if t.strip().startswith(name)) for name in ("nan-", "delay")}
     assert line["nan-"].split() == ["nan-sensor", "lost", "(50)", "1.010", "(2)", "raised"]
     assert line["delay"].split() == ["delay", "5e+02", "(2)", "1.000", "(2)", "1.000", "(2)"]
     assert "plant:case nonlinear-mpc nan-sensor: RuntimeError: no [luck]" in text

@@ -35,7 +35,7 @@ problem = km.Problem(
         "near": km.Case(x0=[0.5], reference=[0.0], steps=40),
         "far": km.Case(x0=[1.0], reference=[0.0], steps=6, limits=km.Limits(u_min=-1.0, u_max=1.0)),
     },
-    scene=lambda x, u: [km.Disk("level", (0.0, float(x[0])), 0.1)],
+    scene=lambda x, u: [km.scene.Disk("level", (0.0, float(x[0])), 0.1)],
 )
 '''
 

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from koopmpc.control.move import Status
+import koopmpc as km
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.osqp import DEFAULTS, OSQP
 
@@ -26,7 +26,7 @@ class CheckedOSQP(OSQP):
 
     def solve(self, v, y, time_limit=None):
         solution = super().solve(v, y, time_limit)
-        if solution.status is Status.OPTIMAL:
+        if solution.status is km.Status.OPTIMAL:
             now = QP(self.qp.P, self.qp.q, self.qp.A, self._bounds.low, self._bounds.high)
             meets_kkt(now, solution, *self.eps)
             CheckedOSQP.checked += 1

@@ -5,7 +5,7 @@ import numpy as np
 import scipy.linalg
 
 import koopmpc as km
-from koopmpc.control.stationary import stationary
+from koopmpc.control.riccati import stationary
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
 

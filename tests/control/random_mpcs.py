@@ -122,9 +122,7 @@ def random_case(rng, kind, solver):
     )
     names = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
     model = km.LinearPredictor(A, B, np.eye(nx), km.State(), 0.1, *names)
-    cost = km.Cost(
-        Q, np.diag(R), Q_N=Q_N, R_delta=np.diag(R_delta) if R_delta.any() else None, u_target="zero"
-    )
+    cost = km.Cost(Q, np.diag(R), Q_N=Q_N, R_delta=np.diag(R_delta) if R_delta.any() else None, u_target="zero")
     mpc = km.KoopmanMPC(model, cost, limits, N, solver=solver)
     return _written_down(
         kind,
@@ -148,15 +146,11 @@ def _written_down(kind, mpc, limits, pair, weights, scale, hard_rates):
         free[k * nx : (k + 1) * nx], forced[k * nx : (k + 1) * nx] = X, D
     stages = scipy.linalg.block_diag(*[Q] * (N - 1), Q_N)
     change = np.eye(N * nu) - np.eye(N * nu, k=-nu)
-    H = 2 * (
-        forced.T @ stages @ forced + np.kron(np.eye(N), R) + change.T @ np.kron(np.eye(N), R_delta) @ change
-    )
+    H = 2 * (forced.T @ stages @ forced + np.kron(np.eye(N), R) + change.T @ np.kron(np.eye(N), R_delta) @ change)
     box, rates, states = limits.inputs(nu), limits.rates(nu), limits.states(nx)
     no = np.full(nu, np.inf)
     ends = [
-        np.concatenate(
-            [np.tile(part, N) for part in (box[i], (sign * no if rates is None else rates[i]), states[i])]
-        )
+        np.concatenate([np.tile(part, N) for part in (box[i], (sign * no if rates is None else rates[i]), states[i])])
         for i, sign in ((0, -1.0), (1, 1.0))
     ]
     soft_rates, price = limits.rate_softness(nu), limits.rows(nx, 0)
@@ -169,9 +163,7 @@ def _written_down(kind, mpc, limits, pair, weights, scale, hard_rates):
     )
     rows = Rows(np.vstack([np.eye(N * nu), change, forced]), *ends, linear, quadratic)
     half = np.linalg.cholesky(H)
-    return Case(
-        kind, mpc, A, B, scale, N, H, half, free, forced, stages, R_delta, rows, hard_rates, tuple(box)
-    )
+    return Case(kind, mpc, A, B, scale, N, H, half, free, forced, stages, R_delta, rows, hard_rates, tuple(box))
 
 
 def optimality(case, x, r, u_prev, U, tolerance):

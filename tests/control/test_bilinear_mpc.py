@@ -10,66 +10,53 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.control.move import Controller, Fallback, Status
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.state import State
-from koopmpc.plant import compiled
-from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
+from koopmpc.control.move import Controller, Fallback
+from koopmpc.plants import compiled
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
-GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
+GOOD = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
 
 
-def linear(nu: int = 1) -> LinearPredictor:
+def linear(nu: int = 1) -> km.LinearPredictor:
     """Return an unstable plant of three states."""
     A = np.array([[1.05, 0.1, 0], [0, 1.02, 0.1], [0.05, 0, 0.9]])
     B = np.array([[0.02, 0.1], [0.1, 0], [0, 0.2]])[:, :nu]
-    return LinearPredictor(A, B, np.eye(3), State(), 0.1, ("a", "b", "c"), ("u", "v")[:nu])
+    return km.LinearPredictor(A, B, np.eye(3), km.State(), 0.1, ("a", "b", "c"), ("u", "v")[:nu])
 
 
-def pendulum() -> BilinearPredictor:
+def pendulum() -> km.BilinearPredictor:
     """Return θ⁺ = θ + 0.1 ω, ω⁺ = ω + 0.05 sin θ + 0.1 u cos θ, bilinear on [θ ω sin θ cos θ]."""
     A = np.eye(4)
     A[0, 1], A[1, 2] = 0.1, 0.05
     N = np.zeros((1, 4, 4))
     N[0, 1, 3] = 0.1
-    lifting = State() + Fourier(1, states="theta")
-    return BilinearPredictor(A, np.zeros((4, 1)), N, np.eye(2, 4), lifting, 0.1, ("theta", "omega"), ("u",))
+    lifting = km.State() + km.Fourier(1, states="theta")
+    return km.BilinearPredictor(A, np.zeros((4, 1)), N, np.eye(2, 4), lifting, 0.1, ("theta", "omega"), ("u",))
 
 
-UPRIGHT = Expressions(
-    lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ["sin(theta)", "cos(theta)", "omega"]
-).bind(("theta", "omega"))
-CIRCLE = Cost(Q=[2, 2, 0.2], R=0.1, of=UPRIGHT)
+UPRIGHT = km.Expressions(lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ["sin(theta)", "cos(theta)", "omega"]).bind(
+    ("theta", "omega")
+)
+CIRCLE = km.Cost(Q=[2, 2, 0.2], R=0.1, of=UPRIGHT)
 
 
 LIMITS = [
-    Limits(),
-    Limits(u_min=-0.5, u_max=0.3),
-    Limits(u_max=0.1),
-    Limits(u_min=-1, u_max=1, x_max=[0.25, np.inf, 0.3], slack=(50.0, 10.0)),
-    Limits(u_min=-1, u_max=1, x_min=-0.6, x_max=0.6, slack=(1.0, 5.0)),
-    Limits(u_min=-3, u_max=3, x_max=[0.9, np.inf, np.inf], slack=None),
+    km.Limits(),
+    km.Limits(u_min=-0.5, u_max=0.3),
+    km.Limits(u_max=0.1),
+    km.Limits(u_min=-1, u_max=1, x_max=[0.25, np.inf, 0.3], slack=(50.0, 10.0)),
+    km.Limits(u_min=-1, u_max=1, x_min=-0.6, x_max=0.6, slack=(1.0, 5.0)),
+    km.Limits(u_min=-3, u_max=3, x_max=[0.9, np.inf, np.inf], slack=None),
 ]
 
 
 @pytest.mark.parametrize("nu", [1, 2])
 @pytest.mark.parametrize("limits", LIMITS)
-def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: Limits) -> None:
-    model, cost = linear(nu), Cost(Q=[1, 2, 1], R=0.3)
-    ours = BilinearMPC(model, cost, limits, 15)
-    theirs = KoopmanMPC(model, cost, limits, 15, settings=PRECISE)
+def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: km.Limits) -> None:
+    model, cost = linear(nu), km.Cost(Q=[1, 2, 1], R=0.3)
+    ours = km.BilinearMPC(model, cost, limits, 15)
+    theirs = km.KoopmanMPC(model, cost, limits, 15, settings=PRECISE)
     assert isinstance(ours, Controller)
     x = np.array([0.5, -0.4, 0.3])
     for k in range(12):
@@ -82,15 +69,13 @@ def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: Limits) -> None:
         x = model.A @ x + model.B @ a.u
 
 
-@pytest.mark.parametrize(
-    "limits", [Limits(-4, 4), Limits(-0.8, 0.5), Limits(-0.8, 0.8, x_max=[np.inf, 0.15])]
-)
-@pytest.mark.parametrize("cost", [CIRCLE, Cost(Q=[1, 0.1], R=0.1)])
-def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: Cost, limits: Limits) -> None:
+@pytest.mark.parametrize("limits", [km.Limits(-4, 4), km.Limits(-0.8, 0.5), km.Limits(-0.8, 0.8, x_max=[np.inf, 0.15])])
+@pytest.mark.parametrize("cost", [CIRCLE, km.Cost(Q=[1, 0.1], R=0.1)])
+def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: km.Cost, limits: km.Limits) -> None:
     model = pendulum()
     reference = [0, 1, 0] if cost is CIRCLE else [0, 0]
-    ours = BilinearMPC(model, cost, limits, 15, passes=60)
-    theirs = NonlinearMPC(model.step_map(), cost, limits, 15, settings={"ipopt.tol": 1e-10})
+    ours = km.BilinearMPC(model, cost, limits, 15, passes=60)
+    theirs = km.NonlinearMPC(model.step_map(), cost, limits, 15, settings={"ipopt.tol": 1e-10})
     x = np.array([0.7, -0.3])
     for _ in range(5):
         a, b = ours(x, reference), theirs(x, reference)
@@ -102,7 +87,7 @@ def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: Cost, limits: 
 
 def test_its_plan_follows_the_model_once_it_has_converged() -> None:
     model = pendulum()
-    mpc = BilinearMPC(model, CIRCLE, Limits(-1, 1), 20, passes=60)
+    mpc = km.BilinearMPC(model, CIRCLE, km.Limits(-1, 1), 20, passes=60)
     move = mpc([2.0, 0.5], [0, 1, 0])
     plan = mpc.plan()
     assert np.array_equal(plan.X[0], [2.0, 0.5])
@@ -111,7 +96,7 @@ def test_its_plan_follows_the_model_once_it_has_converged() -> None:
 
 
 def test_every_turn_of_the_angle_counts_the_same() -> None:
-    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-1, 1), 20)
+    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-1, 1), 20)
     u = mpc([0.6, -0.2], [0, 1, 0]).u
     mpc.reset()
     assert np.allclose(mpc([0.6 + 2 * np.pi, -0.2], [0, 1, 0]).u, u, atol=1e-8)
@@ -119,10 +104,10 @@ def test_every_turn_of_the_angle_counts_the_same() -> None:
 
 @pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
 def test_machine_code_and_interpreter_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    limits = Limits(-0.8, 0.5, x_max=[np.inf, 0.15])
-    fast = BilinearMPC(pendulum(), CIRCLE, limits, 20)
+    limits = km.Limits(-0.8, 0.5, x_max=[np.inf, 0.15])
+    fast = km.BilinearMPC(pendulum(), CIRCLE, limits, 20)
     monkeypatch.setattr(compiled, "compiler", lambda: None)
-    slow = BilinearMPC(pendulum(), CIRCLE, limits, 20)
+    slow = km.BilinearMPC(pendulum(), CIRCLE, limits, 20)
     assert fast._iteration.compiled
     assert not slow._iteration.compiled
     x = np.array([2.5, 0.3])
@@ -133,7 +118,7 @@ def test_machine_code_and_interpreter_agree(monkeypatch: pytest.MonkeyPatch) -> 
         x = pendulum().step_map()(x, a.u)
 
 
-SHARED = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5, x_min=[-9, -1], x_max=[9, 1]), 10)
+SHARED = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5, x_min=[-9, -1], x_max=[9, 1]), 10)
 measured = st.one_of(st.floats(-20, 20), st.sampled_from([np.nan, np.inf, -np.inf, 1e300, 1e31, 0.0]))
 
 
@@ -148,31 +133,31 @@ def test_whatever_it_measures_its_input_is_inside_the_limits(states: list, fresh
         assert (move.u <= 0.5).all()
         assert (move.status in GOOD) == (move.fallback is Fallback.NONE)
         bad = not np.abs(x).max() < 1e30
-        assert (move.status is Status.BAD_MEASUREMENT) == bad
+        assert (move.status is km.Status.BAD_MEASUREMENT) == bad
         assert (SHARED.plan() is None) == (move.status not in GOOD)
 
 
 def test_hard_limits_that_nothing_meets_are_found() -> None:
-    limits = Limits(-1, 1, x_max=[0.5, np.inf], slack=None)
-    mpc = BilinearMPC(pendulum(), Cost(1, 0.1), limits, 10)
+    limits = km.Limits(-1, 1, x_max=[0.5, np.inf], slack=None)
+    mpc = km.BilinearMPC(pendulum(), km.Cost(1, 0.1), limits, 10)
     plan = [mpc([0.4, -0.1], [0, 0]), mpc.plan().U][1]
     move = mpc([0.45, 3.0], [0, 0])
-    assert (move.status, move.fallback) == (Status.INFEASIBLE, Fallback.SHIFTED_PLAN)
+    assert (move.status, move.fallback) == (km.Status.INFEASIBLE, Fallback.SHIFTED_PLAN)
     assert np.array_equal(move.u, plan[1])
     assert mpc.plan() is None
     assert mpc([0.4, -0.1], [0, 0]).status in GOOD
 
 
 def test_a_soft_limit_that_gives_way_is_reported() -> None:
-    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-1, 1, x_max=[np.inf, 0.2]), 10)
-    assert mpc([0.1, 0.9], [0, 1, 0]).status is Status.SOFTENED
-    assert mpc([0.1, 0.0], [0, 1, 0]).status in (Status.UNCONSTRAINED, Status.OPTIMAL)
+    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-1, 1, x_max=[np.inf, 0.2]), 10)
+    assert mpc([0.1, 0.9], [0, 1, 0]).status is km.Status.SOFTENED
+    assert mpc([0.1, 0.0], [0, 1, 0]).status in (km.Status.UNCONSTRAINED, km.Status.OPTIMAL)
 
 
 def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
-    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5), 15, passes=2)
+    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5), 15, passes=2)
 
-    def run(controller: BilinearMPC) -> list[np.ndarray]:
+    def run(controller: km.BilinearMPC) -> list[np.ndarray]:
         controller.reset()
         return [controller([3.0 - 0.1 * k, 0.2], [0, 1, 0]).u for k in range(6)]
 
@@ -182,17 +167,17 @@ def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
 
 
 def test_two_in_two_threads_do_not_disturb_each_other() -> None:
-    limits, plant = Limits(-0.8, 0.5, x_max=[np.inf, 0.5]), pendulum().step_map()
+    limits, plant = km.Limits(-0.8, 0.5, x_max=[np.inf, 0.5]), pendulum().step_map()
 
-    def run(job: tuple[BilinearMPC, float]) -> list[np.ndarray]:
+    def run(job: tuple[km.BilinearMPC, float]) -> list[np.ndarray]:
         (controller, load), x, found = job, np.array([0.9, 0.2]), []
         for _ in range(60):
             found.append(controller(x, [0.3, 0]).u)
             x = plant(x, found[-1]) + np.array([0, load])
         return found
 
-    def made() -> BilinearMPC:
-        return BilinearMPC(pendulum(), Cost(Q=[1, 0.1], R=0.1), limits, 15, estimator=LiftedDisturbance(0.3))
+    def made() -> km.BilinearMPC:
+        return km.BilinearMPC(pendulum(), km.Cost(Q=[1, 0.1], R=0.1), limits, 15, estimator=km.LiftedDisturbance(0.3))
 
     loads = (0.005, -0.005)
     alone = [run((made(), load)) for load in loads]
@@ -204,28 +189,28 @@ def test_two_in_two_threads_do_not_disturb_each_other() -> None:
 
 
 def test_a_solver_that_is_made_to_fail_leaves_the_last_plan() -> None:
-    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5), 15)
+    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5), 15)
     mpc([1.0, 0.2], [0, 1, 0])
     plan = mpc.plan().U
     mpc.solver_fails = True
     move = mpc([1.0, 0.2], [0, 1, 0])
-    assert (move.status, move.fallback) == (Status.FAILED, Fallback.SHIFTED_PLAN)
+    assert (move.status, move.fallback) == (km.Status.FAILED, Fallback.SHIFTED_PLAN)
     assert np.array_equal(move.u, plan[1])
     mpc.solver_fails = False
     assert mpc([1.0, 0.2], [0, 1, 0]).status in GOOD
 
 
 def test_a_reference_that_is_not_finite_is_a_bad_measurement() -> None:
-    mpc = BilinearMPC(pendulum(), CIRCLE, Limits(-0.8, 0.5), 15)
-    assert mpc([1.0, 0.2], [0, np.nan, 0]).status is Status.BAD_MEASUREMENT
+    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5), 15)
+    assert mpc([1.0, 0.2], [0, np.nan, 0]).status is km.Status.BAD_MEASUREMENT
     assert mpc([1.0, 0.2], [0, 1, 0]).status in GOOD
 
 
 def test_it_takes_a_step_map_of_one_state() -> None:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    plant = StepMap(ca.Function("F", [x, u], [x + 0.1 * ca.sin(x) + 0.1 * u]), 0.1)
+    plant = km.StepMap(ca.Function("F", [x, u], [x + 0.1 * ca.sin(x) + 0.1 * u]), 0.1)
     for N in (1, 5):
-        mpc = BilinearMPC(plant, Cost(1, 0.01), Limits(-1, 1), N)
+        mpc = km.BilinearMPC(plant, km.Cost(1, 0.01), km.Limits(-1, 1), N)
         state = np.array([0.8])
         for _ in range(60):
             state = plant(state, mpc(state, [0]).u)
@@ -233,23 +218,23 @@ def test_it_takes_a_step_map_of_one_state() -> None:
 
 
 def test_the_constant_of_an_affine_model_does_no_harm() -> None:
-    model = LinearPredictor.local(pendulum().step_map(), [0.3, 0.1], [0.2])
-    assert Constant().bind(model.states).names[0] in model.lifting.names
-    assert BilinearMPC(model, Cost(1, 0.1), None, 5)([0.3, 0.1], [0, 0]).status is Status.UNCONSTRAINED
+    model = km.LinearPredictor.local(pendulum().step_map(), [0.3, 0.1], [0.2])
+    assert km.Constant().bind(model.states).names[0] in model.lifting.names
+    assert km.BilinearMPC(model, km.Cost(1, 0.1), None, 5)([0.3, 0.1], [0, 0]).status is km.Status.UNCONSTRAINED
 
 
 def test_refusals() -> None:
     model = pendulum()
-    with pytest.raises(DataError, match="horizon is 0; it must be at least 1"):
-        BilinearMPC(model, CIRCLE, None, 0)
-    with pytest.raises(DataError, match="passes is 0; it must be at least 1"):
-        BilinearMPC(model, CIRCLE, None, 5, passes=0)
-    with pytest.raises(ShapeError, match="Q_N weighs x_N − r_N, but the reference is not of the state"):
-        BilinearMPC(model, Cost(Q=[2, 2, 0.2], R=0.1, Q_N=[1, 1], of=UPRIGHT), None, 5)
-    mpc = BilinearMPC(model, CIRCLE, None, 5)
-    with pytest.raises(ShapeError, match=r"y has shape \(3,\), expected \(2,\), one value a state"):
+    with pytest.raises(km.errors.DataError, match="horizon is 0; it must be at least 1"):
+        km.BilinearMPC(model, CIRCLE, None, 0)
+    with pytest.raises(km.errors.DataError, match="passes is 0; it must be at least 1"):
+        km.BilinearMPC(model, CIRCLE, None, 5, passes=0)
+    with pytest.raises(km.errors.ShapeError, match="Q_N weighs x_N − r_N, but the reference is not of the state"):
+        km.BilinearMPC(model, km.Cost(Q=[2, 2, 0.2], R=0.1, Q_N=[1, 1], of=UPRIGHT), None, 5)
+    mpc = km.BilinearMPC(model, CIRCLE, None, 5)
+    with pytest.raises(km.errors.ShapeError, match=r"y has shape \(3,\), expected \(2,\), one value a state"):
         mpc([0, 0, 0], [0, 1, 0])
-    with pytest.raises(ShapeError, match=r"reference has shape \(2,\), expected \(3,\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"reference has shape \(2,\), expected \(3,\)"):
         mpc([0, 0], [0, 1])
 
 
@@ -257,14 +242,14 @@ def test_a_step_that_fails_without_a_plan_takes_the_clipped_optimum() -> None:
     """A hard limit that nothing meets: the loop goes on as a feedback law, and comes back inside."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
     x_next = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.3 * ca.sin(x[0]) + 0.1 * u)
-    plant = StepMap(ca.Function("F", [x, u], [x_next]), 0.1, states=("theta", "omega"), inputs=("u",))
+    plant = km.StepMap(ca.Function("F", [x, u], [x_next]), 0.1, states=("theta", "omega"), inputs=("u",))
     for rate in (None, 2.0):
-        mpc = BilinearMPC(
-            plant, Cost([2, 0.2], 0.1), Limits(-9, 9, x_max=[0.1, np.inf], slack=None, du_max=rate), 15
+        mpc = km.BilinearMPC(
+            plant, km.Cost([2, 0.2], 0.1), km.Limits(-9, 9, x_max=[0.1, np.inf], slack=None, du_max=rate), 15
         )
         state = np.array([0.5, 0.0])
         first = mpc(state, [0, 0])
-        assert (first.status, first.fallback) == (Status.INFEASIBLE, Fallback.CLIPPED_LQR)
+        assert (first.status, first.fallback) == (km.Status.INFEASIBLE, Fallback.CLIPPED_LQR)
         assert -9 <= first.u[0] < -1
         assert rate is None or first.u[0] == -rate
         for _ in range(60):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.stationary import stationary
+from koopmpc.control.riccati import stationary
 from tests.control.models import PRECISE, cvxpy_plan, dense_plan, equilibrium, linear, random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -92,9 +92,9 @@ def test_riccati_coordinates_equal_plain_condensing_on_a_stable_plant():
     for _ in range(10):
         x = rng.normal(size=3)
         met.add(mpc(x, np.zeros(3)).status)
-        cp.Problem(
-            cp.Minimize(0.5 * cp.quad_form(U, cp.psd_wrap(H)) + (F @ x) @ U), [U <= 0.3, U >= -0.3]
-        ).solve(cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11)
+        cp.Problem(cp.Minimize(0.5 * cp.quad_form(U, cp.psd_wrap(H)) + (F @ x) @ U), [U <= 0.3, U >= -0.3]).solve(
+            cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11
+        )
         np.testing.assert_allclose(mpc.plan().U.ravel(), U.value, atol=1e-5)
     assert km.Status.OPTIMAL in met
 

@@ -7,25 +7,21 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.estimate.disturbance import LiftedDisturbance
+import koopmpc as km
 from tests.control.test_slack import COST, MODEL, A, B, N
 
-LIMITS = Limits(-1, 1, du_min=-0.2, du_max=0.2)
-MAKERS: dict[str, Callable[[], BilinearMPC | KoopmanMPC | NonlinearMPC]] = {
-    "koopman": lambda: KoopmanMPC(MODEL, COST, LIMITS, N, estimator=LiftedDisturbance(0.2)),
-    "bilinear": lambda: BilinearMPC(MODEL, COST, LIMITS, N),
-    "bilinear, estimated": lambda: BilinearMPC(MODEL, COST, LIMITS, N, estimator=LiftedDisturbance(0.2)),
-    "bilinear, late": lambda: BilinearMPC(MODEL, COST, LIMITS, N, latency=1),
-    "nonlinear": lambda: NonlinearMPC(MODEL.step_map(), COST, LIMITS, N),
+LIMITS = km.Limits(-1, 1, du_min=-0.2, du_max=0.2)
+MAKERS: dict[str, Callable[[], km.BilinearMPC | km.KoopmanMPC | km.NonlinearMPC]] = {
+    "koopman": lambda: km.KoopmanMPC(MODEL, COST, LIMITS, N, estimator=km.LiftedDisturbance(0.2)),
+    "bilinear": lambda: km.BilinearMPC(MODEL, COST, LIMITS, N),
+    "bilinear, estimated": lambda: km.BilinearMPC(MODEL, COST, LIMITS, N, estimator=km.LiftedDisturbance(0.2)),
+    "bilinear, late": lambda: km.BilinearMPC(MODEL, COST, LIMITS, N, latency=1),
+    "nonlinear": lambda: km.NonlinearMPC(MODEL.step_map(), COST, LIMITS, N),
 }
 
 
 def moves(
-    mpc: BilinearMPC | KoopmanMPC | NonlinearMPC, x: np.ndarray, steps: int
+    mpc: km.BilinearMPC | km.KoopmanMPC | km.NonlinearMPC, x: np.ndarray, steps: int
 ) -> tuple[list[float], np.ndarray]:
     """Return the inputs under a load that no model has, and the state at the end."""
     found: list[float] = []

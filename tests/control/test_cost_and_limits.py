@@ -16,28 +16,28 @@ def test_costs_that_make_no_sense():
     for kwargs, error, text in (
         (
             {"Q": [1, -1], "R": 1},
-            km.DefinitenessError,
+            km.errors.DefinitenessError,
             r"Q is indefinite: its least eigenvalue is -1; weights must be ⪰ 0",
         ),
         (
             {"Q": 1, "R": [[1, 2], [2, 1]]},
-            km.DefinitenessError,
+            km.errors.DefinitenessError,
             r"R is indefinite: its least eigenvalue is -1",
         ),
-        ({"Q": [[1, 1], [0, 1]], "R": 1}, km.DefinitenessError, r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"),
-        ({"Q": 1, "R": [[1, 0.5], [0, 1]]}, km.DefinitenessError, r"R is not symmetric"),
-        ({"Q": 1, "R": 1, "Q_N": -1}, km.DefinitenessError, r"Q_N is indefinite"),
+        ({"Q": [[1, 1], [0, 1]], "R": 1}, km.errors.DefinitenessError, r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"),
+        ({"Q": 1, "R": [[1, 0.5], [0, 1]]}, km.errors.DefinitenessError, r"R is not symmetric"),
+        ({"Q": 1, "R": 1, "Q_N": -1}, km.errors.DefinitenessError, r"Q_N is indefinite"),
         (
             {"Q": np.ones((2, 3)), "R": 1},
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q has shape \(2, 3\), expected a square matrix or its diagonal",
         ),
-        ({"Q": [1, np.nan], "R": 1}, km.DataError, r"Q holds 1 NaN or inf, the first at \(1,\)"),
-        ({"Q": "much", "R": 1}, km.DataError, r"Q is not an array of numbers: got str"),
+        ({"Q": [1, np.nan], "R": 1}, km.errors.DataError, r"Q holds 1 NaN or inf, the first at \(1,\)"),
+        ({"Q": "much", "R": 1}, km.errors.DataError, r"Q is not an array of numbers: got str"),
     ):
         with pytest.raises(error, match=text):
             km.Cost(**kwargs)
-    with pytest.raises(km.ShapeError, match=r"R has shape \(3,\), expected \(2, 2\) or its diagonal"):
+    with pytest.raises(km.errors.ShapeError, match=r"R has shape \(3,\), expected \(2, 2\) or its diagonal"):
         km.Cost(1, [1, 1, 1]).matrices(2, 2)
 
 
@@ -45,40 +45,40 @@ def test_limits_that_make_no_sense():
     for kwargs, error, text in (
         (
             {"u_min": 1, "u_max": -1},
-            km.DataError,
+            km.errors.DataError,
             r"input limits cross at index 0: lower 1 is above upper -1; swap or widen",
         ),
         (
             {"x_min": [0, 2], "x_max": 1},
-            km.DataError,
+            km.errors.DataError,
             r"state limits cross at index 1: lower 2 is above upper 1",
         ),
-        ({"of": km.State(), "y_min": 1, "y_max": 0}, km.DataError, r"output limits cross at index 0"),
-        ({"y_max": 1}, km.DataError, r"y_min and y_max limit observables; say which with of="),
+        ({"of": km.State(), "y_min": 1, "y_max": 0}, km.errors.DataError, r"output limits cross at index 0"),
+        ({"y_max": 1}, km.errors.DataError, r"y_min and y_max limit observables; say which with of="),
         (
             {"u_min": np.inf},
-            km.DataError,
+            km.errors.DataError,
             r"u_min is \+inf or u_max is −inf somewhere; use −inf, \+inf where there is no",
         ),
-        ({"x_max": [1, -np.inf]}, km.DataError, r"x_min is \+inf or x_max is −inf"),
-        ({"u_min": np.nan}, km.DataError, r"u_min holds NaN; use ±inf where there is no limit"),
+        ({"x_max": [1, -np.inf]}, km.errors.DataError, r"x_min is \+inf or x_max is −inf"),
+        ({"u_min": np.nan}, km.errors.DataError, r"u_min holds NaN; use ±inf where there is no limit"),
         (
             {"x_min": [0, 0], "x_max": [1, 1, 1]},
-            km.ShapeError,
+            km.errors.ShapeError,
             r"x_min has shape \(2,\) and x_max \(3,\); pass one limit a row",
         ),
         (
             {"slack": (-1.0, 0.0)},
-            km.DataError,
+            km.errors.DataError,
             r"slack is \(-1.0, 0.0\); pass weights \(linear, quadratic\) ≥ 0, one above zero, or None",
         ),
-        ({"slack": (0.0, 0.0)}, km.DataError, r"slack is \(0.0, 0.0\); pass weights"),
-        ({"slack": (np.nan, 1.0)}, km.DataError, r"the linear weight of slack holds NaN"),
-        ({"slack": (1.0, np.inf)}, km.DataError, r"quadratic weight of slack holds 1 NaN or inf"),
+        ({"slack": (0.0, 0.0)}, km.errors.DataError, r"slack is \(0.0, 0.0\); pass weights"),
+        ({"slack": (np.nan, 1.0)}, km.errors.DataError, r"the linear weight of slack holds NaN"),
+        ({"slack": (1.0, np.inf)}, km.errors.DataError, r"quadratic weight of slack holds 1 NaN or inf"),
     ):
         with pytest.raises(error, match=text):
             km.Limits(**kwargs)
-    with pytest.raises(km.ShapeError, match=r"x_max has shape \(3,\), expected \(2,\) or a scalar"):
+    with pytest.raises(km.errors.ShapeError, match=r"x_max has shape \(3,\), expected \(2,\) or a scalar"):
         km.Limits(x_max=[1, 1, 1]).states(2)
 
 

@@ -27,7 +27,7 @@ def test_an_answer_that_is_late_is_used_and_says_so():
     late, timely = mpc(x, [0, 0]), free(x, [0, 0])
     assert timely.status is km.Status.UNCONSTRAINED
     assert late.status is km.Status.TIME_LIMIT
-    assert late.fallback is km.Fallback.NONE
+    assert late.fallback is km.control.Fallback.NONE
     np.testing.assert_array_equal(late.u, timely.u)
 
 
@@ -47,5 +47,5 @@ def test_every_step_of_a_short_deadline_is_in_time_or_reported():
 
 @pytest.mark.parametrize("limit", [0, -1.0])
 def test_a_deadline_must_be_above_zero(limit):
-    with pytest.raises(km.DataError, match="time_limit is"):
+    with pytest.raises(km.errors.DataError, match="time_limit is"):
         unstable(time_limit=limit)

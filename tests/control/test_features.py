@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.stationary import stationary
+from koopmpc.control.riccati import stationary
 from tests.control.models import PRECISE, Told, linear, random_pair
 from tests.control.oracle import oracle, targets_of
 
@@ -21,9 +21,7 @@ SOLVED = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
 
 
 def with_disturbances(model, E):
-    return km.LinearPredictor(
-        model.A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, E=E
-    )
+    return km.LinearPredictor(model.A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, E=E)
 
 
 def terminal(model, cost, N):
@@ -93,9 +91,7 @@ def equals_cvxpy(seed, coordinates):
     N, nx, nu, nw, nz = sum(blocks), model.nx, model.nu, model.nw, model.nz
     d = np.zeros(nz)
     told = Told(d) if disturbed else None
-    mpc = km.KoopmanMPC(
-        model, cost, limits, N, moves=blocks, estimator=told, coordinates=coordinates, settings=PRECISE
-    )
+    mpc = km.KoopmanMPC(model, cost, limits, N, moves=blocks, estimator=told, coordinates=coordinates, settings=PRECISE)
     P = terminal(model, cost, N)
     x = rng.normal(size=nx)
     u_prev = np.clip(0.3 * rng.normal(size=nu), *limits.inputs(nu))
@@ -109,9 +105,7 @@ def equals_cvxpy(seed, coordinates):
         targets = targets_of(mpc, rows, e)
         if cost.Q_N is not None and nz == nx:
             targets[-1] = rows[-1], targets[-1][1]
-        found = oracle(
-            model, cost, limits, model.lift(x), rows, targets, P=P, u_prev=u_prev, W=W, d=d, blocks=blocks
-        )
+        found = oracle(model, cost, limits, model.lift(x), rows, targets, P=P, u_prev=u_prev, W=W, d=d, blocks=blocks)
         if found is not None and np.abs(found[0]).max() > 100:
             return  # hard states without input limits: beyond the digits of both solvers
         if found is None:
@@ -207,7 +201,7 @@ def test_a_move_is_held_through_its_block():
     few.reset()
     np.testing.assert_array_equal(inputs(closed_loop(few)), inputs(closed_loop(same)))
     failed = few([np.nan, 0], [0, 0])  # the plan that stands in is held through its blocks too
-    assert failed.fallback is km.Fallback.SHIFTED_PLAN
+    assert failed.fallback is km.control.Fallback.SHIFTED_PLAN
 
 
 ODD = st.sampled_from([0.0, 0.3, -2.0, 5.0, np.nan, 1e31])
@@ -245,7 +239,7 @@ def test_what_is_returned_keeps_inputs_and_rates(seed, applied, start, trouble, 
         reach = np.clip([known - rate, known + rate], box.low[0], box.high[0])
         assert reach[0] - 1e-9 <= move.u[0] <= reach[1] + 1e-9
         out_of_reach = known - rate > box.high[0] + 1e-8 or known + rate < box.low[0] - 1e-8
-        if out_of_reach and move.fallback is km.Fallback.NONE:
+        if out_of_reach and move.fallback is km.control.Fallback.NONE:
             assert move.status is km.Status.SOFTENED
         last = move.u[0]
 
@@ -360,9 +354,9 @@ def test_update_is_a_fresh_controller(moves):
         np.testing.assert_allclose(move.u, fresh(x, [0.3, 0]).u, atol=1e-6)
         assert mpc.predictor is model
         x = A @ x + B @ move.u
-    with pytest.raises(km.DataError, match=r"another lifting than the controller's; make a new controller"):
+    with pytest.raises(km.errors.DataError, match=r"another lifting than the controller's; make a new controller"):
         mpc.update(linear(A, B, constant=[0, 0]))
-    with pytest.raises(km.DataError, match=r"another dt than"):
+    with pytest.raises(km.errors.DataError, match=r"another dt than"):
         mpc.update(linear(A, B, dt=0.2))
     np.testing.assert_allclose(mpc(x, [0.3, 0]).u, fresh(x, [0.3, 0], applied=move.u).u, atol=1e-6)
 
@@ -421,47 +415,47 @@ def test_messages():
     make = lambda *a, **k: km.KoopmanMPC(model, cost, *a, **k)  # noqa: E731
     driven = km.KoopmanMPC(with_disturbances(model, np.ones((2, 2))), cost, horizon=5)
     for error, text, call in (
-        (km.DataError, r"moves is 6, the horizon 5; a horizon has at most", lambda: make(horizon=5, moves=6)),
-        (km.DataError, r"moves is 0; it must be at least 1", lambda: make(moves=0)),
-        (km.DataError, r"\(2, 2\) sum to 4, the horizon is 5", lambda: make(horizon=5, moves=(2, 2))),
-        (km.DataError, r"a block of moves is 0; it must be", lambda: make(horizon=5, moves=(5, 0))),
-        (km.DataError, r"w was passed, but the predictor has no E", lambda: make()([0, 0], [0, 0], w=[0])),
+        (km.errors.DataError, r"moves is 6, the horizon 5; a horizon has at most", lambda: make(horizon=5, moves=6)),
+        (km.errors.DataError, r"moves is 0; it must be at least 1", lambda: make(moves=0)),
+        (km.errors.DataError, r"\(2, 2\) sum to 4, the horizon is 5", lambda: make(horizon=5, moves=(2, 2))),
+        (km.errors.DataError, r"a block of moves is 0; it must be", lambda: make(horizon=5, moves=(5, 0))),
+        (km.errors.DataError, r"w was passed, but the predictor has no E", lambda: make()([0, 0], [0, 0], w=[0])),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"w has shape \(3,\), expected \(2,\), or rows of 2 for steps k … k\+4",
             lambda: driven([0, 0], [0, 0], w=[0, 0, 0]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"applied has shape \(2,\), expected \(1,\)",
             lambda: make(km.Limits(du_max=1))([0, 0], [0, 0], [0, 0]),
         ),
-        (km.DefinitenessError, r"R_delta is indefinite", lambda: km.Cost(1, 1, R_delta=-1)),
+        (km.errors.DefinitenessError, r"R_delta is indefinite", lambda: km.Cost(1, 1, R_delta=-1)),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"R_delta has shape \(2,\), expected \(1, 1\) or its diagonal",
             lambda: km.KoopmanMPC(model, km.Cost(1, 1, R_delta=[1, 1])),
         ),
-        (km.DataError, r"rate limits cross at index 0", lambda: km.Limits(du_min=1, du_max=-1)),
-        (km.DataError, r"du_max is -1.0; an input must be free to stay", lambda: km.Limits(du_max=-1)),
-        (km.DataError, r"du_min is 0.5; an input must be free to stay", lambda: km.Limits(du_min=0.5)),
+        (km.errors.DataError, r"rate limits cross at index 0", lambda: km.Limits(du_min=1, du_max=-1)),
+        (km.errors.DataError, r"du_max is -1.0; an input must be free to stay", lambda: km.Limits(du_max=-1)),
+        (km.errors.DataError, r"du_min is 0.5; an input must be free to stay", lambda: km.Limits(du_min=0.5)),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"slack has a weight of shape \(3,\), expected \(2,\), one a state, then one an output",
             lambda: make(km.Limits(x_max=1, slack=([1, 1, 1], 1))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"du_slack has a weight of shape \(2,\), expected \(1,\), one an input",
             lambda: make(km.Limits(du_max=1, du_slack=([1, 1], 1))),
         ),
         (
-            km.DataError,
+            km.errors.DataError,
             r"slack has both weights zero at index 1; a limit that costs nothing is none",
             lambda: make(km.Limits(x_max=1, slack=([1, 0], 0))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"E has shape \(3, 1\), expected \(2, any\)",
             lambda: with_disturbances(model, np.ones((3, 1))),
         ),

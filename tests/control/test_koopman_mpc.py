@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.stationary import stationary
+from koopmpc.control.riccati import stationary
 from tests.control.kkt import CheckedOSQP
 from tests.control.models import PRECISE, cvxpy_plan, dense_plan, equilibrium, linear, random_pair, step_map
 
@@ -162,7 +162,7 @@ def test_whatever_comes_in_a_sane_input_comes_out(seed, ys, references, low, wid
             for controller in (mpc, lqr):
                 move = controller(np.array(y), np.array(reference))
                 assert isinstance(move.status, km.Status)
-                assert isinstance(move.fallback, km.Fallback)
+                assert isinstance(move.fallback, km.control.Fallback)
                 assert move.u.shape == (2,)
                 assert np.isfinite(move.u).all()
                 assert (move.u >= low).all()
@@ -172,7 +172,7 @@ def test_whatever_comes_in_a_sane_input_comes_out(seed, ys, references, low, wid
                 if not finite:
                     assert move.status is km.Status.BAD_MEASUREMENT
                 failed = move.status.value >= km.Status.MAX_ITERATIONS.value
-                assert failed == (move.fallback is not km.Fallback.NONE)
+                assert failed == (move.fallback is not km.control.Fallback.NONE)
 
 
 @pytest.mark.parametrize("active", [False, True])
@@ -201,14 +201,14 @@ def hard():
 def test_infeasible_hard_limits_fall_back_and_the_next_step_recovers():
     mpc = hard()
     before = mpc([3.0, 0.0], [0, 0])
-    assert (before.status, before.fallback) == (km.Status.INFEASIBLE, km.Fallback.CLIPPED_LQR)
+    assert (before.status, before.fallback) == (km.Status.INFEASIBLE, km.control.Fallback.CLIPPED_LQR)
     np.testing.assert_array_equal(before.u, [-2.0])
     assert mpc.plan() is None
     good = mpc([0.35, 0.3], [0, 0])
     assert good.status is km.Status.OPTIMAL
     plan = mpc.plan().U
     failed = mpc([3.0, 0.0], [0, 0])
-    assert (failed.status, failed.fallback) == (km.Status.INFEASIBLE, km.Fallback.SHIFTED_PLAN)
+    assert (failed.status, failed.fallback) == (km.Status.INFEASIBLE, km.control.Fallback.SHIFTED_PLAN)
     np.testing.assert_array_equal(failed.u, plan[1])
     again = mpc([0.35, 0.3], [0, 0])
     assert again.status is km.Status.OPTIMAL
@@ -222,17 +222,17 @@ def test_a_bad_measurement_uses_the_plan_up_and_then_holds():
     np.testing.assert_array_equal(first.u, plan[0])
     for k in range(1, 8):
         move = mpc([np.nan, 0.0], [0, 0])
-        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.SHIFTED_PLAN)
+        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.control.Fallback.SHIFTED_PLAN)
         np.testing.assert_array_equal(move.u, plan[k])
     for _ in range(3):
         move = mpc([0.0, np.inf], [0, 0])
-        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.HOLD)
+        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.control.Fallback.HOLD)
         np.testing.assert_array_equal(move.u, plan[-1])
     move = mpc([0.0, np.inf], [0, 0], applied=[0.25])
     np.testing.assert_array_equal(move.u, [0.25])
     move = mpc([0.0, np.inf], [0, 0], applied=[np.nan])
     np.testing.assert_array_equal(move.u, [0.25])
-    assert mpc([0.1, 0.0], [0, 0]).fallback is km.Fallback.NONE
+    assert mpc([0.1, 0.0], [0, 0]).fallback is km.control.Fallback.NONE
 
 
 def test_a_bad_first_measurement_holds_what_reset_says():
@@ -240,7 +240,7 @@ def test_a_bad_first_measurement_holds_what_reset_says():
     for u_prev, held in ((None, 0.0), (0.3, 0.3), (7.0, 2.0)):
         mpc.reset(u_prev=None if u_prev is None else [u_prev])
         move = mpc([np.nan, 0.0], [0, 0])
-        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.HOLD)
+        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.control.Fallback.HOLD)
         np.testing.assert_array_equal(move.u, [held])
     move = mpc([0.1, 0.0], [np.nan, 0])
     assert move.status is km.Status.BAD_MEASUREMENT
@@ -257,7 +257,7 @@ def test_too_few_iterations_are_reported():
         settings={"max_iter": 1, "check_termination": 1},
     )
     move = mpc([0.9, 0.5], [0, 0])
-    assert (move.status, move.fallback) == (km.Status.MAX_ITERATIONS, km.Fallback.CLIPPED_LQR)
+    assert (move.status, move.fallback) == (km.Status.MAX_ITERATIONS, km.control.Fallback.CLIPPED_LQR)
     assert move.iterations == 1
     np.testing.assert_array_equal(move.u, [-0.2])
 
@@ -345,71 +345,71 @@ def test_messages():
     A, B = UNSTABLE
     model, cost = linear(A, B), km.Cost(1, 0.1)
     wrong = [
-        (km.DataError, r"horizon is 0; it must be at least 1", lambda: km.KoopmanMPC(model, cost, horizon=0)),
+        (km.errors.DataError, r"horizon is 0; it must be at least 1", lambda: km.KoopmanMPC(model, cost, horizon=0)),
         (
-            km.ObservableError,
+            km.errors.ObservableError,
             r"the lifting lacks 'sin\(x0\)'; add it to the lifting: it holds x0, x1",
             lambda: km.KoopmanMPC(model, km.Cost(1, 1, of=km.Fourier(1, states=["x0"]))),
         ),
         (
-            km.ObservableError,
+            km.errors.ObservableError,
             r"the lifting lacks 'sin\(x1\)'",
             lambda: km.KoopmanMPC(model, cost, km.Limits(of=km.Fourier(1, states=["x1"]), y_max=0.5)),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q has shape \(3,\), expected \(2, 2\) or its diagonal",
             lambda: km.KoopmanMPC(model, km.Cost([1, 1, 1], 1)),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"R has shape \(2, 2\), expected \(1, 1\) or its diagonal",
             lambda: km.KoopmanMPC(model, km.Cost(1, np.eye(2))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q_N has shape \(4, 4\), expected \(2, 2\) on the state or \(3, 3\) on z",
             lambda: km.KoopmanMPC(linear(A, B, constant=[0, 0]), km.Cost(1, 1, Q_N=np.eye(4))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q_N \(2, 2\) weighs x_N − r_N, but the reference is not of the state; pass \(3, 3\)",
             lambda: km.KoopmanMPC(
                 linear(A, B, constant=[0, 0]), km.Cost(1, 1, Q_N=np.eye(2), of=km.State() + km.Constant())
             ),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"u_max has shape \(3,\), expected \(1,\) or a scalar",
             lambda: km.KoopmanMPC(model, cost, km.Limits(u_max=[1, 1, 1])),
         ),
         (
-            km.DefinitenessError,
+            km.errors.DefinitenessError,
             r"R \+ BᵀPB is not positive definite",
             lambda: km.KoopmanMPC(model, km.Cost(Q=0, R=0)),
         ),
         (
-            km.DataError,
+            km.errors.DataError,
             r"OSQP refuses the problem or its settings \{'eps': 1\}: Unrecognized settings",
             lambda: km.KoopmanMPC(model, cost, settings={"eps": 1}),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"y has shape \(3,\), expected \(2,\), one value a state",
             lambda: km.KoopmanMPC(model, cost)([0, 0, 0], [0, 0]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"reference has shape \(3,\), expected \(2,\), or rows of 2 for steps k … k\+20",
             lambda: km.KoopmanMPC(model, cost)([0, 0], [0, 0, 0]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"reference has shape \(0,\), expected \(2,\)",
             lambda: km.KoopmanMPC(model, cost)([0, 0], []),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"u_prev has shape \(2,\), expected \(1,\)",
             lambda: km.KoopmanMPC(model, cost).reset(u_prev=[0, 0]),
         ),

@@ -17,7 +17,7 @@ def test_the_feedback_law_and_its_limits():
         np.testing.assert_allclose(move.u, np.clip(free, -0.5, 0.7), atol=1e-6)
         inside = -0.5 <= free[0] <= 0.7
         assert move.status is (km.Status.UNCONSTRAINED if inside else km.Status.SATURATED)
-        assert move.fallback is km.Fallback.NONE
+        assert move.fallback is km.control.Fallback.NONE
         assert move.iterations == 0
     assert (lqr.dt, lqr.nu, lqr.horizon) == (0.1, 1, 0)
 
@@ -26,7 +26,7 @@ def test_nan_holds_the_last_input():
     lqr = km.LQR(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5))
     for bad in ([np.nan, 0], [np.inf, 0], [0, 1e31]):
         move = lqr(bad, [0, 0])
-        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.HOLD)
+        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.control.Fallback.HOLD)
         np.testing.assert_array_equal(move.u, [0.0])
     u = lqr([0.02, 0.01], [0, 0]).u
     assert u[0] != 0
@@ -61,17 +61,17 @@ def test_an_affine_model_reaches_its_own_equilibrium():
 def test_messages():
     lqr = km.LQR(linear(A, B), km.Cost(1, 0.1))
     for error, text, call in (
-        (km.ShapeError, r"y has shape \(3,\), expected \(2,\)", lambda: lqr([0, 0, 0], [0, 0])),
-        (km.ShapeError, r"reference has shape \(1,\), expected \(2,\)", lambda: lqr([0, 0], [0])),
-        (km.ShapeError, r"applied has shape \(2,\), expected \(1,\)", lambda: lqr([0, 0], [0, 0], [0, 0])),
-        (km.ShapeError, r"u_prev has shape \(2,\), expected \(1,\)", lambda: lqr.reset(u_prev=[0, 0])),
+        (km.errors.ShapeError, r"y has shape \(3,\), expected \(2,\)", lambda: lqr([0, 0, 0], [0, 0])),
+        (km.errors.ShapeError, r"reference has shape \(1,\), expected \(2,\)", lambda: lqr([0, 0], [0])),
+        (km.errors.ShapeError, r"applied has shape \(2,\), expected \(1,\)", lambda: lqr([0, 0], [0, 0], [0, 0])),
+        (km.errors.ShapeError, r"u_prev has shape \(2,\), expected \(1,\)", lambda: lqr.reset(u_prev=[0, 0])),
         (
-            km.ObservableError,
+            km.errors.ObservableError,
             r"the lifting lacks",
             lambda: km.LQR(linear(A, B), km.Cost(1, 1, of=km.Constant())),
         ),
         (
-            km.DefinitenessError,
+            km.errors.DefinitenessError,
             r"R \+ BᵀPB is not positive definite: its least eigenvalue is 0; raise R, or weight a state",
             lambda: km.LQR(linear(A, B), km.Cost(0, 0)),
         ),
@@ -118,6 +118,6 @@ def test_a_measured_disturbance_moves_the_target():
     np.testing.assert_allclose(x, held, atol=1e-9)
     assert lqr(x, held, w=[np.nan]).status is km.Status.BAD_MEASUREMENT
     with pytest.raises(
-        km.ShapeError, match=r"w has shape \(2,\), the predictor has 1 disturbances; pass one value"
+        km.errors.ShapeError, match=r"w has shape \(2,\), the predictor has 1 disturbances; pass one value"
     ):
         lqr(x, held, w=[0, 0])

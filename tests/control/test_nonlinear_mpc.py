@@ -66,11 +66,9 @@ def test_a_held_reference_is_its_rows_repeated():
 
 
 def test_every_end_has_a_status_and_a_safe_input():
-    short = km.NonlinearMPC(
-        step_map(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, settings={"ipopt.max_iter": 1}
-    )
+    short = km.NonlinearMPC(step_map(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, settings={"ipopt.max_iter": 1})
     move = short([2.0, 1.0], [0, 0])
-    assert (move.status, move.fallback) == (km.Status.MAX_ITERATIONS, km.Fallback.HOLD)
+    assert (move.status, move.fallback) == (km.Status.MAX_ITERATIONS, km.control.Fallback.HOLD)
     assert move.iterations == 1
     np.testing.assert_array_equal(move.u, [0.0])
 
@@ -80,15 +78,15 @@ def test_every_end_has_a_status_and_a_safe_input():
     assert good.status is km.Status.OPTIMAL
     failed = mpc([3.0, 0.0], [0, 0])
     assert failed.status is km.Status.INFEASIBLE
-    assert failed.fallback is km.Fallback.SHIFTED_PLAN
+    assert failed.fallback is km.control.Fallback.SHIFTED_PLAN
     assert mpc.plan() is None
     np.testing.assert_array_equal(failed.u, plan[1])
     for k in range(2, 6):
         move = mpc([0.1, np.nan], [0, 0])
-        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.SHIFTED_PLAN)
+        assert (move.status, move.fallback) == (km.Status.BAD_MEASUREMENT, km.control.Fallback.SHIFTED_PLAN)
         np.testing.assert_array_equal(move.u, plan[k])
     held = mpc([0.1, 0.1], [np.inf, 0])
-    assert (held.status, held.fallback) == (km.Status.BAD_MEASUREMENT, km.Fallback.HOLD)
+    assert (held.status, held.fallback) == (km.Status.BAD_MEASUREMENT, km.control.Fallback.HOLD)
     np.testing.assert_array_equal(held.u, plan[-1])
     mpc.reset(u_prev=[7.0])
     np.testing.assert_array_equal(mpc([np.nan, 0], [0, 0]).u, [1.0])
@@ -126,37 +124,37 @@ def test_messages():
     plant, cost = step_map(A, B), km.Cost(1, 0.1)
     for error, text, call in (
         (
-            km.DataError,
+            km.errors.DataError,
             r"horizon is 0; it must be at least 1",
             lambda: km.NonlinearMPC(plant, cost, horizon=0),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q has shape \(3,\), expected \(2, 2\) or its diagonal",
             lambda: km.NonlinearMPC(plant, km.Cost([1, 1, 1], 1)),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q_N has shape \(3, 3\), expected \(2, 2\)",
             lambda: km.NonlinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(3))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out",
             lambda: km.NonlinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(2), of=km.Constant())),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"x_max has shape \(3,\), expected \(2,\) or a scalar",
             lambda: km.NonlinearMPC(plant, cost, km.Limits(x_max=[1, 1, 1])),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"y has shape \(3,\), expected \(2,\)",
             lambda: km.NonlinearMPC(plant, cost)([0] * 3, [0, 0]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"reference has shape \(3,\), expected \(2,\), or rows of 2",
             lambda: km.NonlinearMPC(plant, cost)([0, 0], [0, 0, 0]),
         ),

@@ -8,49 +8,43 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.equilibrium import Equilibria
-from koopmpc.control.learned_map import learned_map
-from koopmpc.control.limits import Limits
-from koopmpc.control.move import Status
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.control.outputs import outputs
-from koopmpc.control.stationary import stationary
-from koopmpc.errors import DataError
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.plant.step_map import StepMap
+import koopmpc as km
+from koopmpc.control.nonlinear.model import learned_map
+from koopmpc.control.nonlinear.terminal import Equilibria
+from koopmpc.control.riccati import stationary
+from koopmpc.control.tracking import outputs
 
 SOLVERS = ["ipopt", "fatrop", "sqpmethod"]
 
 
-def pendulum() -> StepMap:
+def pendulum() -> km.StepMap:
     """θ = 0 is upright."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
     x_next = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.3 * ca.sin(x[0]) + 0.1 * u)
-    return StepMap(ca.Function("F", [x, u], [x_next]), 0.1, states=("theta", "omega"), inputs=("u",))
+    return km.StepMap(ca.Function("F", [x, u], [x_next]), 0.1, states=("theta", "omega"), inputs=("u",))
 
 
-UPRIGHT = Expressions(lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ["s", "c", "omega"])
+UPRIGHT = km.Expressions(lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ["s", "c", "omega"])
 
 
 @pytest.mark.parametrize(
     "limits",
     [
-        Limits(-1, 1),
-        Limits(-2, 2, x_max=[np.inf, 0.2]),
-        Limits(-2, 2, x_max=[0.5, np.inf], slack=None),
-        Limits(-2, 2, x_min=[-1, -0.4], slack=([np.inf, 30.0], [0.0, 3.0])),
+        km.Limits(-1, 1),
+        km.Limits(-2, 2, x_max=[np.inf, 0.2]),
+        km.Limits(-2, 2, x_max=[0.5, np.inf], slack=None),
+        km.Limits(-2, 2, x_min=[-1, -0.4], slack=([np.inf, 30.0], [0.0, 3.0])),
     ],
 )
-def test_all_solvers_find_the_same_plan(limits: Limits) -> None:
-    plant, cost = pendulum(), Cost(Q=[2, 0.2], R=0.1)
+def test_all_solvers_find_the_same_plan(limits: km.Limits) -> None:
+    plant, cost = pendulum(), km.Cost(Q=[2, 0.2], R=0.1)
     plans = []
     for solver in SOLVERS:
-        mpc = NonlinearMPC(plant, cost, limits, 12, solver=solver)
+        mpc = km.NonlinearMPC(plant, cost, limits, 12, solver=solver)
         x = np.array([0.45, 0.1])
         for _ in range(4):
             move = mpc(x, [0, 0])
-            assert move.status in (Status.OPTIMAL, Status.SOFTENED), solver
+            assert move.status in (km.Status.OPTIMAL, km.Status.SOFTENED), solver
             x = plant(x, move.u)
         plans.append(mpc.plan().U)
     assert np.allclose(plans[1], plans[0], atol=1e-3)
@@ -59,12 +53,12 @@ def test_all_solvers_find_the_same_plan(limits: Limits) -> None:
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_copies_go_on_as_their_original_also_in_threads(solver: str) -> None:
-    plant, limits = pendulum(), Limits(-1, 1, du_max=0.3, x_max=[np.inf, 0.2])
-    mpc = NonlinearMPC(plant, Cost(Q=[2, 0.2], R=0.1), limits, 12, solver=solver)
+    plant, limits = pendulum(), km.Limits(-1, 1, du_max=0.3, x_max=[np.inf, 0.2])
+    mpc = km.NonlinearMPC(plant, km.Cost(Q=[2, 0.2], R=0.1), limits, 12, solver=solver)
     start = np.array([0.45, 0.1])
     start = plant(start, mpc(start, [0, 0]).u)
 
-    def run(controller: NonlinearMPC) -> np.ndarray:
+    def run(controller: km.NonlinearMPC) -> np.ndarray:
         x, inputs = start, []
         for k in range(25):
             inputs.append(controller(x, [0.01 * (k % 5), 0]).u)
@@ -79,15 +73,15 @@ def test_copies_go_on_as_their_original_also_in_threads(solver: str) -> None:
 
 
 def test_no_starts_are_refused() -> None:
-    with pytest.raises(DataError, match="starts is 0; it must be at least 1"):
-        NonlinearMPC(pendulum(), Cost(1, 1), starts=0)
+    with pytest.raises(km.errors.DataError, match="starts is 0; it must be at least 1"):
+        km.NonlinearMPC(pendulum(), km.Cost(1, 1), starts=0)
 
 
 def test_several_starts_leave_a_local_optimum() -> None:
     """Hanging, at rest, no small input changes 1 − cos θ: one start stays, several do not."""
-    plant, cost = pendulum(), Cost(Q=[1, 1, 0.01], R=0.01, of=UPRIGHT)
+    plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.01], R=0.01, of=UPRIGHT)
     hanging = [np.pi, 0.0]
-    one, several = (NonlinearMPC(plant, cost, Limits(-2, 2), 30, starts=n) for n in (1, 5))
+    one, several = (km.NonlinearMPC(plant, cost, km.Limits(-2, 2), 30, starts=n) for n in (1, 5))
     one(hanging, [0, 1, 0])
     several(hanging, [0, 1, 0])
     highest = [np.cos(mpc.plan().X[:, 0]).max() for mpc in (one, several)]
@@ -95,8 +89,8 @@ def test_several_starts_leave_a_local_optimum() -> None:
 
 
 def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() -> None:
-    plant, cost = pendulum(), Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = outputs(plant.states, plant.nu, cost, Limits(-2, 2))
+    plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
+    read = outputs(plant.states, plant.nu, cost, km.Limits(-2, 2))
     goal = Equilibria(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
 
     def end(x: np.ndarray) -> float:
@@ -116,7 +110,7 @@ def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() ->
 
 def test_the_goal_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
     """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
-    plant, cost = pendulum(), Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = outputs(plant.states, plant.nu, cost, Limits(-2, 2))
+    plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
+    read = outputs(plant.states, plant.nu, cost, km.Limits(-2, 2))
     goal = Equilibria(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
     assert np.cos(goal.x[0]) < -0.99

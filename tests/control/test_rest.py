@@ -6,33 +6,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.cost import Cost
-from koopmpc.control.learned_map import learned_map
-from koopmpc.control.limits import Limits
-from koopmpc.control.outputs import outputs
-from koopmpc.control.rest import CLOSE, Rests
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.plant.step_map import StepMap
+import koopmpc as km
+from koopmpc.control.nonlinear.equilibrium import CLOSE, Rests
+from koopmpc.control.nonlinear.model import learned_map
+from koopmpc.control.tracking import outputs
 from tests.control.test_bilinear_mpc import pendulum
 
-COST = Cost(Q=[1, 0.1], R=0.1)
-BOX = Limits(-0.3, 0.4, x_max=[0.7, 5.0])
+COST = km.Cost(Q=[1, 0.1], R=0.1)
+BOX = km.Limits(-0.3, 0.4, x_max=[0.7, 5.0])
 
 
-def two_tanks() -> StepMap:
+def two_tanks() -> km.StepMap:
     """Return two levels that drain faster the higher they are, the second fed by the first too."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
     flow = ca.vertcat(u[0] - x[0] - 0.2 * x[0] ** 2, u[1] + 0.5 * x[0] - x[1] - 0.1 * x[1] ** 3)
-    return StepMap(ca.Function("F", [x, u], [x + 0.1 * flow]), 0.1)
+    return km.StepMap(ca.Function("F", [x, u], [x + 0.1 * flow]), 0.1)
 
 
-def rests(model, limits: Limits, cost: Cost = COST) -> Rests:
+def rests(model, limits: km.Limits, cost: km.Cost = COST) -> Rests:
     seen = outputs(model.states, model.nu, cost, limits)
     return Rests(learned_map(model), seen, of_state=True)
 
 
-SWING, TANKS = rests(pendulum(), BOX), rests(two_tanks(), Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+SWING, TANKS = rests(pendulum(), BOX), rests(two_tanks(), km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
 
 
 @settings(max_examples=40)
@@ -59,15 +55,15 @@ def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
     assert np.allclose(again.x, near.x, atol=1e-9)
 
 
-@pytest.mark.parametrize("limits", [Limits(-4, 4), Limits(-0.35, 0.4), Limits(-4, 4, x_max=[0.5, np.inf])])
+@pytest.mark.parametrize("limits", [km.Limits(-4, 4), km.Limits(-0.35, 0.4), km.Limits(-4, 4, x_max=[0.5, np.inf])])
 @pytest.mark.parametrize("reference", [0.3, 0.9])
 def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(
-    monkeypatch: pytest.MonkeyPatch, limits: Limits, reference: float
+    monkeypatch: pytest.MonkeyPatch, limits: km.Limits, reference: float
 ) -> None:
     """Where the reference is out of reach the state ends at the limit, and the input where it is inside its own."""
     model = pendulum()
     F, found = model.step_map(), []
-    mpc = BilinearMPC(model, COST, limits, 30, estimator=LiftedDisturbance(0.3))
+    mpc = km.BilinearMPC(model, COST, limits, 30, estimator=km.LiftedDisturbance(0.3))
     x = np.array([0.1, 0.0])
     find = Rests.find
     monkeypatch.setattr(Rests, "find", lambda self, *rest: found.append(1) or find(self, *rest))

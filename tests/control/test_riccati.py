@@ -6,9 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.horizon import one_step
-from koopmpc.control.riccati import Stage, recursion
-from koopmpc.control.stationary import _iterate, _leap, stationary
+from koopmpc.control.linear.horizon import one_step
+from koopmpc.control.riccati import Stage, _iterate, _leap, recursion, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -106,9 +105,7 @@ def test_gains_of_the_databook():
     np.testing.assert_allclose(km.lqr(A, B, 1, 1e-4).K, [[-100, -197.537, 1491.281, 668.445]], atol=5e-4)
     printed = A.copy()
     printed[1, 2] *= -1
-    np.testing.assert_allclose(
-        km.lqr(printed, B, 1, 1e-4).K, [[-100, -183.179, 1683.180, 646.613]], atol=5e-4
-    )
+    np.testing.assert_allclose(km.lqr(printed, B, 1, 1e-4).K, [[-100, -183.179, 1683.180, 646.613]], atol=5e-4)
 
 
 def test_the_slow_manifold():
@@ -235,22 +232,22 @@ def test_the_recursion_is_a_bellman_equation(seed, nx, nu, N):
 
 def test_messages():
     A, B = np.array([[1.1, 0], [0, 0.5]]), np.array([[1.0], [0]])
-    with pytest.raises(km.DefinitenessError, match=r"R \+ BᵀPB is not positive definite: .* is 0; raise R"):
+    with pytest.raises(km.errors.DefinitenessError, match=r"R \+ BᵀPB is not positive definite: .* is 0; raise R"):
         stationary(A, B, np.diag([0.0, 1]), np.zeros((1, 1)), 10)
-    with pytest.raises(km.DefinitenessError, match=r"R is not positive definite: .* is 0; raise it"):
+    with pytest.raises(km.errors.DefinitenessError, match=r"R is not positive definite: .* is 0; raise it"):
         km.lqr(A, B, 1, 0)
     with pytest.raises(
-        km.DefinitenessError, match=r"Q is indefinite: its least eigenvalue is -1; weights must be"
+        km.errors.DefinitenessError, match=r"Q is indefinite: its least eigenvalue is -1; weights must be"
     ):
         km.dlqr(A, B, [1, -1], 1)
-    with pytest.raises(km.DefinitenessError, match=r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"):
+    with pytest.raises(km.errors.DefinitenessError, match=r"Q is not symmetric; pass \(M \+ Mᵀ\)/2"):
         km.dlqr(A, B, [[1, 1], [0, 1]], 1)
-    with pytest.raises(km.ShapeError, match=r"Q has shape \(3,\), expected \(2, 2\) or its diagonal"):
+    with pytest.raises(km.errors.ShapeError, match=r"Q has shape \(3,\), expected \(2, 2\) or its diagonal"):
         km.lqr(A, B, [1, 1, 1], 1)
-    with pytest.raises(km.ShapeError, match=r"B has shape \(3, 1\), expected \(2, any\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"B has shape \(3, 1\), expected \(2, any\)"):
         km.lqr(A, np.ones((3, 1)), 1, 1)
-    with pytest.raises(km.ShapeError, match=r"A has shape \(2, 3\), expected \(2, 2\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"A has shape \(2, 3\), expected \(2, 2\)"):
         km.lqr(np.ones((2, 3)), B, 1, 1)
     for solve, unstable in ((km.lqr, [[1.0, 0], [0, 1]]), (km.dlqr, [[0.5, 0], [0, 1.1]])):
-        with pytest.raises(km.DataError, match=r"no stabilising solution: .* not stabilisable"):
+        with pytest.raises(km.errors.DataError, match=r"no stabilising solution: .* not stabilisable"):
             solve(unstable, B, 1, 1)

@@ -61,7 +61,7 @@ def through_controllers(seed, count, share):
         for x, r, u_prev, move, plan in steps(case, rng):
             inside(case, move.u, u_prev)
             status, U = move.status, None if plan is None else plan.U.ravel()
-            assert (status in GOOD) == (move.fallback is km.Fallback.NONE) == (plan is not None)
+            assert (status in GOOD) == (move.fallback is km.control.Fallback.NONE) == (plan is not None)
             seen[solver, case.kind, status.name] += 1
             if rng.random() > share or conflict(case, u_prev):
                 continue

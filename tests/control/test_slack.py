@@ -4,20 +4,12 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.control.move import Status
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.lifting.state import State
-from koopmpc.loop.simulate import simulate
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 
 A, B, N = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]]), 12
-MODEL = LinearPredictor(A, B, np.eye(2), State(), 0.1, ("p [m]", "v [m/s]"), ("a [N]",))
-COST = Cost(Q=[10.0, 1.0], R=0.1, Q_N=np.diag([10.0, 1.0]))
-LIMITS = Limits(-1, 1, x_min=[-np.inf, -0.3], x_max=[np.inf, 0.3], slack=(20.0, 5.0))
+MODEL = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p [m]", "v [m/s]"), ("a [N]",))
+COST = km.Cost(Q=[10.0, 1.0], R=0.1, Q_N=np.diag([10.0, 1.0]))
+LIMITS = km.Limits(-1, 1, x_min=[-np.inf, -0.3], x_max=[np.inf, 0.3], slack=(20.0, 5.0))
 
 
 def by_hand(x: np.ndarray) -> float:
@@ -35,17 +27,17 @@ def test_every_controller_says_what_the_plan_of_the_problem_breaks(x: list[float
     expected = by_hand(np.array(x))
     exact = {"eps_abs": 1e-9, "eps_rel": 1e-9}
     for mpc in (
-        KoopmanMPC(MODEL, COST, LIMITS, N, settings=exact),
-        KoopmanMPC(MODEL, COST, LIMITS, N, solver="daqp"),
-        BilinearMPC(MODEL, COST, LIMITS, N),
-        NonlinearMPC(MODEL.step_map(), COST, LIMITS, N),
+        km.KoopmanMPC(MODEL, COST, LIMITS, N, settings=exact),
+        km.KoopmanMPC(MODEL, COST, LIMITS, N, solver="daqp"),
+        km.BilinearMPC(MODEL, COST, LIMITS, N),
+        km.NonlinearMPC(MODEL.step_map(), COST, LIMITS, N),
     ):
         move = mpc(x, [0.0, 0.0])
         if expected < 1e-6:
             assert move.slack == 0
-            assert move.status is not Status.SOFTENED
+            assert move.status is not km.Status.SOFTENED
         else:
-            assert move.status is Status.SOFTENED
+            assert move.status is km.Status.SOFTENED
             assert abs(move.slack - expected) < 1e-4
             assert mpc.plan() is not None
             assert abs(np.abs(mpc.plan().X[1:, 1]).max() - 0.3 - expected) < 1e-4
@@ -54,22 +46,22 @@ def test_every_controller_says_what_the_plan_of_the_problem_breaks(x: list[float
 @pytest.mark.parametrize("up", [0.5, np.inf])
 def test_a_rate_that_the_box_overrules_is_told_in_its_unit(up: float) -> None:
     """u = 3 was applied, the limit is 1, and the rate allows 0.5: it is exceeded by 1.5."""
-    limits = Limits(-1, 1, du_min=-0.5, du_max=up)
+    limits = km.Limits(-1, 1, du_min=-0.5, du_max=up)
     for mpc in (
-        KoopmanMPC(MODEL, COST, limits, N),
-        BilinearMPC(MODEL, COST, limits, N),
-        NonlinearMPC(MODEL.step_map(), COST, limits, N),
+        km.KoopmanMPC(MODEL, COST, limits, N),
+        km.BilinearMPC(MODEL, COST, limits, N),
+        km.NonlinearMPC(MODEL.step_map(), COST, limits, N),
     ):
         mpc.reset(u_prev=[1.0])
         move = mpc([-5.0, 0.0], [0.0, 0.0], applied=[3.0])
-        assert move.status is Status.SOFTENED
+        assert move.status is km.Status.SOFTENED
         assert abs(move.slack - 1.5) < 1e-6
 
 
 def test_a_run_keeps_it() -> None:
-    run = simulate(
-        MODEL.step_map(), KoopmanMPC(MODEL, COST, LIMITS, N), x0=[0.0, 1.0], reference=[0.0, 0.0], steps=20
+    run = km.simulate(
+        MODEL.step_map(), km.KoopmanMPC(MODEL, COST, LIMITS, N), x0=[0.0, 1.0], reference=[0.0, 0.0], steps=20
     )
-    gave = np.array([status is Status.SOFTENED for status in run.status])
+    gave = np.array([status is km.Status.SOFTENED for status in run.status])
     assert gave.any()
     assert ((run.slack > 0) == gave).all()

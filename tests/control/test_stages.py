@@ -10,12 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
 from tests.bare import shown
 
 N = 12
@@ -40,17 +34,17 @@ MIXES = [
 ]
 
 
-def linear(disturbed: bool = False, mass: float = 1.0) -> LinearPredictor:
+def linear(disturbed: bool = False, mass: float = 1.0) -> km.LinearPredictor:
     """Return an unstable plant of three states and two inputs, with a measured disturbance or without."""
     names = ("a", "b", "c"), ("u", "v")
-    return LinearPredictor(A, B / mass, np.eye(3), km.State(), 0.1, *names, E=E if disturbed else None)
+    return km.LinearPredictor(A, B / mass, np.eye(3), km.State(), 0.1, *names, E=E if disturbed else None)
 
 
 def built(kind, model, cost, limits, moves, **options):
     if kind == "bilinear":
-        return BilinearMPC(model, cost, limits, N, moves=moves, passes=3, **options)
+        return km.BilinearMPC(model, cost, limits, N, moves=moves, passes=3, **options)
     tight = {"ipopt.tol": 1e-10, "ipopt.bound_relax_factor": 0.0}
-    return NonlinearMPC(model.step_map(), cost, limits, N, moves=moves, settings=tight, **options)
+    return km.NonlinearMPC(model.step_map(), cost, limits, N, moves=moves, settings=tight, **options)
 
 
 @pytest.mark.parametrize("kind", ["bilinear", "nonlinear"])
@@ -59,7 +53,7 @@ def test_on_a_linear_plant_all_features_are_koopman_mpc(kind, mix):
     cost, limits, moves = MIXES[mix]
     model = linear()
     ours = built(kind, model, cost, limits, moves)
-    theirs = KoopmanMPC(model, cost, limits, N, moves=moves, solver="daqp")
+    theirs = km.KoopmanMPC(model, cost, limits, N, moves=moves, solver="daqp")
     x, u = np.array([0.5, -0.4, 0.3]), np.array([0.1, -0.1])
     for mpc in (ours, theirs):
         mpc.reset(u_prev=u)
@@ -96,9 +90,7 @@ def test_the_program_with_rates_is_that_of_cvxpy():
         objective += cp.quad_form(X[k + 1], weight) + cp.quad_form(U[k], np.diag([0.3, 0.2]))
         objective += cp.quad_form(U[k] - last, np.diag([0.5, 0.1]))
         last = U[k]
-    cp.Problem(cp.Minimize(objective), held).solve(
-        cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11
-    )
+    cp.Problem(cp.Minimize(objective), held).solve(cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11)
     for kind in ("bilinear", "nonlinear"):
         mpc = built(kind, linear(), cost, limits, None)
         mpc.reset(u_prev=u0)
@@ -109,8 +101,8 @@ def test_the_program_with_rates_is_that_of_cvxpy():
 @pytest.mark.parametrize("latency", [0, 2])
 def test_a_measured_disturbance_and_its_preview_are_koopman_mpcs(latency):
     model, cost, limits = linear(disturbed=True), R_DELTA, km.Limits(**BOX, du_max=0.3)
-    ours = BilinearMPC(model, cost, limits, N, passes=3, latency=latency)
-    theirs = KoopmanMPC(model, cost, limits, N, latency=latency, solver="daqp")
+    ours = km.BilinearMPC(model, cost, limits, N, passes=3, latency=latency)
+    theirs = km.KoopmanMPC(model, cost, limits, N, latency=latency, solver="daqp")
     assert ours.horizon == theirs.horizon == N + latency
     rng, x = np.random.default_rng(0), np.array([0.3, -0.2, 0.1])
     for k in range(6):
@@ -121,14 +113,14 @@ def test_a_measured_disturbance_and_its_preview_are_koopman_mpcs(latency):
         x = A @ x + B @ a.u + 0.01 * rng.normal(size=3)
 
 
-def pendulum(mass: float = 1.0, load: float = 0.0, gravity: float = 0.05) -> BilinearPredictor:
+def pendulum(mass: float = 1.0, load: float = 0.0, gravity: float = 0.05) -> km.BilinearPredictor:
     """Return θ⁺ = θ + 0.1 ω, ω⁺ = 0.98 ω + gravity sin θ + (0.1 u cos θ + load) / mass."""
     M = np.eye(5)
     M[0, 1], M[1, 1], M[1, 2], M[1, 4] = 0.1, 0.98, gravity, load / mass
     Nu = np.zeros((1, 5, 5))
     Nu[0, 1, 3] = 0.1 / mass
     lifting = km.State() + km.Fourier(1, states="theta") + km.Constant()
-    return BilinearPredictor(M, np.zeros((5, 1)), Nu, np.eye(2, 5), lifting, 0.1, ("theta", "omega"), ("u",))
+    return km.BilinearPredictor(M, np.zeros((5, 1)), Nu, np.eye(2, 5), lifting, 0.1, ("theta", "omega"), ("u",))
 
 
 TRACKED = km.Cost(Q=[10, 1], R=0.1, R_delta=0.01)
@@ -136,9 +128,7 @@ TRACKED = km.Cost(Q=[10, 1], R=0.1, R_delta=0.01)
 
 @pytest.mark.parametrize(("mass", "load"), [(1.0, 0.0), (1.0, 0.02), (1.2, 0.0), (1.2, -0.02)])
 def test_no_offset_is_left(mass, load):
-    mpc = BilinearMPC(
-        pendulum(), TRACKED, km.Limits(-3, 3, du_max=1), 20, estimator=LiftedDisturbance(gain=0.2)
-    )
+    mpc = km.BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3, du_max=1), 20, estimator=km.LiftedDisturbance(gain=0.2))
     truth = pendulum(mass, load).step_map()
     run = km.simulate(truth, mpc, x0=[0, 0], reference=[0.4, 0], steps=120)
     assert abs(run.X[-1, 0] - 0.4) < 1e-6
@@ -146,14 +136,14 @@ def test_no_offset_is_left(mass, load):
 
 
 def test_without_an_estimator_there_is_an_offset():
-    mpc = BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3), 20)
+    mpc = km.BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3), 20)
     run = km.simulate(pendulum(1.2, 0.02).step_map(), mpc, x0=[0, 0], reference=[0.4, 0], steps=60)
     assert abs(run.X[-1, 0] - 0.4) > 1e-3
 
 
 def test_a_setpoint_beyond_the_input_limit_is_held_as_nearly_as_the_plant_can():
     model = pendulum(gravity=-0.05)
-    mpc = BilinearMPC(model, TRACKED, km.Limits(-0.15, 0.15), 20, estimator=LiftedDisturbance(gain=0.2))
+    mpc = km.BilinearMPC(model, TRACKED, km.Limits(-0.15, 0.15), 20, estimator=km.LiftedDisturbance(gain=0.2))
     truth = pendulum(1.0, 0.005, gravity=-0.05).step_map()
     run = km.simulate(truth, mpc, x0=[0, 0], reference=[0.6, 0], steps=300)
     assert set(run.status) <= set(GOOD)
@@ -167,16 +157,16 @@ def test_on_a_true_model_the_plan_happens_late(kind):
     model = pendulum()
     limits = km.Limits(-3, 3, du_max=1)
     if kind == "bilinear":
-        mpc = BilinearMPC(model, TRACKED, limits, 15, latency=2, passes=30)
+        mpc = km.BilinearMPC(model, TRACKED, limits, 15, latency=2, passes=30)
     else:
-        mpc = NonlinearMPC(model.step_map(), TRACKED, limits, 15, latency=2)
+        mpc = km.NonlinearMPC(model.step_map(), TRACKED, limits, 15, latency=2)
     run = km.simulate(
         model.step_map(),
         mpc,
         x0=[0.5, 0],
         reference=[0, 0],
         steps=60,
-        faults=(km.ActuatorDelay(2),),
+        faults=(km.faults.ActuatorDelay(2),),
         plans=True,
     )
     for k in (0, 4, 10):
@@ -187,7 +177,7 @@ def test_on_a_true_model_the_plan_happens_late(kind):
 def test_an_update_is_a_new_controller():
     old, new = pendulum(), pendulum(1.2, 0.01)
     limits = km.Limits(-3, 3, du_max=1)
-    updated, fresh = (BilinearMPC(model, TRACKED, limits, 15, passes=20) for model in (old, new))
+    updated, fresh = (km.BilinearMPC(model, TRACKED, limits, 15, passes=20) for model in (old, new))
     updated([0.3, 0.1], [0.2, 0])
     updated.update(new)
     updated.reset()
@@ -201,15 +191,15 @@ def test_an_update_is_a_new_controller():
 
 
 def test_an_update_keeps_the_plan():
-    mpc = BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3), 15)
+    mpc = km.BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3), 15)
     for _ in range(3):
         mpc([0.3, 0.1], [0.2, 0])
     before = mpc.plan()
     mpc.update(pendulum(1.0 + 1e-9))
     assert np.array_equal(mpc.plan().U, before.U)
-    with pytest.raises(km.DataError, match="made for a BilinearPredictor, and got a LinearPredictor"):
+    with pytest.raises(km.errors.DataError, match="made for a BilinearPredictor, and got a LinearPredictor"):
         mpc.update(linear())
-    other = BilinearPredictor(
+    other = km.BilinearPredictor(
         np.eye(2),
         np.zeros((2, 1)),
         np.zeros((1, 2, 2)),
@@ -219,19 +209,19 @@ def test_an_update_keeps_the_plan():
         ("theta", "omega"),
         ("u",),
     )
-    with pytest.raises(km.DataError, match="another lifting than the controller's; make a new controller"):
+    with pytest.raises(km.errors.DataError, match="another lifting than the controller's; make a new controller"):
         mpc.update(other)
 
 
 def whole():
-    return BilinearMPC(
+    return km.BilinearMPC(
         linear(disturbed=True),
         R_DELTA,
         km.Limits(**BOX, du_max=0.3, du_slack=(5.0, 1.0), x_max=[0.45, np.inf, 0.3]),
         N,
         moves=6,
         latency=1,
-        estimator=LiftedDisturbance(0.3),
+        estimator=km.LiftedDisturbance(0.3),
     )
 
 
@@ -249,22 +239,20 @@ def test_a_copy_runs_as_its_original():
 
 def test_a_step_without_time_says_so_and_the_next_ones_go_on():
     limits = km.Limits(-0.3, 0.3, du_max=0.2)
-    mpc = BilinearMPC(pendulum(), TRACKED, limits, 20, time_limit=1e-7)
+    mpc = km.BilinearMPC(pendulum(), TRACKED, limits, 20, time_limit=1e-7)
     for _ in range(4):
         move = mpc([0.5, 0.5], [0.0, 0])
         assert move.status is km.Status.TIME_LIMIT
         assert np.abs(move.u).max() <= 0.3
-    late = NonlinearMPC(pendulum().step_map(), TRACKED, limits, 20, time_limit=1e-6)
+    late = km.NonlinearMPC(pendulum().step_map(), TRACKED, limits, 20, time_limit=1e-6)
     assert late([0.5, 0.5], [0.0, 0]).status is km.Status.TIME_LIMIT
-    ready = BilinearMPC(pendulum(), TRACKED, limits, 20, time_limit=10.0)
+    ready = km.BilinearMPC(pendulum(), TRACKED, limits, 20, time_limit=10.0)
     assert ready([0.5, 0.5], [0.0, 0]).status in GOOD
 
 
 SHARED = {
-    "bilinear": BilinearMPC(pendulum(), TRACKED, km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3), 10),
-    "nonlinear": NonlinearMPC(
-        pendulum().step_map(), TRACKED, km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3), 10
-    ),
+    "bilinear": km.BilinearMPC(pendulum(), TRACKED, km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3), 10),
+    "nonlinear": km.NonlinearMPC(pendulum().step_map(), TRACKED, km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3), 10),
 }
 faulty = st.one_of(st.floats(-4, 4), st.sampled_from([np.nan, np.inf, -np.inf, 1e300, 1e31, 0.0]))
 got = st.one_of(st.none(), st.floats(-3, 3), st.sampled_from([np.nan, np.inf]))
@@ -287,13 +275,13 @@ def test_inputs_and_rates_are_never_outside_their_limits(kind, steps):
         assert (move.u <= 0.5).all()
         reach = np.clip([last - 0.2, last + 0.3], -0.8, 0.5)  # the box wins
         assert reach[0] - 1e-9 <= move.u <= reach[1] + 1e-9
-        assert (move.status in GOOD) == (move.fallback is km.Fallback.NONE)
+        assert (move.status in GOOD) == (move.fallback is km.control.Fallback.NONE)
         last = move.u
     mpc.solver_fails = False
 
 
 def test_half_an_actuator_is_told_by_applied():
-    mpc = BilinearMPC(pendulum(), TRACKED, km.Limits(-2, 2, du_max=0.4), 15)
+    mpc = km.BilinearMPC(pendulum(), TRACKED, km.Limits(-2, 2, du_max=0.4), 15)
     run = km.simulate(
         pendulum().step_map(),
         mpc,
@@ -301,7 +289,11 @@ def test_half_an_actuator_is_told_by_applied():
         reference=[0, 0],
         steps=60,
         limits=km.Limits(-2, 2, du_max=0.4),
-        faults=(km.ActuatorLoss(0.5, begin=3), km.NaNSensor(probability=0.1), km.SolverFailure(0.2)),
+        faults=(
+            km.faults.ActuatorLoss(0.5, begin=3),
+            km.faults.NaNSensor(probability=0.1),
+            km.faults.SolverFailure(0.2),
+        ),
         rng=1,
     )
     assert np.abs(run.U).max() <= 2
@@ -310,8 +302,8 @@ def test_half_an_actuator_is_told_by_applied():
 def test_where_box_and_rate_exclude_each_other_the_box_wins():
     limits = km.Limits(-0.5, 0.5, du_max=0.1)
     for mpc in (
-        BilinearMPC(pendulum(), TRACKED, limits, 10),
-        NonlinearMPC(pendulum().step_map(), TRACKED, limits, 10),
+        km.BilinearMPC(pendulum(), TRACKED, limits, 10),
+        km.NonlinearMPC(pendulum().step_map(), TRACKED, limits, 10),
     ):
         move = mpc([0.1, 0], [0, 0], applied=[2.0])
         assert move.status is km.Status.SOFTENED
@@ -325,7 +317,7 @@ def test_several_starts_with_rates_find_the_better_side():
     plant = km.StepMap(ca.Function("F", [x, u], [ca.vertcat(x[0] + 0.1 * x[1], wall)]), 0.1)
     cost = km.Cost(Q=[1, 0.1], R=0.01, R_delta=0.02)
     limits = km.Limits(-3, 3, du_max=1.0)
-    one, several = (NonlinearMPC(plant, cost, limits, 15, starts=n) for n in (1, 5))
+    one, several = (km.NonlinearMPC(plant, cost, limits, 15, starts=n) for n in (1, 5))
     price = lambda plan: float((plan.X[1:] ** 2 @ [1, 0.1]).sum())  # noqa: E731
     for controller in (one, several):
         assert controller([2.0, 0.0], [0, 0]).status in GOOD
@@ -340,7 +332,7 @@ x = km.load_problem("pendulum")
 plant = km.discretize(x.dynamics, 0.05)
 flat = km.LinearPredictor.local(plant, [0, 0], [0])
 cost, limits = km.Cost(1, 0.1), km.Limits(-1, 1)
-from koopmpc.control.bilinear_mpc import BilinearMPC
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.estimate.kalman import LiftedKalman
 still = km.LinearPredictor(np.eye(2), np.zeros((2, 0)), np.eye(2), km.State(), 0.1, ("a", "b"), ())
 mpc = km.KoopmanMPC(flat, cost, limits, 5)

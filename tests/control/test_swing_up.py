@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.prepare import Prepared
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.move import Status
-from koopmpc.identify.bilinear import bilinear_edmd
-from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import simulate
+import koopmpc as km
+from koopmpc.bench.controllers import Prepared
 
 NAMES = ["cart_pole_swing", "pendulum_swing"]
 SECONDS, HELD = 10.0, 2.0
@@ -25,7 +19,7 @@ def starts(nx: int, count: int) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.5, 0.5, count), np.zeros(count), theta, omega])
 
 
-def upright(run: Run) -> bool:
+def upright(run: km.Run) -> bool:
     """Whether the last 2 s of 10 s are upright and slow, and the cart was on its rail throughout."""
     i = run.states.index("theta [rad]")
     last = run.X[-round(HELD / run.dt) - 1 :]
@@ -37,22 +31,22 @@ class Learned:
     """A problem, its plant, and the bilinear model of its data."""
 
     def __init__(self, name: str) -> None:
-        self.problem = load_problem(name)
+        self.problem = km.load_problem(name)
         self.parts = Prepared(self.problem)
-        self.model = bilinear_edmd(self.parts.data, self.problem.lifting, difference=True)
+        self.model = km.bilinear_edmd(self.parts.data, self.problem.lifting, difference=True)
         self.reference = next(iter(self.problem.cases.values())).reference
 
-    def runs(self, controller, count: int) -> list[Run]:
+    def runs(self, controller, count: int) -> list[km.Run]:
         problem = self.problem
         steps = round(SECONDS / problem.dt)
         return [
-            simulate(self.parts.step_map, controller, x0=x0, reference=self.reference, steps=steps)
+            km.simulate(self.parts.step_map, controller, x0=x0, reference=self.reference, steps=steps)
             for x0 in starts(problem.dynamics.nx, count)
         ]
 
-    def bilinear(self) -> BilinearMPC:
+    def bilinear(self) -> km.BilinearMPC:
         problem = self.problem
-        return BilinearMPC(self.model, problem.cost, problem.limits, problem.horizon)
+        return km.BilinearMPC(self.model, problem.cost, problem.limits, problem.horizon)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -66,13 +60,13 @@ def test_the_bilinear_model_swings_up_and_holds(learned: Learned) -> None:
     for run in runs:
         limit = float(learned.problem.limits.u_max)
         assert np.abs(run.U).max() <= limit
-        assert set(run.status) <= {Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED}
+        assert set(run.status) <= {km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED}
 
 
 def test_a_linear_model_of_the_same_data_does_not() -> None:
     learned = Learned("cart_pole_swing")
     problem = learned.problem
-    linear = KoopmanMPC(learned.parts.model, problem.cost, problem.limits, problem.horizon)
+    linear = km.KoopmanMPC(learned.parts.model, problem.cost, problem.limits, problem.horizon)
     assert sum(upright(run) for run in learned.runs(linear, 2)) == 0
 
 
@@ -80,8 +74,8 @@ def test_its_first_plan_stays_where_the_model_was_learned() -> None:
     """Half a radian off: a first plan along the free fall, beyond the data, would end in the model's own invention."""
     learned = Learned("cart_pole")
     problem, case = learned.problem, learned.problem.cases["recover"]
-    mpc = BilinearMPC(learned.model, problem.cost, problem.limits, problem.horizon)
-    run = simulate(learned.parts.step_map, mpc, x0=case.x0, reference=case.reference, steps=case.steps)
+    mpc = km.BilinearMPC(learned.model, problem.cost, problem.limits, problem.horizon)
+    run = km.simulate(learned.parts.step_map, mpc, x0=case.x0, reference=case.reference, steps=case.steps)
     assert np.abs(run.X[-1] - case.reference).max() < 0.05
     assert np.abs(run.X[:, 2] - np.pi).max() < 0.7
 

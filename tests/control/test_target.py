@@ -78,9 +78,7 @@ def test_where_no_equilibrium_meets_the_state_limits_the_inputs_still_hold():
     """Rest at 4 ≤ x ≤ 5 would take |u| > 1: the target is the nearest that the inputs hold."""
     A, B = np.array([[0.5]]), np.array([[1.0]])
     state = Box(np.array([4.0]), np.array([5.0]))  # x = 2 u at rest
-    found = targets(
-        A, B, np.eye(1), np.eye(1), Box(-np.ones(1), np.ones(1)), np.eye(1), state, None, hold=True
-    )
+    found = targets(A, B, np.eye(1), np.eye(1), Box(-np.ones(1), np.ones(1)), np.eye(1), state, None, hold=True)
     alpha = found.coordinates(np.array([[4.5]]))[0]
     np.testing.assert_allclose(found.z0 + found.Z @ alpha, [2.0], atol=1e-6)
     np.testing.assert_allclose(found.u0 + found.W @ alpha, [1.0], atol=1e-6)

@@ -9,19 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.collect import Uniform, collect
-from koopmpc.data.episodes import Episodes
-from koopmpc.data.excitation import PRBS, Chirp, Feedback, Multisine, Noise
-from koopmpc.errors import DataError, KoopmpcError, ShapeError
-from koopmpc.plant.dynamics import Dynamics
-from koopmpc.plant.simulated import SimulatedPlant
-from koopmpc.plant.step_map import StepMap, discretize
+import koopmpc as km
+from koopmpc.plants.simulated import SimulatedPlant
 
 SEEDS = st.integers(0, 2**32 - 1)
 
 
 @dataclass(frozen=True)
-class Pendulum(Dynamics):
+class Pendulum(km.Dynamics):
     """Hanging, driven, damped."""
 
     states = ("theta [rad]", "omega [rad/s]")
@@ -57,26 +52,26 @@ class Unseen:
         return 2 * self.x
 
 
-PENDULUM = discretize(Pendulum(), 0.05)
-BOX = Uniform([-3, -4], [3, 4])
+PENDULUM = km.discretize(Pendulum(), 0.05)
+BOX = km.Uniform([-3, -4], [3, 4])
 EXCITATIONS = {
-    "noise": Noise(-8, 8, 3),
-    "prbs": PRBS(-8, 8),
-    "multisine": Multisine(8, 0.5, 4),
-    "chirp": Chirp(8, 0.1, 5, 1),
-    "feedback": Feedback([[5, 1]], Noise(-2, 2), u_min=-6, u_max=6),
+    "noise": km.Noise(-8, 8, 3),
+    "prbs": km.PRBS(-8, 8),
+    "multisine": km.Multisine(8, 0.5, 4),
+    "chirp": km.Chirp(8, 0.1, 5, 1),
+    "feedback": km.Feedback([[5, 1]], km.Noise(-2, 2), u_min=-6, u_max=6),
     "function": lambda k, y, rng: -y[1] + k * rng.normal(),
 }
 
 
-def unstable() -> StepMap:
+def unstable() -> km.StepMap:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    return StepMap(ca.Function("F", [x, u], [x**3 + u]), 0.1)
+    return km.StepMap(ca.Function("F", [x, u], [x**3 + u]), 0.1)
 
 
 @pytest.mark.parametrize("excitation", EXCITATIONS.values(), ids=EXCITATIONS)
 def test_every_step_is_one_of_the_plant(excitation: Callable[..., object]) -> None:
-    data = collect(PENDULUM, BOX, excitation, episodes=4, steps=25)
+    data = km.collect(PENDULUM, BOX, excitation, episodes=4, steps=25)
     assert [run.X.shape for run in data] == [(26, 2)] * 4
     for run in data:
         for x, u, x_next in zip(run.X, run.U, run.X[1:], strict=False):
@@ -87,8 +82,8 @@ def test_every_step_is_one_of_the_plant(excitation: Callable[..., object]) -> No
 @pytest.mark.parametrize("excitation", EXCITATIONS.values(), ids=EXCITATIONS)
 @given(seed=SEEDS)
 def test_the_batch_and_the_stepwise_way_agree(excitation: Callable[..., object], seed: int) -> None:
-    batch = collect(PENDULUM, BOX, excitation, episodes=3, steps=20, rng=seed)
-    stepwise = collect(SimulatedPlant(PENDULUM), BOX, excitation, episodes=3, steps=20, rng=seed)
+    batch = km.collect(PENDULUM, BOX, excitation, episodes=3, steps=20, rng=seed)
+    stepwise = km.collect(SimulatedPlant(PENDULUM), BOX, excitation, episodes=3, steps=20, rng=seed)
     assert (batch.dt, batch.states, batch.inputs) == (stepwise.dt, stepwise.states, stepwise.inputs)
     for a, b in zip(batch, stepwise, strict=True):
         np.testing.assert_allclose(a.X, b.X, rtol=0, atol=1e-9)
@@ -97,8 +92,8 @@ def test_the_batch_and_the_stepwise_way_agree(excitation: Callable[..., object],
 
 @given(SEEDS)
 def test_the_seed_decides(seed: int) -> None:
-    def run(rng: np.random.Generator | int) -> Episodes:
-        return collect(PENDULUM, BOX, Noise(-8, 8), episodes=2, steps=5, rng=rng)
+    def run(rng: np.random.Generator | int) -> km.Episodes:
+        return km.collect(PENDULUM, BOX, km.Noise(-8, 8), episodes=2, steps=5, rng=rng)
 
     assert run(seed) == run(seed) == run(np.random.default_rng(seed))
     assert run(seed) != run(seed + 1)
@@ -106,33 +101,33 @@ def test_the_seed_decides(seed: int) -> None:
 
 
 def test_names_and_dt_come_from_the_plant() -> None:
-    data = collect(PENDULUM, BOX, Noise(-8, 8), episodes=1, steps=2)
+    data = km.collect(PENDULUM, BOX, km.Noise(-8, 8), episodes=1, steps=2)
     assert (data.states, data.inputs, data.dt) == (Pendulum.states, Pendulum.inputs, 0.05)
 
 
 @given(SEEDS)
 def test_uniform_stays_in_its_box(seed: int) -> None:
-    X = Uniform([-1, 2], [1, 2.5]).sample(40, np.random.default_rng(seed))
+    X = km.Uniform([-1, 2], [1, 2.5]).sample(40, np.random.default_rng(seed))
     assert X.shape == (40, 2)
     assert (X >= [-1, 2]).all()
     assert (X <= [1, 2.5]).all()
 
 
 def test_given_starts_are_used() -> None:
-    one = collect(PENDULUM, [0.1, 0.2], Noise(-8, 8), episodes=3, steps=2)
+    one = km.collect(PENDULUM, [0.1, 0.2], km.Noise(-8, 8), episodes=3, steps=2)
     assert [run.X[0].tolist() for run in one] == [[0.1, 0.2]] * 3
-    each = collect(PENDULUM, [[1, 2], [3, 4]], Noise(-8, 8), episodes=2, steps=2)
+    each = km.collect(PENDULUM, [[1, 2], [3, 4]], km.Noise(-8, 8), episodes=2, steps=2)
     assert [run.X[0].tolist() for run in each] == [[1, 2], [3, 4]]
 
 
 @pytest.mark.parametrize(
-    "excitation", [Noise(-8, 8), Feedback([[1, 1]], Noise(-1, 1))], ids=["open", "closed"]
+    "excitation", [km.Noise(-8, 8), km.Feedback([[1, 1]], km.Noise(-1, 1))], ids=["open", "closed"]
 )
-def test_the_measured_is_what_is_kept(excitation: Noise | Feedback) -> None:
-    whole = discretize(Pendulum(), 0.05)
-    partly = discretize(SeenAngle(), 0.05)
-    seen = collect(partly, BOX, excitation, episodes=3, steps=10)
-    driven = collect(SimulatedPlant(partly), BOX, excitation, episodes=3, steps=10)
+def test_the_measured_is_what_is_kept(excitation: km.Noise | km.Feedback) -> None:
+    whole = km.discretize(Pendulum(), 0.05)
+    partly = km.discretize(SeenAngle(), 0.05)
+    seen = km.collect(partly, BOX, excitation, episodes=3, steps=10)
+    driven = km.collect(SimulatedPlant(partly), BOX, excitation, episodes=3, steps=10)
     assert seen.states == ("y0", "omega [rad/s]")
     rng = np.random.default_rng(0)
     for start, run, other in zip(BOX.sample(3, rng), seen, driven, strict=True):
@@ -149,7 +144,7 @@ def test_somebody_elses_plant() -> None:
         calls.append((k, float(y[0])))
         return 1.0
 
-    data = collect(plant, [3.0], count, episodes=2, steps=3)
+    data = km.collect(plant, [3.0], count, episodes=2, steps=3)
     assert plant.resets == 2
     assert calls == [(0, 6), (1, 8), (2, 10)] * 2
     assert data[1].X.ravel().tolist() == [6, 8, 10, 12]
@@ -158,8 +153,8 @@ def test_somebody_elses_plant() -> None:
 
 def test_an_autonomous_plant_needs_no_input() -> None:
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 0)
-    plant = StepMap(ca.Function("F", [x, u], [0.5 * x]), 0.1)
-    data = collect(plant, [1, 2], lambda k, y, rng: [], episodes=1, steps=2)
+    plant = km.StepMap(ca.Function("F", [x, u], [0.5 * x]), 0.1)
+    data = km.collect(plant, [1, 2], lambda k, y, rng: [], episodes=1, steps=2)
     assert data[0].X.tolist() == [[1, 2], [0.5, 1], [0.25, 0.5]]
     assert data[0].U.shape == (2, 0)
 
@@ -168,47 +163,47 @@ def test_an_autonomous_plant_needs_no_input() -> None:
     ("act", "kind", "text"),
     [
         (
-            lambda: collect(unstable(), [[0.1], [3.0]], Noise(-0.1, 0.1), episodes=2, steps=20),
-            DataError,
+            lambda: km.collect(unstable(), [[0.1], [3.0]], km.Noise(-0.1, 0.1), episodes=2, steps=20),
+            km.errors.DataError,
             "episode 1 is NaN or infinite from step 6 on: the plant diverged; start nearer, excite less",
         ),
         (
-            lambda: collect(unstable(), [[0.1], [3.0]], Feedback([[0.0]]), episodes=2, steps=20),
-            DataError,
+            lambda: km.collect(unstable(), [[0.1], [3.0]], km.Feedback([[0.0]]), episodes=2, steps=20),
+            km.errors.DataError,
             "episode 1 is NaN or infinite from step 6 on",
         ),
         (
-            lambda: collect(SimulatedPlant(unstable()), [[0.1], [3.0]], Feedback([[0.0]]), episodes=2, steps=20),
-            DataError,
+            lambda: km.collect(SimulatedPlant(unstable()), [[0.1], [3.0]], km.Feedback([[0.0]]), episodes=2, steps=20),
+            km.errors.DataError,
             "episode 1 is NaN or infinite from step 6 on",
         ),
         (
-            lambda: collect(PENDULUM, BOX, Noise([-1, -1], [1, 1]), episodes=1, steps=2),
-            ShapeError,
+            lambda: km.collect(PENDULUM, BOX, km.Noise([-1, -1], [1, 1]), episodes=1, steps=2),
+            km.errors.ShapeError,
             r"the excitation gives 2 inputs, the plant takes 1 \(torque \[N m\]\); pass one level for each input",
         ),
         (
-            lambda: collect(PENDULUM, BOX, lambda k, y, rng: [1, 2], episodes=1, steps=2),
-            ShapeError,
+            lambda: km.collect(PENDULUM, BOX, lambda k, y, rng: [1, 2], episodes=1, steps=2),
+            km.errors.ShapeError,
             r"the excitation's u has shape \(2,\), expected \(1,\) or a scalar",
         ),
         (
-            lambda: collect(PENDULUM, [[0, 0], [1, 1]], Noise(-1, 1), episodes=3, steps=2),
-            ShapeError,
+            lambda: km.collect(PENDULUM, [[0, 0], [1, 1]], km.Noise(-1, 1), episodes=3, steps=2),
+            km.errors.ShapeError,
             r"x0 gives shape \(2, 2\), expected \(3, 2\): an episode a row, a state a column; pass Uniform",
         ),
         (
-            lambda: collect(PENDULUM, Uniform([0], [1]), Noise(-1, 1), episodes=3, steps=2),
-            ShapeError,
+            lambda: km.collect(PENDULUM, km.Uniform([0], [1]), km.Noise(-1, 1), episodes=3, steps=2),
+            km.errors.ShapeError,
             r"x0 gives shape \(3, 1\), expected \(3, 2\)",
         ),
-        (lambda: collect(PENDULUM, [0, np.nan], Noise(-1, 1), episodes=3, steps=2), DataError, "x0 holds 1 NaN"),
-        (lambda: collect(PENDULUM, BOX, Noise(-1, 1), episodes=0, steps=2), DataError, "episodes is 0; it must be"),
-        (lambda: collect(PENDULUM, BOX, Noise(-1, 1), episodes=1, steps=0), DataError, "steps is 0; it must be"),
-        (lambda: Uniform([0, 1], [1, 0]), DataError, "initial state limits cross at index 1: lower 1 is above upper 0"),
-        (lambda: Uniform([0, 1], [1, 2, 3]), ShapeError, r"high has shape \(3,\), expected \(2,\) or a scalar"),
+        (lambda: km.collect(PENDULUM, [0, np.nan], km.Noise(-1, 1), episodes=3, steps=2), km.errors.DataError, "x0 holds 1 NaN"),
+        (lambda: km.collect(PENDULUM, BOX, km.Noise(-1, 1), episodes=0, steps=2), km.errors.DataError, "episodes is 0; it must be"),
+        (lambda: km.collect(PENDULUM, BOX, km.Noise(-1, 1), episodes=1, steps=0), km.errors.DataError, "steps is 0; it must be"),
+        (lambda: km.Uniform([0, 1], [1, 0]), km.errors.DataError, "initial state limits cross at index 1: lower 1 is above upper 0"),
+        (lambda: km.Uniform([0, 1], [1, 2, 3]), km.errors.ShapeError, r"high has shape \(3,\), expected \(2,\) or a scalar"),
     ],
 )  # fmt: skip
-def test_messages(act: Callable[[], object], kind: type[KoopmpcError], text: str) -> None:
+def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
     with pytest.raises(kind, match=text):
         act()

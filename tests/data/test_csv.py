@@ -8,8 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.storage import load_episodes
-from koopmpc.errors import DataError, FitWarning, LogError
+import koopmpc as km
 
 
 def text(file: Path, content: str, encoding: str = "utf-8") -> Path:
@@ -22,7 +21,7 @@ def test_a_log_that_says_nothing_is_understood(tmp_path: Path) -> None:
         tmp_path / "log.csv",
         "time [s],theta [rad],omega,force [N],note\n0,1,2,5,a\n0.1,3,4,6,b\n0.2,5,6,,c\n",
     )
-    read = load_episodes(file)
+    read = km.load_episodes(file)
     assert (read.dt, read.states, read.inputs) == (0.1, ("theta [rad]", "omega"), ("force [N]",))
     assert read[0].X.tolist() == [[1, 2], [3, 4], [5, 6]]
     assert read[0].U.tolist() == [[5], [6]]
@@ -40,23 +39,21 @@ def test_a_log_that_says_nothing_is_understood(tmp_path: Path) -> None:
     ],
 )
 def test_the_ways_in_which_programs_write_one_table(tmp_path: Path, content: str) -> None:
-    read = load_episodes(text(tmp_path / "log.csv", content))
+    read = km.load_episodes(text(tmp_path / "log.csv", content))
     assert (read.dt, read.states, read.inputs) == (1.0, ("x",), ("u",))
     assert (read[0].X.ravel().tolist(), read[0].U.ravel().tolist()) == ([1.5, 2.5, 3.5], [1.0, 2.0])
 
 
 def test_letters_of_another_encoding(tmp_path: Path) -> None:
-    read = load_episodes(
-        text(tmp_path / "log.csv", "t,φ\n0,1\n1,2\n".replace("φ", "é"), "latin-1"), inputs=[]
-    )
+    read = km.load_episodes(text(tmp_path / "log.csv", "t,φ\n0,1\n1,2\n".replace("φ", "é"), "latin-1"), inputs=[])
     assert read.states == ("é",)
 
 
 def test_what_is_told_counts(tmp_path: Path) -> None:
     file = text(tmp_path / "log.csv", "a,b,w,u1\n1,2,3,4\n5,6,7,8\n")
-    read = load_episodes(file, dt=0.5, states=["u1"], inputs=["a"], disturbances=["b"])
+    read = km.load_episodes(file, dt=0.5, states=["u1"], inputs=["a"], disturbances=["b"])
     assert (read.states, read.inputs, read.disturbances, read.dt) == (("u1",), ("a",), ("b",), 0.5)
-    guessed = load_episodes(file, dt=0.5)
+    guessed = km.load_episodes(file, dt=0.5)
     assert (guessed.states, guessed.inputs, guessed.disturbances) == (("a", "b"), ("u1",), ("w",))
 
 
@@ -70,16 +67,14 @@ def test_gaps_cut_and_no_pair_spans_one(tmp_path: Path, T: int, holes: set[int],
     file = text(tmp_path / "log.csv", "\n".join(["t,x,u", *rows]) + "\n")
     pairs = [k for k in range(T - 1) if k not in holes and k + 1 not in holes and t[k + 1] - t[k] == 1]
     if not pairs:
-        with pytest.raises(DataError, match="no two rows in sequence"):
-            load_episodes(file, dt=1.0)
+        with pytest.raises(km.errors.DataError, match="no two rows in sequence"):
+            km.load_episodes(file, dt=1.0)
         return
     if len(pairs) == T - 1:
-        read = load_episodes(file, dt=1.0)
+        read = km.load_episodes(file, dt=1.0)
     else:
-        with pytest.warns(
-            FitWarning, match=r"gaps \(after row .*\) cut 1 episodes into \d+; \d+ of \d+ rows"
-        ):
-            read = load_episodes(file, dt=1.0)
+        with pytest.warns(km.FitWarning, match=r"gaps \(after row .*\) cut 1 episodes into \d+; \d+ of \d+ rows"):
+            read = km.load_episodes(file, dt=1.0)
     found = [int(x) for e in read for x in e.X[:-1, 0]]
     assert found == pairs
     assert all(np.array_equal(e.U, 10 * e.X[:-1]) for e in read)
@@ -87,7 +82,7 @@ def test_gaps_cut_and_no_pair_spans_one(tmp_path: Path, T: int, holes: set[int],
 
 
 def test_time_that_goes_back_starts_an_episode(tmp_path: Path) -> None:
-    read = load_episodes(text(tmp_path / "log.csv", "t,x,u\n0,1,1\n1,2,1\n0,7,1\n1,8,2\n2,9,1\n"))
+    read = km.load_episodes(text(tmp_path / "log.csv", "t,x,u\n0,1,1\n1,2,1\n0,7,1\n1,8,2\n2,9,1\n"))
     assert [e.X.ravel().tolist() for e in read] == [[1, 2], [7, 8, 9]]
 
 
@@ -97,10 +92,10 @@ def test_unequal_time_is_named_and_resampled(tmp_path: Path) -> None:
     rows = [f"{v!r},{2 * v - 1!r},{k}" for k, v in enumerate(t.tolist())]
     file = text(tmp_path / "log.csv", "\n".join(["t,x,u", *rows]))
     with pytest.raises(
-        DataError, match=r"steps differ from dt = .* by more than 2 %, the first at row 1, where it"
+        km.errors.DataError, match=r"steps differ from dt = .* by more than 2 %, the first at row 1, where it"
     ):
-        load_episodes(file)
-    (episode,) = read = load_episodes(file, resample=0.05)
+        km.load_episodes(file)
+    (episode,) = read = km.load_episodes(file, resample=0.05)
     grid = t[0] + 0.05 * np.arange(len(episode.X))
     assert read.dt == 0.05
     assert grid[-1] <= t[-1] < grid[-1] + 0.05
@@ -111,44 +106,42 @@ def test_unequal_time_is_named_and_resampled(tmp_path: Path) -> None:
 
 def test_columns_that_say_nothing_are_named(tmp_path: Path) -> None:
     file = text(tmp_path / "log.csv", "t,x,y,c,u\n0,1,1,7,1\n1,2,2,7,0\n2,4,4,7,1\n")
-    with pytest.warns(FitWarning) as caught:
-        load_episodes(file)
+    with pytest.warns(km.FitWarning) as caught:
+        km.load_episodes(file)
     said = [str(w.message) for w in caught]
     assert any("'y' repeats 'x'; leave one out" in s for s in said)
     assert any("'c' is 7 throughout; leave it out" in s for s in said)
-    with pytest.warns(
-        FitWarning, match="no column is named as an input, .* its states are x, y; pass inputs="
-    ):
-        load_episodes(text(tmp_path / "free.csv", "t,x,y\n0,1,5\n1,2,3\n"))
+    with pytest.warns(km.FitWarning, match="no column is named as an input, .* its states are x, y; pass inputs="):
+        km.load_episodes(text(tmp_path / "free.csv", "t,x,y\n0,1,5\n1,2,3\n"))
 
 
 @pytest.mark.parametrize(
     ("content", "error", "said"),
     [
-        ("", LogError, "it is no .csv file, or was cut"),
-        ("\n\n", LogError, "it is no .csv file"),
-        ("t,x,u\n0,1,2\n1,2\n", LogError, "can be read: CSV parse error: Expected 3 columns, got 2"),
-        ("0,1,2\n1,2,3\n", LogError, "has no line of names: its first row is 0, 1, 2"),
-        ("t,x,x\n0,1,2\n1,2,3\n", DataError, "has two columns 'x'; rename one"),
-        ("t,u\n0,1\n1,2\n", DataError, "has no column that could be a state: its columns are t, u"),
-        ("t,x,u\n", DataError, "has columns and no row in them; leave the file out"),
-        ("x,u\n1,2\n2,3\n", DataError, "does not say its sample time: pass dt="),
+        ("", km.errors.LogError, "it is no .csv file, or was cut"),
+        ("\n\n", km.errors.LogError, "it is no .csv file"),
+        ("t,x,u\n0,1,2\n1,2\n", km.errors.LogError, "can be read: CSV parse error: Expected 3 columns, got 2"),
+        ("0,1,2\n1,2,3\n", km.errors.LogError, "has no line of names: its first row is 0, 1, 2"),
+        ("t,x,x\n0,1,2\n1,2,3\n", km.errors.DataError, "has two columns 'x'; rename one"),
+        ("t,u\n0,1\n1,2\n", km.errors.DataError, "has no column that could be a state: its columns are t, u"),
+        ("t,x,u\n", km.errors.DataError, "has columns and no row in them; leave the file out"),
+        ("x,u\n1,2\n2,3\n", km.errors.DataError, "does not say its sample time: pass dt="),
     ],
 )  # fmt: skip
 def test_what_is_no_table_is_refused(tmp_path: Path, content: str, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
-        load_episodes(text(tmp_path / "log.csv", content))
+        km.load_episodes(text(tmp_path / "log.csv", content))
 
 
 def test_a_changed_file_of_our_own_is_refused(tmp_path: Path) -> None:
     file = text(tmp_path / "log.csv", "t,x,u\n0,1,2\n1,2,3\n2,3,4\n")
-    load_episodes(file).save(tmp_path / "own.csv")
+    km.load_episodes(file).save(tmp_path / "own.csv")
     lines = (tmp_path / "own.csv").read_text().splitlines()
     text(tmp_path / "own.csv", "\n".join([*lines[:3], *lines[4:]]))
     with pytest.raises(
-        LogError, match="holds no episodes that can be read: its rows are not those that were written"
+        km.errors.LogError, match="holds no episodes that can be read: its rows are not those that were written"
     ):
-        load_episodes(tmp_path / "own.csv")
+        km.load_episodes(tmp_path / "own.csv")
 
 
 def table(tmp_path: Path, cells: list[str], header: str = "t,x,v,u") -> Path:
@@ -161,24 +154,24 @@ def test_a_cell_that_is_no_number_costs_no_column_in_silence(tmp_path: Path, spo
     file = table(tmp_path, ["1.5", "2.5", spoilt, "4.5", "6"])
     shown = re.escape(spoilt.strip('"'))
     said = rf"log\.csv: 'x' holds '{shown}' in row 3, which is no real number; repair the cell"
-    with pytest.raises(DataError, match=said):
-        load_episodes(file)
-    with pytest.raises(DataError, match=said):
-        load_episodes(file, states=["x", "v"], inputs=["u"])
-    assert load_episodes(file, states=["v"], inputs=["u"]).states == ("v",)
+    with pytest.raises(km.errors.DataError, match=said):
+        km.load_episodes(file)
+    with pytest.raises(km.errors.DataError, match=said):
+        km.load_episodes(file, states=["x", "v"], inputs=["u"])
+    assert km.load_episodes(file, states=["v"], inputs=["u"]).states == ("v",)
 
 
 def test_complex_cells_are_not_left_out_in_silence(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"'x' holds '\(1\+2j\)' in row 1, which is no real number"):
-        load_episodes(table(tmp_path, ["(1+2j)", "(2+1j)", "(3-1j)"]))
+    with pytest.raises(km.errors.DataError, match=r"'x' holds '\(1\+2j\)' in row 1, which is no real number"):
+        km.load_episodes(table(tmp_path, ["(1+2j)", "(2+1j)", "(3-1j)"]))
 
 
 def test_a_column_of_labels_is_no_state(tmp_path: Path) -> None:
-    assert load_episodes(table(tmp_path, ["walk", "walk", "2nd", "3", "run"])).states == ("v",)
+    assert km.load_episodes(table(tmp_path, ["walk", "walk", "2nd", "3", "run"])).states == ("v",)
 
 
 def test_truth_values_with_one_missing_cut_an_episode(tmp_path: Path) -> None:
     file = table(tmp_path, ["true", "false", "", "true", "false"])
-    with pytest.warns(FitWarning, match="1 gaps .* cut 1 episodes into 2; 1 of 5 rows are lost"):
-        read = load_episodes(file)
+    with pytest.warns(km.FitWarning, match="1 gaps .* cut 1 episodes into 2; 1 of 5 rows are lost"):
+        read = km.load_episodes(file)
     assert [episode.X[:, 0].tolist() for episode in read] == [[1, 0], [1, 0]]

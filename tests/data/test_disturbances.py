@@ -31,7 +31,7 @@ def test_edmd_finds_them():
     for episode in held_out:
         np.testing.assert_allclose(model.rollout(episode.X[0], episode.U, episode.W), episode.X, atol=1e-10)
     assert km.score(model, held_out, 10).total < 1e-10
-    np.testing.assert_allclose(km.linearity_error(model, held_out), 0.0, atol=1e-10)
+    np.testing.assert_allclose(km.spectrum.linearity_error(model, held_out), 0.0, atol=1e-10)
     blind = km.LinearPredictor(model.A, model.B, model.C, model.lifting, 0.1, model.states, model.inputs)
     assert blind.nw == 0
     assert km.score(blind, held_out, 10).total > 0.1
@@ -55,7 +55,7 @@ def test_files_hold_them(tmp_path, suffix):
     assert all(part.nw == 2 for part in episodes.split(0.5))
     model = km.edmd(episodes, km.State())
     model.save(tmp_path / "model.npz")
-    assert km.load_predictor(tmp_path / "model.npz") == model
+    assert km.load_model(tmp_path / "model.npz") == model
 
 
 def test_messages():
@@ -66,43 +66,41 @@ def test_messages():
     named = km.Episodes([one], 0.1, ("a", "b"), ("u",), ("gust",))
     for error, text, call in (
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"W has 2 rows and U 3; both have one a step",
             lambda: km.Episode(X=X, U=U, W=[[0], [0]]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"episode 1 has 0 measured disturbances, episode 0 has 1; measure the same ones throughout",
             lambda: km.Episodes([one, other], 0.1),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"disturbances has 2 names and the data 1 columns",
             lambda: km.Episodes([one], 0.1, disturbances=("p", "q")),
         ),
-        (km.DataError, r"which dmdc does not fit; use edmd on State\(\)", lambda: km.dmdc(data())),
-        (km.DataError, r"a bilinear fit leaves out; use edmd", lambda: km.bilinear_edmd(data(), km.State())),
+        (km.errors.DataError, r"which dmdc does not fit; use edmd on State\(\)", lambda: km.dmdc(data())),
+        (km.errors.DataError, r"a bilinear fit leaves out; use edmd", lambda: km.bilinear_edmd(data(), km.State())),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"the episodes have disturbances \(gust\), the predictor has \(load \[N\], wind \[m/s\]\)",
             lambda: km.score(model, named, 2),
         ),
         (
-            km.DataError,
+            km.errors.DataError,
             r"the episodes differ in disturbances: gust and w0",
             lambda: named + km.Episodes([one], 0.1, ("a", "b"), ("u",)),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"W has shape \(3, 1\), expected \(3, 2\)",
             lambda: model.rollout([0, 0], U, [[0]] * 3),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"disturbances has 1 names and E 2 columns; give one name each",
-            lambda: km.LinearPredictor(
-                A, B, np.eye(2), km.State(), 0.1, ("a", "b"), ("u",), E=E, disturbances=("p",)
-            ),
+            lambda: km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("a", "b"), ("u",), E=E, disturbances=("p",)),
         ),
     ):
         with pytest.raises(error, match=text):

@@ -7,24 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, KoopmpcError, ShapeError
+import koopmpc as km
 from koopmpc.values import from_data, to_data
 from tests.bare import shown
 
 LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=8)
 
 
-def numbered(lengths: list[int], nu: int = 2) -> Episodes:
+def numbered(lengths: list[int], nu: int = 2) -> km.Episodes:
     """Episodes whose entries say where they stand: x_k = (episode, k), u_k = (episode, k, …)[:nu]."""
     runs = [
-        Episode(
+        km.Episode(
             X=[(e, k) for k in range(steps + 1)],
             U=np.array([(e, k, -k) for k in range(steps)], dtype=float)[:, :nu],
         )
         for e, steps in enumerate(lengths)
     ]
-    return Episodes(runs, dt=0.1, states=["e", "k"])
+    return km.Episodes(runs, dt=0.1, states=["e", "k"])
 
 
 @given(LENGTHS, st.integers(0, 3))
@@ -53,7 +52,7 @@ def test_no_snapshot_crosses_from_one_episode_to_the_next(lengths: list[int]) ->
 def test_a_split_deals_out_whole_episodes(lengths: list[int], fraction: float, seed: int) -> None:
     data = numbered(lengths)
     if not 0 < round(fraction * len(data)) < len(data):
-        with pytest.raises(DataError, match=f"a split of {len(data)} episodes at fraction .* at least one"):
+        with pytest.raises(km.errors.DataError, match=f"a split of {len(data)} episodes at fraction .* at least one"):
             data.split(fraction, seed)
         return
     train, held_out = data.split(fraction, seed)
@@ -84,27 +83,27 @@ def test_joining_and_slicing_undo_each_other(first: list[int], second: list[int]
 
 
 def test_names_count_up_by_default() -> None:
-    data = Episodes([Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], dt=0.1)
+    data = km.Episodes([km.Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], dt=0.1)
     assert (data.states, data.inputs, data.nx, data.nu) == (("x0", "x1"), ("u0",), 2, 1)
 
 
 def test_autonomous_data_has_no_inputs() -> None:
-    run = Episode(X=np.zeros((4, 2)))
+    run = km.Episode(X=np.zeros((4, 2)))
     assert run.U.shape == (3, 0)
     assert len(run) == 3
-    assert Episodes([run], 0.1).inputs == ()
+    assert km.Episodes([run], 0.1).inputs == ()
 
 
 def test_episodes_own_their_arrays_and_are_values() -> None:
     X, U = np.arange(6.0).reshape(3, 2), np.zeros((2, 1))
-    data = Episodes([Episode(X=X, U=U)], dt=0.1)
+    data = km.Episodes([km.Episode(X=X, U=U)], dt=0.1)
     X[:] = 7
     assert data[0].X[0, 0] == 0
     assert from_data(to_data(data)) == data
 
 
-def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> Episode:
-    return Episode(X=np.zeros((rows, nx)), U=np.zeros((moves, nu)))
+def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> km.Episode:
+    return km.Episode(X=np.zeros((rows, nx)), U=np.zeros((moves, nu)))
 
 
 @pytest.mark.parametrize(
@@ -112,46 +111,46 @@ def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> Episode:
     [
         (
             lambda: zeros(5, 5),
-            ShapeError,
+            km.errors.ShapeError,
             "U has 5 rows and X 5: X must have one row more than U; x_0 … x_T, u_0 … u_{T-1}",
         ),
-        (lambda: zeros(3, 5), ShapeError, "U has 5 rows and X 3: X must have one row more"),
-        (lambda: Episode(X=np.zeros((0, 2))), ShapeError, "X has no row; an episode holds x_0 at least"),
-        (lambda: Episode(X=[1.0, 2.0]), ShapeError, r"X has shape \(2,\), expected \(any, any\)"),
-        (lambda: Episode(X=[[1.0], [np.nan]]), DataError, r"X holds 1 NaN or inf, the first at \(1, 0\); remove"),
-        (lambda: Episode(X=[[1.0], [2.0]], U=[[np.inf]]), DataError, "U holds 1 NaN or inf"),
-        (lambda: Episodes([], 0.1), DataError, "there is no episode; pass at least one"),
+        (lambda: zeros(3, 5), km.errors.ShapeError, "U has 5 rows and X 3: X must have one row more"),
+        (lambda: km.Episode(X=np.zeros((0, 2))), km.errors.ShapeError, "X has no row; an episode holds x_0 at least"),
+        (lambda: km.Episode(X=[1.0, 2.0]), km.errors.ShapeError, r"X has shape \(2,\), expected \(any, any\)"),
+        (lambda: km.Episode(X=[[1.0], [np.nan]]), km.errors.DataError, r"X holds 1 NaN or inf, the first at \(1, 0\); remove"),
+        (lambda: km.Episode(X=[[1.0], [2.0]], U=[[np.inf]]), km.errors.DataError, "U holds 1 NaN or inf"),
+        (lambda: km.Episodes([], 0.1), km.errors.DataError, "there is no episode; pass at least one"),
         (
-            lambda: Episodes([zeros(4, 3), zeros(1, 0)], 0.1),
-            DataError,
+            lambda: km.Episodes([zeros(4, 3), zeros(1, 0)], 0.1),
+            km.errors.DataError,
             "episode 1 is too short: X has 1 row and so no step; an episode needs at least 2 rows, drop it",
         ),
         (
-            lambda: Episodes([zeros(4, 3), zeros(4, 3, nx=3)], 0.1),
-            ShapeError,
+            lambda: km.Episodes([zeros(4, 3), zeros(4, 3, nx=3)], 0.1),
+            km.errors.ShapeError,
             "episode 1 has 3 states and 1 inputs, episode 0 has 2 and 1; episodes of one set come from one plant",
         ),
-        (lambda: Episodes([zeros(4, 3)], -0.1), DataError, "dt is -0.1 s; it must be above zero"),
-        (lambda: Episodes([zeros(4, 3)], 0.1, states=["a"]), ShapeError, "states has 1 names and the data 2 columns"),
-        (lambda: Episodes([zeros(4, 3)], 0.1, inputs="u"), DataError, "inputs is 'u'; pass a tuple of names"),
+        (lambda: km.Episodes([zeros(4, 3)], -0.1), km.errors.DataError, "dt is -0.1 s; it must be above zero"),
+        (lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a"]), km.errors.ShapeError, "states has 1 names and the data 2 columns"),
+        (lambda: km.Episodes([zeros(4, 3)], 0.1, inputs="u"), km.errors.DataError, "inputs is 'u'; pass a tuple of names"),
         (
-            lambda: Episodes([zeros(4, 3)], 0.1, states=["a", "b"], inputs=["a"]),
-            DataError,
+            lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a", "b"], inputs=["a"]),
+            km.errors.DataError,
             "two states or inputs are named 'a'; rename one",
         ),
         (
-            lambda: Episodes([zeros(4, 3)], 0.1) + Episodes([zeros(4, 3)], 0.2),
-            DataError,
+            lambda: km.Episodes([zeros(4, 3)], 0.1) + km.Episodes([zeros(4, 3)], 0.2),
+            km.errors.DataError,
             "the episodes have unequal dt: 0.1 s and 0.2 s; resample one of them",
         ),
         (
-            lambda: Episodes([zeros(4, 3)], 0.1) + Episodes([zeros(4, 3)], 0.1, states=["a", "b"]),
-            DataError,
+            lambda: km.Episodes([zeros(4, 3)], 0.1) + km.Episodes([zeros(4, 3)], 0.1, states=["a", "b"]),
+            km.errors.DataError,
             "the episodes differ in states: x0, x1 and a, b; rename one",
         ),
     ],
 )  # fmt: skip
-def test_messages(act: Callable[[], object], kind: type[KoopmpcError], text: str) -> None:
+def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
     with pytest.raises(kind, match=text):
         act()
 
@@ -172,13 +171,11 @@ show(lambda: km.edmd([X], km.State()))
 show(lambda: km.edmd(X, km.State()))
 show(lambda: km.dmd(X))
 show(lambda: km.dmdc(X))
-from koopmpc.identify.bilinear import bilinear_edmd
+from koopmpc.identify.fits.bilinear import bilinear_edmd
 show(lambda: bilinear_edmd(X, km.State()))
 """
     )
-    episodes = (
-        "; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, Files(folder) or Stream(episodes)"
-    )
+    episodes = "; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, Files(folder) or Stream(episodes)"
     assert lines == [
         "DataError episode 0 is a ndarray; pass Episode(X=…, U=…)",
         "DataError episodes is a ndarray; pass a list of Episode(X=…, U=…)",

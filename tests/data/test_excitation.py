@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.data.excitation import PRBS, Chirp, Feedback, Multisine, Noise
-from koopmpc.data.policy import Excitation
-from koopmpc.data.shift_register import ORDERS, maximal_length
-from koopmpc.errors import DataError, KoopmpcError, ShapeError
+import koopmpc as km
+from koopmpc.data.excitation import ORDERS, Excitation, maximal_length
 from koopmpc.values import from_data, to_data
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -22,7 +20,7 @@ def generator(seed: int) -> np.random.Generator:
 
 @given(SEEDS, st.integers(1, 7), st.integers(1, 40))
 def test_noise_stays_in_its_box_and_is_held(seed: int, hold: int, steps: int) -> None:
-    U = Noise([-1, 2], [1, 2.5], hold).sequence(steps, 0.1, generator(seed))
+    U = km.Noise([-1, 2], [1, 2.5], hold).sequence(steps, 0.1, generator(seed))
     assert U.shape == (steps, 2)
     assert (U >= [-1, 2]).all()
     assert (U <= [1, 2.5]).all()
@@ -31,7 +29,7 @@ def test_noise_stays_in_its_box_and_is_held(seed: int, hold: int, steps: int) ->
 
 
 def test_noise_fills_its_box_evenly() -> None:
-    u = Noise(-2, 6).sequence(20_000, 0.1, generator(0)).ravel()
+    u = km.Noise(-2, 6).sequence(20_000, 0.1, generator(0)).ravel()
     counts = np.histogram(u, bins=8, range=(-2, 6))[0]
     assert np.abs(counts - 2500).max() < 5 * np.sqrt(2500)
 
@@ -47,7 +45,7 @@ def test_registers_are_of_maximal_length(order: int) -> None:
 @given(SEEDS, st.integers(1, 5), st.integers(4, 9))
 def test_prbs_has_two_levels_and_a_flat_spectrum(seed: int, hold: int, order: int) -> None:
     period = 2**order - 1
-    u = PRBS(-1, 1, hold, order).sequence(2 * period * hold, 0.1, generator(seed)).ravel()
+    u = km.PRBS(-1, 1, hold, order).sequence(2 * period * hold, 0.1, generator(seed)).ravel()
     assert set(u.tolist()) == {-1.0, 1.0}
     assert (u[: period * hold] == u[period * hold :]).all()
     bits = u[: period * hold : hold]
@@ -57,15 +55,13 @@ def test_prbs_has_two_levels_and_a_flat_spectrum(seed: int, hold: int, order: in
 
 
 def test_the_inputs_of_a_prbs_are_hardly_correlated() -> None:
-    U = PRBS([-1, -1, -1], [1, 1, 1], order=8).sequence(255, 0.1, generator(0))
+    U = km.PRBS([-1, -1, -1], [1, 1, 1], order=8).sequence(255, 0.1, generator(0))
     np.testing.assert_allclose(U.T @ U, 256 * np.eye(3) - 1, atol=1e-9)
 
 
 @given(SEEDS, st.sampled_from([3, [1, 4, 9], [7]]))
-def test_multisine_holds_only_its_harmonics_and_reaches_its_peak(
-    seed: int, harmonics: int | list[int]
-) -> None:
-    U = Multisine([2, 0.5], 2.0, harmonics, offset=[1, 0]).sequence(120, 0.05, generator(seed))
+def test_multisine_holds_only_its_harmonics_and_reaches_its_peak(seed: int, harmonics: int | list[int]) -> None:
+    U = km.Multisine([2, 0.5], 2.0, harmonics, offset=[1, 0]).sequence(120, 0.05, generator(seed))
     np.testing.assert_allclose(U[:40], U[40:80], rtol=0, atol=0)
     one = U[:40] - [1, 0]
     np.testing.assert_allclose(np.abs(one).max(axis=0), [2, 0.5], rtol=1e-12)
@@ -87,7 +83,7 @@ def local_frequency(u: np.ndarray, dt: float) -> float:
 @pytest.mark.parametrize(("f0", "f1"), [(0.5, 4.0), (4.0, 0.5)])
 def test_a_chirp_runs_from_f0_to_f1(f0: float, f1: float) -> None:
     dt, duration = 0.01, 200.0
-    u = Chirp(3.0, f0, f1, duration, offset=-1.0).sequence(40_000, dt, generator(0)).ravel() + 1
+    u = km.Chirp(3.0, f0, f1, duration, offset=-1.0).sequence(40_000, dt, generator(0)).ravel() + 1
     assert np.abs(u).max() == pytest.approx(3, rel=1e-3)
     assert (u[:20_000] == u[20_000:]).all()
     assert local_frequency(u[:400], dt) == pytest.approx(f0, rel=0.1)
@@ -99,10 +95,10 @@ def test_a_chirp_runs_from_f0_to_f1(f0: float, f1: float) -> None:
 def test_feedback_is_its_formula(seed: int) -> None:
     rng = generator(seed)
     K, x_ref, u_ref, y = rng.normal(size=(2, 3)), rng.normal(size=3), rng.normal(size=2), rng.normal(size=3)
-    noise = Noise([-1, -1], [1, 1], hold=2)
-    plain = Feedback(K, x_ref=x_ref, u_ref=u_ref)
+    noise = km.Noise([-1, -1], [1, 1], hold=2)
+    plain = km.Feedback(K, x_ref=x_ref, u_ref=u_ref)
     np.testing.assert_allclose(plain.start(5, 0.1, rng)(0, y), u_ref - K @ (y - x_ref), rtol=1e-12)
-    noisy = Feedback(K, noise, x_ref, u_ref, u_min=-0.5, u_max=[0.1, np.inf]).start(5, 0.1, generator(1))
+    noisy = km.Feedback(K, noise, x_ref, u_ref, u_min=-0.5, u_max=[0.1, np.inf]).start(5, 0.1, generator(1))
     V = noise.sequence(5, 0.1, generator(1))
     for k in range(5):
         expected = np.minimum(np.maximum(u_ref - K @ (y - x_ref) + V[k], -0.5), [0.1, np.inf])
@@ -111,7 +107,7 @@ def test_feedback_is_its_formula(seed: int) -> None:
 
 @pytest.mark.parametrize(
     "excitation",
-    [Noise(-1, 1, 2), PRBS([0, 0], [1, 2]), Multisine(1, 1.0, 3), Chirp(1, 1, 2, 5), Feedback([[1, 2]], Noise(-1, 1))],
+    [km.Noise(-1, 1, 2), km.PRBS([0, 0], [1, 2]), km.Multisine(1, 1.0, 3), km.Chirp(1, 1, 2, 5), km.Feedback([[1, 2]], km.Noise(-1, 1))],
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_excitations_are_values_and_follow_the_seed(excitation: Excitation) -> None:
@@ -123,48 +119,48 @@ def test_excitations_are_values_and_follow_the_seed(excitation: Excitation) -> N
     assert np.array_equal(U, [again(k, y) for k in range(30)])
     other = excitation.start(30, 0.05, generator(4))
     same = np.array_equal(U, [other(k, y) for k in range(30)])
-    assert same == isinstance(excitation, Chirp)  # the one with nothing random in it
+    assert same == isinstance(excitation, km.Chirp)  # the one with nothing random in it
 
 
 @pytest.mark.parametrize(
     ("act", "kind", "text"),
     [
-        (lambda: Noise(1, -1), DataError, "excitation limits cross at index 0: lower 1 is above upper -1; swap"),
-        (lambda: Noise([-1, -1], [1, 1, 1]), ShapeError, r"low has shape \(2,\), expected \(3,\) or a scalar"),
-        (lambda: Noise([[1]], 2), ShapeError, r"low has shape \(1, 1\), expected \(any,\)"),
-        (lambda: Noise(np.nan, 2), DataError, "low holds 1 NaN or inf"),
-        (lambda: Noise(-1, 1, hold=0), DataError, "hold is 0; it must be at least 1"),
-        (lambda: PRBS(-1, 1, order=2), DataError, "order is 2; choose 3 … 16"),
-        (lambda: Multisine(1, 0.0, 3), DataError, "period is 0 s; it must be above zero"),
+        (lambda: km.Noise(1, -1), km.errors.DataError, "excitation limits cross at index 0: lower 1 is above upper -1; swap"),
+        (lambda: km.Noise([-1, -1], [1, 1, 1]), km.errors.ShapeError, r"low has shape \(2,\), expected \(3,\) or a scalar"),
+        (lambda: km.Noise([[1]], 2), km.errors.ShapeError, r"low has shape \(1, 1\), expected \(any,\)"),
+        (lambda: km.Noise(np.nan, 2), km.errors.DataError, "low holds 1 NaN or inf"),
+        (lambda: km.Noise(-1, 1, hold=0), km.errors.DataError, "hold is 0; it must be at least 1"),
+        (lambda: km.PRBS(-1, 1, order=2), km.errors.DataError, "order is 2; choose 3 … 16"),
+        (lambda: km.Multisine(1, 0.0, 3), km.errors.DataError, "period is 0 s; it must be above zero"),
         (
-            lambda: Multisine(1, 0.12, 1).sequence(9, 0.05, generator(0)),
-            DataError,
+            lambda: km.Multisine(1, 0.12, 1).sequence(9, 0.05, generator(0)),
+            km.errors.DataError,
             "period is 0.12 s, no multiple of dt 0.05 s; choose 0.1",
         ),
         (
-            lambda: Multisine(1, 0.5, 5).sequence(9, 0.05, generator(0)),
-            DataError,
+            lambda: km.Multisine(1, 0.5, 5).sequence(9, 0.05, generator(0)),
+            km.errors.DataError,
             "harmonic 5 of 10 samples a period is not below the Nyquist frequency; lengthen the period or drop it",
         ),
         (
-            lambda: Chirp(1, 1, 10, 5).sequence(9, 0.05, generator(0)),
-            DataError,
+            lambda: km.Chirp(1, 1, 10, 5).sequence(9, 0.05, generator(0)),
+            km.errors.DataError,
             "a chirp up to 10 Hz needs dt below 0.05 s, dt is 0.05 s; lower the frequency",
         ),
-        (lambda: Feedback([1, 2]), ShapeError, r"K has shape \(2,\), expected \(any, any\)"),
+        (lambda: km.Feedback([1, 2]), km.errors.ShapeError, r"K has shape \(2,\), expected \(any, any\)"),
         (
-            lambda: Feedback([[1, 2]], Noise([-1, -1], [1, 1])),
-            ShapeError,
+            lambda: km.Feedback([[1, 2]], km.Noise([-1, -1], [1, 1])),
+            km.errors.ShapeError,
             "noise has 2 inputs and K 1 rows; pass one level for each input",
         ),
-        (lambda: Feedback([[1, 2]], u_min=1, u_max=0), DataError, "u limits cross at index 0"),
+        (lambda: km.Feedback([[1, 2]], u_min=1, u_max=0), km.errors.DataError, "u limits cross at index 0"),
         (
-            lambda: Feedback([[1, 2]]).start(3, 0.1, generator(0))(0, np.zeros(3)),
-            ShapeError,
+            lambda: km.Feedback([[1, 2]]).start(3, 0.1, generator(0))(0, np.zeros(3)),
+            km.errors.ShapeError,
             r"K has 2 columns, the plant measures 3; pass K of shape \(1, 3\)",
         ),
     ],
 )  # fmt: skip
-def test_messages(act: Callable[[], object], kind: type[KoopmpcError], text: str) -> None:
+def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
     with pytest.raises(kind, match=text):
         act()

@@ -7,27 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.folder import Files
+import koopmpc as km
 from koopmpc.data.source import Changed, Source, source_of
-from koopmpc.data.storage import load_episodes
-from koopmpc.data.stream import Stream
-from koopmpc.errors import DataError, LogError, ShapeError
 from tests.bare import shown
 from tests.identify.plants import random_episodes
 
 
-def sets(count: int = 4) -> list[Episodes]:
+def sets(count: int = 4) -> list[km.Episodes]:
     return [random_episodes(seed, [30, 5], 2, 1) for seed in range(count)]
 
 
-def folder_of(path: Path, given: list[Episodes], suffix: str = ".npz") -> Path:
+def folder_of(path: Path, given: list[km.Episodes], suffix: str = ".npz") -> Path:
     for i, one in enumerate(given):
         one.save(path / f"{i}{suffix}")
     return path
 
 
-def read(source: Source) -> list[Episode]:
+def read(source: Source) -> list[km.Episode]:
     return [episode for part in source.parts() for episode in part.load()]
 
 
@@ -35,47 +31,45 @@ def read(source: Source) -> list[Episode]:
 def test_a_folder_holds_its_files_in_the_order_of_their_names(tmp_path: Path, suffix: str) -> None:
     given = sets()
     (tmp_path / "notes.txt").write_text("no data")
-    source = Files(folder_of(tmp_path, given, suffix))
+    source = km.Files(folder_of(tmp_path, given, suffix))
     assert read(source) == [episode for one in given for episode in one]
     assert (source.dt, source.states, source.inputs) == (0.1, ("x0", "x1"), ("u0",))
-    backward = Files([tmp_path / f"{i}{suffix}" for i in (3, 0)])
+    backward = km.Files([tmp_path / f"{i}{suffix}" for i in (3, 0)])
     assert read(backward) == [*given[3], *given[0]]
 
 
-def test_small_files_share_a_part_and_large_ones_do_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = Files(folder_of(tmp_path, sets()))
+def test_small_files_share_a_part_and_large_ones_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = km.Files(folder_of(tmp_path, sets()))
     assert [str(part) for part in source.parts()] == [f"{tmp_path}/0.npz and 3 files after it"]
     size = (tmp_path / "0.npz").stat().st_size
-    monkeypatch.setattr("koopmpc.data.folder._PART", 2 * size)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 2 * size)
     assert [len(part.load()) for part in source.parts()] == [4, 4]
-    monkeypatch.setattr("koopmpc.data.folder._PART", 10)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 10)
     assert [str(part) for part in source.parts()] == [str(tmp_path / f"{i}.npz") for i in range(4)]
 
 
 def test_a_stream_gives_each_set_once_and_a_list_again() -> None:
     given = sets()
     every = [episode for one in given for episode in one]
-    once, again = Stream(iter(given)), Stream(given)
+    once, again = km.Stream(iter(given)), km.Stream(given)
     assert not once.replayable
     assert again.replayable
     assert read(once) == every
     assert read(again) == read(again) == every
-    with pytest.raises(DataError, match=r"stream was read already.*make a new Stream, or pass Stream a list"):
+    with pytest.raises(km.errors.DataError, match=r"stream was read already.*make a new Stream, or pass Stream a list"):
         once.parts()
 
 
 def test_a_stream_reads_one_set_ahead_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("koopmpc.data.stream._PART", 10)
+    monkeypatch.setattr("koopmpc.data.source._PART", 10)
     given, taken = sets(), []
 
-    def generator() -> Iterator[Episodes]:
+    def generator() -> Iterator[km.Episodes]:
         for i, one in enumerate(given):
             taken.append(i)
             yield one
 
-    parts = iter(Stream(generator()).parts())
+    parts = iter(km.Stream(generator()).parts())
     assert str(next(parts)) == "set 0 of the stream"
     assert taken == [0, 1]
     assert str(next(parts)) == "set 1 of the stream"
@@ -86,14 +80,14 @@ def test_episodes_are_a_source_of_one_part() -> None:
     assert [part.load() for part in source_of(data).parts()] == [data]
 
 
-def last_state_only(episodes: Episodes) -> Episodes:
-    return Episodes([Episode(X=e.X[:, 1:], U=e.U) for e in episodes], episodes.dt, episodes.states[1:])
+def last_state_only(episodes: km.Episodes) -> km.Episodes:
+    return km.Episodes([km.Episode(X=e.X[:, 1:], U=e.U) for e in episodes], episodes.dt, episodes.states[1:])
 
 
 @pytest.mark.parametrize("kind", ["files", "stream"])
 def test_a_change_is_made_to_each_part_as_it_is_loaded(kind: str, tmp_path: Path) -> None:
     given = sets()
-    source = Files(folder_of(tmp_path, given)) if kind == "files" else Stream(iter(given))
+    source = km.Files(folder_of(tmp_path, given)) if kind == "files" else km.Stream(iter(given))
     changed = Changed(source, last_state_only, ("x1",), source.inputs)
     assert (changed.nx, changed.nu, changed.nw) == (1, 1, 0)
     assert read(changed) == [episode for one in given for episode in last_state_only(one)]
@@ -101,73 +95,73 @@ def test_a_change_is_made_to_each_part_as_it_is_loaded(kind: str, tmp_path: Path
 
 def test_measured_disturbances_come_behind_the_inputs() -> None:
     rng = np.random.default_rng(0)
-    episode = Episode(X=rng.normal(size=(5, 1)), U=rng.normal(size=(4, 1)), W=rng.normal(size=(4, 2)))
-    data = Episodes([episode], 0.1)
-    driven = Stream([data]).driven()
+    episode = km.Episode(X=rng.normal(size=(5, 1)), U=rng.normal(size=(4, 1)), W=rng.normal(size=(4, 2)))
+    data = km.Episodes([episode], 0.1)
+    driven = km.Stream([data]).driven()
     assert driven.inputs == ("u0", "w0", "w1")
     assert [part.load() for part in driven.parts()] == [data.driven()]
 
 
 def test_the_path_must_be_there_and_hold_episodes(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="nowhere does not exist; pass a folder"):
-        Files(tmp_path / "nowhere")
-    with pytest.raises(LogError, match=r"holds no .npz, .parquet, .csv or .rrd file: it holds nothing"):
-        Files(tmp_path)
+    with pytest.raises(km.errors.LogError, match="nowhere does not exist; pass a folder"):
+        km.Files(tmp_path / "nowhere")
+    with pytest.raises(km.errors.LogError, match=r"holds no .npz, .parquet, .csv or .rrd file: it holds nothing"):
+        km.Files(tmp_path)
     (tmp_path / "a.txt").touch()
-    with pytest.raises(LogError, match=r"it holds a\.txt"):
-        Files(tmp_path)
-    with pytest.raises(LogError, match=r"b\.npz is no file; pass files, or one folder"):
-        Files([tmp_path / "b.npz"])
-    with pytest.raises(DataError, match="there is no path"):
-        Files([])
+    with pytest.raises(km.errors.LogError, match=r"it holds a\.txt"):
+        km.Files(tmp_path)
+    with pytest.raises(km.errors.LogError, match=r"b\.npz is no file; pass files, or one folder"):
+        km.Files([tmp_path / "b.npz"])
+    with pytest.raises(km.errors.DataError, match="there is no path"):
+        km.Files([])
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".parquet"])
 def test_an_empty_file_is_named(tmp_path: Path, suffix: str) -> None:
     folder_of(tmp_path, sets(2), suffix)
     (tmp_path / f"1{suffix}").write_bytes(b"")
-    source = Files(tmp_path)
-    with pytest.raises(LogError, match=rf"{tmp_path}/1\{suffix}"):
+    source = km.Files(tmp_path)
+    with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/1\{suffix}"):
         read(source)
     (tmp_path / f"0{suffix}").write_bytes(b"")
-    with pytest.raises(LogError, match=rf"{tmp_path}/0\{suffix}"):
-        Files(tmp_path)
+    with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/0\{suffix}"):
+        km.Files(tmp_path)
 
 
-def ragged(path: Path) -> Episodes:
+def ragged(path: Path) -> km.Episodes:
     if path.name == "1.npz":
-        raise ShapeError("U has 3 rows and X 9")
-    return load_episodes(path)
+        raise km.errors.ShapeError("U has 3 rows and X 9")
+    return km.load_episodes(path)
 
 
 def test_what_a_reader_raises_is_told_with_the_file(tmp_path: Path) -> None:
-    source = Files(folder_of(tmp_path, sets(2)), reader=ragged)
-    with pytest.raises(ShapeError, match=rf"{tmp_path}/1\.npz: U has 3 rows and X 9"):
+    source = km.Files(folder_of(tmp_path, sets(2)), reader=ragged)
+    with pytest.raises(km.errors.ShapeError, match=rf"{tmp_path}/1\.npz: U has 3 rows and X 9"):
         read(source)
-    with pytest.raises(DataError, match="reader of your own is given no dt; bind them with partial"):
-        Files(tmp_path, reader=ragged, dt=0.1)
+    with pytest.raises(km.errors.DataError, match="reader of your own is given no dt; bind them with partial"):
+        km.Files(tmp_path, reader=ragged, dt=0.1)
 
 
 def test_a_file_of_another_plant_is_named(tmp_path: Path) -> None:
     first = sets(1)[0]
     for name, other, told in (
-        ("a", Episodes(first.episodes, 0.2), r"a\.npz has dt = 0\.2 s, .*0\.npz has 0\.1 s; resample"),
-        ("b", Episodes(first.episodes, 0.1, ["p", "x1"]), r"b\.npz names the states 'p', 'x1', .*'x0', 'x1'"),
-        ("c", Episodes([Episode(X=e.X) for e in first], 0.1), r"c\.npz names the inputs none, .*0\.npz 'u0'"),
+        ("a", km.Episodes(first.episodes, 0.2), r"a\.npz has dt = 0\.2 s, .*0\.npz has 0\.1 s; resample"),
+        ("b", km.Episodes(first.episodes, 0.1, ["p", "x1"]), r"b\.npz names the states 'p', 'x1', .*'x0', 'x1'"),
+        ("c", km.Episodes([km.Episode(X=e.X) for e in first], 0.1), r"c\.npz names the inputs none, .*0\.npz 'u0'"),
     ):
         folder = tmp_path / name
         folder_of(folder, [first])
         other.save(folder / f"{name}.npz")
-        with pytest.raises(DataError, match=told):
-            read(Files(folder))
-    with pytest.raises(DataError, match=r"set 1 of the stream has dt = 0\.2 s, set 0 has 0\.1 s"):
-        read(Stream([first, Episodes(first.episodes, 0.2)]))
+        with pytest.raises(km.errors.DataError, match=told):
+            read(km.Files(folder))
+    with pytest.raises(km.errors.DataError, match=r"set 1 of the stream has dt = 0\.2 s, set 0 has 0\.1 s"):
+        read(km.Stream([first, km.Episodes(first.episodes, 0.2)]))
 
 
 def test_clocks_that_round_are_one_sample_time(tmp_path: Path) -> None:
     first = sets(1)[0]
-    folder_of(tmp_path, [first, Episodes(first.episodes, 0.1 * (1 + 1e-9))])
-    assert len(read(Files(tmp_path))) == 4
+    folder_of(tmp_path, [first, km.Episodes(first.episodes, 0.1 * (1 + 1e-9))])
+    assert len(read(km.Files(tmp_path))) == 4
 
 
 def test_plain_tables_are_read_as_they_are_told(tmp_path: Path) -> None:
@@ -178,13 +172,13 @@ def test_plain_tables_are_read_as_they_are_told(tmp_path: Path) -> None:
         x = np.arange(6.0) + i
         pq.write_table(pa.table({"x [m]": x, "u [N]": -x}), tmp_path / f"{i}.parquet")
     how = {"dt": 0.1, "states": ["x [m]"], "inputs": ["u [N]"]}
-    assert [e.X[0, 0] for e in read(Files(tmp_path, **how))] == [0.0, 1.0]
-    assert read(Files(tmp_path, reader=partial(load_episodes, **how))) == read(Files(tmp_path, **how))
+    assert [e.X[0, 0] for e in read(km.Files(tmp_path, **how))] == [0.0, 1.0]
+    assert read(km.Files(tmp_path, reader=partial(km.load_episodes, **how))) == read(km.Files(tmp_path, **how))
 
 
 def test_what_is_no_stream_of_episodes_is_refused() -> None:
-    with pytest.raises(DataError, match="the stream is empty"):
-        Stream(iter([]))
+    with pytest.raises(km.errors.DataError, match="the stream is empty"):
+        km.Stream(iter([]))
     lines = shown("""
 show(lambda: km.Stream(3))
 show(lambda: km.Stream([1]))

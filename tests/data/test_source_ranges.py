@@ -8,18 +8,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.folder import Files
-from koopmpc.data.ranges import RangePart, ranges
-from koopmpc.errors import DataError, LogError
-from koopmpc.identify.gather import moments
-from koopmpc.lifting.state import State
+import koopmpc as km
+from koopmpc.data.files.npz import RangePart, ranges
 from tests.identify.plants import brute_force, random_episodes
 
 LENGTHS = st.lists(st.integers(1, 30), min_size=1, max_size=8)
 
 
-def pairs(episodes: list[Episode], history: int = 0) -> np.ndarray:
+def pairs(episodes: list[km.Episode], history: int = 0) -> np.ndarray:
     """Return the rows [x u x⁺ w] of all pairs but the first `history` of each episode."""
     rows = [np.hstack([e.X[:-1], e.U, e.X[1:], e.W])[history:] for e in episodes]
     return np.concatenate(rows)
@@ -33,13 +29,12 @@ def test_ranges_hold_each_pair_once_in_order(
     data = random_episodes(seed, [*lengths, 9], 2, 1)
     if disturbed:
         rng = np.random.default_rng(seed)
-        data = Episodes([Episode(X=e.X, U=e.U, W=rng.normal(size=(len(e), 1))) for e in data], 0.1)
+        data = km.Episodes([km.Episode(X=e.X, U=e.U, W=rng.normal(size=(len(e), 1))) for e in data], 0.1)
     data.save(tmp_path / "a.npz")
     parts = ranges(tmp_path / "a.npz", 8 * rows * (3 + disturbed), history, None)
     assert parts is not None
     assert all(
-        sum(steps for _, _, steps in part.stretches) <= rows + history * len(lengths) + history
-        for part in parts
+        sum(steps for _, _, steps in part.stretches) <= rows + history * len(lengths) + history for part in parts
     )
     read = [episode for part in parts for episode in part.load()]
     assert np.array_equal(pairs(read, history), pairs(list(data), history))
@@ -49,25 +44,25 @@ def test_a_folder_cuts_its_large_files_and_no_others(tmp_path: Path, monkeypatch
     sets = [random_episodes(i, [n, n], 2, 1) for i, n in enumerate((20, 3000, 20))]
     for i, one in enumerate(sets):
         one.save(tmp_path / f"{i}.npz")
-    monkeypatch.setattr("koopmpc.data.folder._LARGE", 20_000)
-    monkeypatch.setattr("koopmpc.data.folder._PART", 40_000)
-    source = Files(tmp_path)
+    monkeypatch.setattr("koopmpc.data.files.folder._LARGE", 20_000)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 40_000)
+    source = km.Files(tmp_path)
     parts = source.parts()
     assert [isinstance(part, RangePart) for part in parts] == [False, True, True, True, True, False]
     assert str(parts[1]) == f"{tmp_path}/1.npz (rows 0 to 1666)"
-    total = moments(source, State(), route="qr")
-    assert moments(source, State(), route="qr", workers=2) == total
-    D = np.concatenate([brute_force(one, State().bind(one.states)) for one in sets])
+    total = km.moments.second_moments(source, km.State(), route="qr")
+    assert km.moments.second_moments(source, km.State(), route="qr", workers=2) == total
+    D = np.concatenate([brute_force(one, km.State().bind(one.states)) for one in sets])
     assert np.allclose(total.sums.T @ total.sums, D.T @ D)
     assert total.samples == len(D)
 
 
 def test_a_large_file_is_never_held(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    episode = Episode(X=rng.standard_normal((1_000_001, 4)), U=rng.standard_normal((1_000_000, 1)))
-    Episodes([episode], 0.1).save(tmp_path / "a.npz")  # 40 MB
+    episode = km.Episode(X=rng.standard_normal((1_000_001, 4)), U=rng.standard_normal((1_000_000, 1)))
+    km.Episodes([episode], 0.1).save(tmp_path / "a.npz")  # 40 MB
     tracemalloc.start()
-    total = moments(Files(tmp_path), State(), route="gram")
+    total = km.moments.second_moments(km.Files(tmp_path), km.State(), route="gram")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert total.samples == 1_000_000
@@ -81,17 +76,17 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     data.save(tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as held:
         np.savez_compressed(tmp_path / "b.npz", **held)
-    monkeypatch.setattr("koopmpc.data.folder._LARGE", 0)
+    monkeypatch.setattr("koopmpc.data.files.folder._LARGE", 0)
     assert ranges(tmp_path / "b.npz", 100, 0, None) is None
-    assert [e for part in Files(tmp_path / "b.npz").parts() for e in part.load()] == list(data)
+    assert [e for part in km.Files(tmp_path / "b.npz").parts() for e in part.load()] == list(data)
     (tmp_path / "c.npz").write_bytes(b"no zip")
-    with pytest.raises(LogError, match=r"c\.npz"):
-        Files(tmp_path / "c.npz")
-    Episodes(data.episodes, 0.2).save(tmp_path / "d.npz")
-    with pytest.raises(DataError, match=r"d\.npz has dt = 0\.2 s, .*a\.npz has 0\.1 s"):
-        [part.load() for part in Files([tmp_path / "a.npz", tmp_path / "d.npz"]).parts()]
-    source = Files(tmp_path / "a.npz")
+    with pytest.raises(km.errors.LogError, match=r"c\.npz"):
+        km.Files(tmp_path / "c.npz")
+    km.Episodes(data.episodes, 0.2).save(tmp_path / "d.npz")
+    with pytest.raises(km.errors.DataError, match=r"d\.npz has dt = 0\.2 s, .*a\.npz has 0\.1 s"):
+        [part.load() for part in km.Files([tmp_path / "a.npz", tmp_path / "d.npz"]).parts()]
+    source = km.Files(tmp_path / "a.npz")
     parts = source.parts()
     (tmp_path / "a.npz").write_bytes(b"")
-    with pytest.raises(LogError, match=r"a\.npz \(rows 0 to 50\) holds no episodes that can be read"):
+    with pytest.raises(km.errors.LogError, match=r"a\.npz \(rows 0 to 50\) holds no episodes that can be read"):
         parts[0].load()

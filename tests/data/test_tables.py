@@ -9,9 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.storage import load_episodes
-from koopmpc.errors import DataError, LogError
+import koopmpc as km
 from tests.data.test_storage import random_episodes
 
 TOLD = {"dt": 0.1, "states": ["x"], "inputs": ["u"]}
@@ -57,22 +55,22 @@ def test_a_table_is_its_episodes(
     file = written(tmp_path / "own.parquet", **table)
     first = list(dict.fromkeys(table["episode"].to_pylist()))
     expected = [data[9 - int(str(label).split()[-1])] for label in first]
-    read = load_episodes(file, dt=data.dt, states=data.states, inputs=data.inputs)
-    assert read == Episodes(expected, data.dt, data.states, data.inputs)
+    read = km.load_episodes(file, dt=data.dt, states=data.states, inputs=data.inputs)
+    assert read == km.Episodes(expected, data.dt, data.states, data.inputs)
 
 
 def test_without_a_column_episode_there_is_one(tmp_path: Path) -> None:
     file = written(tmp_path / "own.parquet", x=[1, 2, 3], u=[4, 5, None])
-    expected = Episode(X=[[1.0], [2.0], [3.0]], U=[[4.0], [5.0]])
-    assert load_episodes(file, **TOLD) == Episodes([expected], 0.1, ["x"], ["u"])
-    assert load_episodes(file, file, **TOLD) == Episodes([expected] * 2, 0.1, ["x"], ["u"])
-    alone = load_episodes(file, dt=0.1, states=["x"], inputs=[])
-    assert alone == Episodes([Episode(X=[[1.0], [2.0], [3.0]])], 0.1, ["x"])
+    expected = km.Episode(X=[[1.0], [2.0], [3.0]], U=[[4.0], [5.0]])
+    assert km.load_episodes(file, **TOLD) == km.Episodes([expected], 0.1, ["x"], ["u"])
+    assert km.load_episodes(file, file, **TOLD) == km.Episodes([expected] * 2, 0.1, ["x"], ["u"])
+    alone = km.load_episodes(file, dt=0.1, states=["x"], inputs=[])
+    assert alone == km.Episodes([km.Episode(X=[[1.0], [2.0], [3.0]])], 0.1, ["x"])
 
 
 def test_a_state_may_be_named_step(tmp_path: Path) -> None:
     file = written(tmp_path / "own.parquet", step=[5.0, 0.0], u=[1.0, 0.0])
-    assert load_episodes(file, dt=1.0, states=["step"], inputs=["u"])[0].X.tolist() == [[5.0], [0.0]]
+    assert km.load_episodes(file, dt=1.0, states=["step"], inputs=["u"])[0].X.tolist() == [[5.0], [0.0]]
 
 
 @pytest.mark.parametrize(
@@ -100,17 +98,17 @@ def test_a_state_may_be_named_step(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_what_is_missing_is_named(tmp_path: Path, columns: dict, told: dict, text: str) -> None:
     file = written(tmp_path / "own.parquet", **{"x": [1.0, 2.0, 3.0], "u": [1.0, 2.0, 3.0]} | columns)
-    with pytest.raises(DataError, match=text):
-        load_episodes(file, **told)
+    with pytest.raises(km.errors.DataError, match=text):
+        km.load_episodes(file, **told)
 
 
 def test_a_file_of_koopmpc_is_told_nothing(tmp_path: Path) -> None:
     for name in ("data.npz", "data.parquet"):
         random_episodes([2], 1, 1, 0).save(tmp_path / name)
         with pytest.raises(
-            DataError, match=rf"{name} says itself what it holds; leave out dt, states and inputs"
+            km.errors.DataError, match=rf"{name} says itself what it holds; leave out dt, states and inputs"
         ):
-            load_episodes(tmp_path / name, dt=0.1)
+            km.load_episodes(tmp_path / name, dt=0.1)
 
 
 def test_a_cut_table_is_refused(tmp_path: Path) -> None:
@@ -119,6 +117,6 @@ def test_a_cut_table_is_refused(tmp_path: Path) -> None:
     for kept in range(0, len(whole), len(whole) // 20):
         file.write_bytes(whole[:kept])
         with pytest.raises(
-            LogError, match=r"own\.parquet holds no episodes that can be read: it is no \.parquet"
+            km.errors.LogError, match=r"own\.parquet holds no episodes that can be read: it is no \.parquet"
         ):
-            load_episodes(file, **TOLD)
+            km.load_episodes(file, **TOLD)

@@ -13,9 +13,7 @@ def linear(A, B, constant=None, E=None, dt=0.1):
     nw = 0 if E is None else np.shape(E)[1]
     extra = {} if E is None else {"E": np.array(E), "disturbances": tuple(f"w{i}" for i in range(nw))}
     if constant is None:
-        return km.LinearPredictor(
-            np.array(A), np.array(B), np.eye(nx), km.State(), dt, states, inputs, **extra
-        )
+        return km.LinearPredictor(np.array(A), np.array(B), np.eye(nx), km.State(), dt, states, inputs, **extra)
     whole = scipy.linalg.block_diag(A, 1.0)
     whole[:nx, nx] = constant
     if E is not None:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.estimate.detectable import hidden
+from koopmpc.estimate.kalman import hidden
 
 MODES = st.sampled_from([-1.3, -1.0, -0.6, 0.0, 0.4, 0.9, 1.0, 1.2])
 
@@ -32,9 +32,7 @@ def rotated(modes, seen, seed):
     return T @ np.diag(modes) @ T.T, M @ T.T
 
 
-@given(
-    st.lists(st.tuples(MODES, st.booleans()), min_size=1, max_size=5, unique_by=lambda m: m[0]), st.integers()
-)
+@given(st.lists(st.tuples(MODES, st.booleans()), min_size=1, max_size=5, unique_by=lambda m: m[0]), st.integers())
 def test_a_mode_is_hidden_exactly_where_the_observability_matrix_has_a_kernel_that_stays(modes, seed):
     F, M = rotated([m for m, _ in modes], [s for _, s in modes], abs(seed))
     lost = hidden(F, M)

@@ -15,9 +15,7 @@ LIFTING = km.State() + km.Expressions(lambda x: [ca.sin(x[0])], ["sin"]) + km.Co
 
 def predictor(rng):
     A = rng.normal(size=(4, 4)) / 3
-    return km.LinearPredictor(
-        A, rng.normal(size=(4, 1)), np.eye(2, 4), LIFTING, 0.1, ("a [m]", "b [m/s]"), ("u [N]",)
-    )
+    return km.LinearPredictor(A, rng.normal(size=(4, 1)), np.eye(2, 4), LIFTING, 0.1, ("a [m]", "b [m/s]"), ("u [N]",))
 
 
 @given(st.floats(0.01, 1.0), st.integers(0, 10**6))
@@ -81,5 +79,5 @@ def test_a_missed_sample_leaves_the_disturbance_as_it_is():
 
 @pytest.mark.parametrize("gain", [0.0, -0.1, 1.1, np.nan])
 def test_the_gain_is_checked(gain):
-    with pytest.raises(km.DataError, match="gain"):
+    with pytest.raises(km.errors.DataError, match="gain"):
         km.LiftedDisturbance(gain)

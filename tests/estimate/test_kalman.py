@@ -46,7 +46,7 @@ def test_it_equals_the_textbook_filter(disturbance, affine, seed):
     rule = km.LiftedKalman(("x0", "x1"), disturbance, process=0.1, drift=0.2, noise=0.3)
     try:
         mine = rule.start(model)
-    except km.DataError:
+    except km.errors.DataError:
         return  # a random plant may be undetectable; test_detectable judges that
     book, Bd, Cd = textbook(model, H, disturbance, rule)
     shift = H.T @ Cd
@@ -204,34 +204,34 @@ INTEGRATOR = linear(np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
         (
             km.LiftedKalman("x0", "output"),
             INTEGRATOR,
-            km.DataError,
+            km.errors.DataError,
             "with λ = 1, 'x0 \\[m\\]', an offset of output 'x0'",
         ),
         (
             km.LiftedKalman("x1"),
             INTEGRATOR,
-            km.DataError,
+            km.errors.DataError,
             "'x0 \\[m\\]' can move without a trace in y; measure one",
         ),
-        (km.LiftedKalman(("x0", "x0")), INTEGRATOR, km.DataError, "depend on each other"),
-        (km.LiftedKalman("1"), INTEGRATOR, km.DataError, "or on the Constant"),
-        (km.LiftedKalman("theta"), INTEGRATOR, km.ObservableError, "lacks 'theta'; add it"),
+        (km.LiftedKalman(("x0", "x0")), INTEGRATOR, km.errors.DataError, "depend on each other"),
+        (km.LiftedKalman("1"), INTEGRATOR, km.errors.DataError, "or on the Constant"),
+        (km.LiftedKalman("theta"), INTEGRATOR, km.errors.ObservableError, "lacks 'theta'; add it"),
         (
             km.LiftedKalman(np.eye(2)),
             INTEGRATOR,
-            km.ShapeError,
+            km.errors.ShapeError,
             r"outputs has shape \(2, 2\), expected \(ny, 3\)",
         ),
         (
             km.LiftedKalman("x0"),
             linear(np.diag([0.5, 0.6]), np.eye(2)),
-            km.DataError,
+            km.errors.DataError,
             "1 outputs cannot tell the disturbances of 2 inputs apart; measure at least 2",
         ),
         (
             km.LiftedKalman("x0", "output"),
             linear(np.diag([0.5, 1.2]), np.ones((2, 1))),
-            km.DataError,
+            km.errors.DataError,
             "λ = 1.2, 'x1 \\[m\\]' can move",
         ),
     ],
@@ -244,13 +244,13 @@ def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words)
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
-        ({"process": 0.0}, km.DefinitenessError, "process is not positive definite"),
-        ({"noise": -1.0}, km.DefinitenessError, "noise is indefinite"),
-        ({"drift": np.nan}, km.DataError, "drift holds 1 NaN"),
-        ({"delay": -1}, km.DataError, "delay is -1"),
-        ({"patience": -1}, km.DataError, "patience is -1"),
-        ({"outputs": [[1.0, 2.0], [1.0]]}, km.DataError, "outputs is not an array"),
-        ({"outputs": ()}, km.ShapeError, "outputs has shape"),
+        ({"process": 0.0}, km.errors.DefinitenessError, "process is not positive definite"),
+        ({"noise": -1.0}, km.errors.DefinitenessError, "noise is indefinite"),
+        ({"drift": np.nan}, km.errors.DataError, "drift holds 1 NaN"),
+        ({"delay": -1}, km.errors.DataError, "delay is -1"),
+        ({"patience": -1}, km.errors.DataError, "patience is -1"),
+        ({"outputs": [[1.0, 2.0], [1.0]]}, km.errors.DataError, "outputs is not an array"),
+        ({"outputs": ()}, km.errors.ShapeError, "outputs has shape"),
     ],
 )
 def test_settings_are_refused_in_words(options, error, words):

@@ -9,19 +9,15 @@ import koopmpc as km
 from tests.control.models import PRECISE, Told, random_pair
 from tests.estimate.plants import linear
 
-LATE = [km.ActuatorDelay(1)]
+LATE = [km.faults.ActuatorDelay(1)]
 
 
 def pair(rng, nx, nu, limits):
     """A controller that compensates, and one on the plant with its delay as states: ξ = [x; u_{k−1}]."""
     A, B = random_pair(rng, nx, nu)
     N, Q, R, P = 8, np.ones(nx), np.full(nu, 0.3), 2 * np.eye(nx)
-    mine = km.KoopmanMPC(
-        linear(A, B), km.Cost(Q, R, Q_N=P, u_target="zero"), limits, N, latency=1, settings=PRECISE
-    )
-    delayed = linear(
-        np.block([[A, B], [np.zeros((nu, nx + nu))]]), np.vstack([np.zeros((nx, nu)), np.eye(nu)])
-    )
+    mine = km.KoopmanMPC(linear(A, B), km.Cost(Q, R, Q_N=P, u_target="zero"), limits, N, latency=1, settings=PRECISE)
+    delayed = linear(np.block([[A, B], [np.zeros((nu, nx + nu))]]), np.vstack([np.zeros((nx, nu)), np.eye(nu)]))
     whole = np.zeros((nx + nu, nx + nu))
     whole[:nx, :nx] = P
     cost = km.Cost(np.append(Q, np.zeros(nu)), R, Q_N=whole, u_target="zero")
@@ -59,9 +55,7 @@ def test_on_a_true_model_the_plan_is_what_happens(estimator):
         np.testing.assert_allclose(run.plans.X[k][:2], run.X[k + 1 : k + 3], atol=1e-6)
     np.testing.assert_allclose(run.X[-1], 0, atol=1e-3)
     ignorant = km.KoopmanMPC(model, cost, limits, 20)
-    other = km.simulate(
-        model.step_map(), ignorant, x0=[1, 0], reference=[0, 0], steps=80, limits=limits, faults=LATE
-    )
+    other = km.simulate(model.step_map(), ignorant, x0=[1, 0], reference=[0, 0], steps=80, limits=limits, faults=LATE)
     assert _cost(run) < _cost(other)
 
 
@@ -73,9 +67,7 @@ def test_a_disturbance_that_is_known_is_predicted_through_too():
     A, B, d = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]]), np.array([0.05, 0.1])
     exact = {"latency": 1, "settings": PRECISE}
     cost = km.Cost([1, 0], 0.1)
-    told = km.KoopmanMPC(
-        linear(A, B, [0.0, 0.0]), cost, horizon=15, estimator=Told(np.append(d, 0.0)), **exact
-    )
+    told = km.KoopmanMPC(linear(A, B, [0.0, 0.0]), cost, horizon=15, estimator=Told(np.append(d, 0.0)), **exact)
     knowing = km.KoopmanMPC(linear(A, B, d), cost, horizon=15, **exact)
     for x in ([0.0, 0.0], [1.0, -1.0]):
         np.testing.assert_allclose(told(x, [0.7, 0]).u, knowing(x, [0.7, 0]).u, atol=1e-9)
@@ -87,7 +79,5 @@ def test_offset_free_with_latency():
     model = linear(A, B, [0.0, 0.0])
     for estimator in (km.LiftedDisturbance(), km.LiftedKalman(("x0", "x1"))):
         mpc = km.KoopmanMPC(model, km.Cost([1, 0], 0.1), km.Limits(-5, 5), 15, latency=1, estimator=estimator)
-        run = km.simulate(
-            true, mpc, x0=[0, 0], reference=[0.7, 0], steps=150, limits=km.Limits(-5, 5), faults=LATE
-        )
+        run = km.simulate(true, mpc, x0=[0, 0], reference=[0.7, 0], steps=150, limits=km.Limits(-5, 5), faults=LATE)
         assert abs(run.X[-1, 0] - 0.7) < 1e-6

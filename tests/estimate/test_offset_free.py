@@ -83,9 +83,7 @@ def plant(gain=0.7, load=0.1, seen=2):
     """x⁺ = A x + gain B u + load: not what the model says."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     F = ca.Function("F", [x, u], [ca.DM(A) @ x + gain * ca.DM(B) @ u + load])
-    return km.StepMap(
-        F, 0.1, ca.Function("h", [x], [x[:seen]]), states=("x0 [m]", "x1 [m]"), inputs=("u0 [N]",)
-    )
+    return km.StepMap(F, 0.1, ca.Function("h", [x], [x[:seen]]), states=("x0 [m]", "x1 [m]"), inputs=("u0 [N]",))
 
 
 def first(x):
@@ -100,9 +98,7 @@ BOTH = pytest.mark.parametrize("estimator", [km.LiftedDisturbance(), km.LiftedKa
 def loop(estimator, limits, reference, steps=200, faults=(), **settings):
     mpc = km.KoopmanMPC(KNOWN, POSITION, limits, 15, estimator=estimator, **settings)
     seen = 2 if isinstance(estimator, km.LiftedDisturbance) else 1
-    return km.simulate(
-        plant(seen=seen), mpc, x0=[0, 0], reference=reference, steps=steps, limits=limits, faults=faults
-    )
+    return km.simulate(plant(seen=seen), mpc, x0=[0, 0], reference=reference, steps=steps, limits=limits, faults=faults)
 
 
 @BOTH
@@ -141,7 +137,7 @@ def test_what_the_plant_really_got_is_what_the_estimator_uses(estimator):
         reference=[1.0],
         steps=40,
         limits=km.Limits(-1, 1),
-        faults=[km.ActuatorLoss(0.5)],
+        faults=[km.faults.ActuatorLoss(0.5)],
         observers=[look],
     )
     assert max(largest) < 1e-12
@@ -190,7 +186,7 @@ def test_a_filter_bridges_missed_samples_for_a_while_then_says_so():
 
 def test_late_measurements_leave_no_offset():
     late = km.LiftedKalman("x0", delay=3)
-    run = loop(late, km.Limits(-5, 5), [0.7], steps=400, faults=[km.SensorDelay(3)])
+    run = loop(late, km.Limits(-5, 5), [0.7], steps=400, faults=[km.faults.SensorDelay(3)])
     assert abs(run.X[-1, 0] - 0.7) < 1e-6
 
 
@@ -215,5 +211,5 @@ def test_a_new_model_between_two_steps_keeps_the_state_of_a_filter():
 
 def test_y_has_one_value_an_output():
     mpc = km.KoopmanMPC(KNOWN, POSITION, horizon=15, estimator=km.LiftedKalman("x0"))
-    with pytest.raises(km.ShapeError, match=r"y has shape \(2,\), expected \(1,\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"y has shape \(2,\), expected \(1,\)"):
         mpc([0.0, 0.0], [1.0])

@@ -99,13 +99,13 @@ WINDOW = st.tuples(st.integers(0, 5), st.none() | st.integers(1, 5)).map(
 )
 CHANNELS = st.sampled_from([None, (0,), (1,)])
 FAULTS = {  # built in the test: the type hook picks at random what it checks, and strategies must not
-    "NaN sensor": st.tuples(st.just(km.NaNSensor), st.tuples(CHANNELS, SHARE), WINDOW),
-    "frozen sensor": st.tuples(st.just(km.FrozenSensor), st.tuples(CHANNELS), WINDOW),
-    "dropped samples": st.tuples(st.just(km.DroppedSamples), st.tuples(SHARE), WINDOW),
-    "half the actuator": st.tuples(st.just(km.ActuatorLoss), st.just((0.5,)), WINDOW),
-    "sensor delay": st.tuples(st.just(km.SensorDelay), st.tuples(st.integers(1, 4)), st.just({})),
-    "actuator delay": st.tuples(st.just(km.ActuatorDelay), st.tuples(st.integers(1, 4)), st.just({})),
-    "failing solver": st.tuples(st.just(km.SolverFailure), st.tuples(SHARE), WINDOW),
+    "NaN sensor": st.tuples(st.just(km.faults.NaNSensor), st.tuples(CHANNELS, SHARE), WINDOW),
+    "frozen sensor": st.tuples(st.just(km.faults.FrozenSensor), st.tuples(CHANNELS), WINDOW),
+    "dropped samples": st.tuples(st.just(km.faults.DroppedSamples), st.tuples(SHARE), WINDOW),
+    "half the actuator": st.tuples(st.just(km.faults.ActuatorLoss), st.just((0.5,)), WINDOW),
+    "sensor delay": st.tuples(st.just(km.faults.SensorDelay), st.tuples(st.integers(1, 4)), st.just({})),
+    "actuator delay": st.tuples(st.just(km.faults.ActuatorDelay), st.tuples(st.integers(1, 4)), st.just({})),
+    "failing solver": st.tuples(st.just(km.faults.SolverFailure), st.tuples(SHARE), WINDOW),
 }
 SETS = {name: st.lists(fault, min_size=1, max_size=1) for name, fault in FAULTS.items()}
 SETS["several"] = st.lists(st.one_of(*FAULTS.values()), min_size=2, max_size=5)
@@ -152,6 +152,6 @@ def test_none_raises_or_leaves_its_limits_and_runs_repeat(controllers, name, wha
     assert figures.status == Counter(status.name for status in run.status)
     assert sum(figures.fallback.values()) == sum(figures.status.values()) == STEPS
     for status, fallback in zip(run.status, run.fallback, strict=True):
-        assert (fallback is km.Fallback.NONE) == (status in GOOD)
+        assert (fallback is km.control.Fallback.NONE) == (status in GOOD)
     again = run_of(controller, limits, faults, seed, x0)
     assert replace(again, solve_time=run.solve_time) == run

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.errors import LogError
-from koopmpc.loop.run import Plans, Run
-from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder, record
+import koopmpc as km
+from koopmpc.loop.run import Plans
 from tests.recording.runs import about, make_run, steps_of
 
 
@@ -22,13 +20,13 @@ def test_a_log_that_is_no_log(tmp_path: Path) -> None:
     folder.mkdir()
     for path in (text, empty):
         with pytest.raises(
-            LogError, match=rf"{path.name} is no log of koopmpc: it does not start as an \.rrd file does"
+            km.errors.LogError, match=rf"{path.name} is no log of koopmpc: it does not start as an \.rrd file does"
         ):
-            load_run(path)
-    with pytest.raises(LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run"):
-        load_run(folder)
-    with pytest.raises(LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
-        load_run(tmp_path / "nowhere.rrd")
+            km.load_run(path)
+    with pytest.raises(km.errors.LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run"):
+        km.load_run(folder)
+    with pytest.raises(km.errors.LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
+        km.load_run(tmp_path / "nowhere.rrd")
 
 
 def test_a_recording_of_something_else(tmp_path: Path) -> None:
@@ -40,22 +38,22 @@ def test_a_recording_of_something_else(tmp_path: Path) -> None:
     other.flush()
     other.disconnect()
     with pytest.raises(
-        LogError, match=r"other\.rrd is a Rerun recording, but no log of koopmpc: it has no description"
+        km.errors.LogError, match=r"other\.rrd is a Rerun recording, but no log of koopmpc: it has no description"
     ):
-        load_run(tmp_path / "other.rrd")
+        km.load_run(tmp_path / "other.rrd")
 
 
 def test_a_log_without_a_step(tmp_path: Path) -> None:
     run = make_run()
-    with Recorder(tmp_path / "none.rrd", **about(run)):
+    with km.Recorder(tmp_path / "none.rrd", **about(run)):
         pass
-    with Recorder(tmp_path / "half.rrd", **about(run)) as recorder:
+    with km.Recorder(tmp_path / "half.rrd", **about(run)) as recorder:
         recorder(steps_of(run)[0].__class__(0, run.Y[0], run.U[0], run.reference[0]))
     for name in ("none", "half"):
         with pytest.raises(
-            LogError, match=rf"{name}\.rrd holds no whole step; its run ended before the second state"
+            km.errors.LogError, match=rf"{name}\.rrd holds no whole step; its run ended before the second state"
         ):
-            load_run(tmp_path / f"{name}.rrd")
+            km.load_run(tmp_path / f"{name}.rrd")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +63,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(T=60)
     import time
 
-    with Recorder(path, **about(run)) as recorder:
+    with km.Recorder(path, **about(run)) as recorder:
         for step in steps_of(run):
             recorder(step)
             time.sleep(0.5 if step.k in (19, 39) else 0.0)
@@ -76,14 +74,12 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_log_cut_before_its_description_is_refused(written: Path, tmp_path: Path, share: float) -> None:
     whole = written.read_bytes()
     (tmp_path / "cut.rrd").write_bytes(whole[: int(share * whole.find(b"koopmpc-log-1"))])
-    with pytest.raises(LogError, match=r"cut\.rrd .*(No recording|or was cut before it)"):
-        load_run(tmp_path / "cut.rrd")
+    with pytest.raises(km.errors.LogError, match=r"cut\.rrd .*(No recording|or was cut before it)"):
+        km.load_run(tmp_path / "cut.rrd")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 0.999, 1.0])
-def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(
-    written: Path, tmp_path: Path, share: float
-) -> None:
+def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(written: Path, tmp_path: Path, share: float) -> None:
     path, whole = tmp_path / "cut.rrd", written.read_bytes()
     run = make_run(T=60)
     start = whole.find(run.plans.X[25].tobytes())  # the plans come first in a batch: the first batch is whole
@@ -94,13 +90,11 @@ def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(
     assert read == head(run, read.steps)
     if share == 1.0:
         assert said == []
-    elif said != [
-        word(path, 60, 60, planned="")
-    ]:  # a Recorder does not know beforehand how many there will be
+    elif said != [word(path, 60, 60, planned="")]:  # a Recorder does not know beforehand how many there will be
         assert said == [word(path, read.steps, 1000, planned="")]
 
 
-def head(run: Run, steps: int) -> Run:
+def head(run: km.Run, steps: int) -> km.Run:
     """Return the first steps of a run."""
     ends = ("X", "Y", "reference")
     moves = ("U", "status", "fallback", "solve_time", "iterations", "u_reference", "slack")
@@ -122,13 +116,13 @@ def word(path: Path, steps: int, total: int, planned: str) -> str:
     )
 
 
-def outcome(path: Path) -> tuple[Run | None, list[str]]:
+def outcome(path: Path) -> tuple[km.Run | None, list[str]]:
     """Return what is read and the words that are said; no run where it is refused."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            read = load_run(path)
-        except LogError as error:
+            read = km.load_run(path)
+        except km.errors.LogError as error:
             return None, [str(error)]
     return read, [str(w.message) for w in caught]
 
@@ -136,7 +130,7 @@ def outcome(path: Path) -> tuple[Run | None, list[str]]:
 def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
     """However `record` was cut: refused before the first block, then block by block, never as a whole run."""
     run, whole, path = make_run(T=450), tmp_path / "run.rrd", tmp_path / "cut.rrd"
-    record(run, whole)
+    km.record(run, whole)
     data = whole.read_bytes()
     found = []
     for share in (*np.linspace(0.0, 1.0, 25, endpoint=False), 1 - 1 / len(data)):
@@ -155,11 +149,11 @@ def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> No
 
 
 def test_a_recorded_log_says_what_it_was_however_little_is_left(tmp_path: Path) -> None:
-    record(make_run(T=200), tmp_path / "run.rrd")
+    km.record(make_run(T=200), tmp_path / "run.rrd")
     data = (tmp_path / "run.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(data[: len(data) // 10])
-    with pytest.raises(LogError, match=r"cut\.rrd holds no whole step; its run ended before"):
-        load_run(tmp_path / "cut.rrd")
+    with pytest.raises(km.errors.LogError, match=r"cut\.rrd holds no whole step; its run ended before"):
+        km.load_run(tmp_path / "cut.rrd")
 
 
 def test_a_log_cut_in_a_batch_ends_with_the_batch_before(written: Path, tmp_path: Path) -> None:
@@ -169,14 +163,14 @@ def test_a_log_cut_in_a_batch_ends_with_the_batch_before(written: Path, tmp_path
     assert place > 0
     (tmp_path / "cut.rrd").write_bytes(whole[:place])
     with pytest.warns(UserWarning, match=r"cut\.rrd ends after step \d+: "):
-        read = load_run(tmp_path / "cut.rrd")
+        read = km.load_run(tmp_path / "cut.rrd")
     assert 0 < read.steps < 50
 
 
 @pytest.mark.parametrize("column", ["X", "U", "solve_time"])
 def test_a_changed_number_is_not_read_as_the_run(tmp_path: Path, column: str) -> None:
     run, path = make_run(T=60), tmp_path / "run.rrd"
-    record(run, path)
+    km.record(run, path)
     data = bytearray(path.read_bytes())
     place = data.find(np.ascontiguousarray(getattr(run, column)[30]).tobytes()[:8])
     if place < 0:
@@ -184,19 +178,19 @@ def test_a_changed_number_is_not_read_as_the_run(tmp_path: Path, column: str) ->
     data[place + 3] ^= 1
     path.write_bytes(data)
     with pytest.raises(
-        LogError, match=r"run\.rrd is damaged: /\w+.* no longer hold what was written; take another copy"
+        km.errors.LogError, match=r"run\.rrd is damaged: /\w+.* no longer hold what was written; take another copy"
     ):
-        load_run(path)
+        km.load_run(path)
 
 
 def test_a_log_of_another_format_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    record(make_run(), path)
+    km.record(make_run(), path)
     shutil.copy(path, tmp_path / "new.rrd")
     data = path.read_bytes()
     assert b'"koopmpc-log-1"' in data
     (tmp_path / "new.rrd").write_bytes(data.replace(b'"koopmpc-log-1"', b'"koopmpc-log-9"'))
     with pytest.raises(
-        LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-1'"
+        km.errors.LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-1'"
     ):
-        load_run(tmp_path / "new.rrd")
+        km.load_run(tmp_path / "new.rrd")

@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import solve_continuous_are
 
-from koopmpc.bench.library import load_problem
-from koopmpc.plant.dynamics import right_side
+import koopmpc as km
+from koopmpc.plants.dynamics import right_side
 
 angle, speed = st.floats(-3.1, 3.1), st.floats(-4.0, 4.0)
 
 
 def rhs(name, x, u):
-    f = right_side(load_problem(name).dynamics)
+    f = right_side(km.load_problem(name).dynamics)
     return np.array(f(x, u)).ravel()
 
 
@@ -30,7 +30,7 @@ def continuous_gain(A, B, Q, R):
     return np.linalg.solve(R, B.T @ P)
 
 
-PENDULUM, CART_POLE = load_problem("pendulum"), load_problem("cart_pole")
+PENDULUM, CART_POLE = km.load_problem("pendulum"), km.load_problem("cart_pole")
 
 
 def test_the_pendulum_has_the_papers_upright_gain():

@@ -2,27 +2,25 @@
 
 import numpy as np
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 
 STATES, INPUTS = ("angle [rad]", "rate [rad/s]"), ("torque [N m]",)
 DT = 0.1
 
 
-def turning(radius: float = 0.95, angle: float = 0.3) -> LinearPredictor:
+def turning(radius: float = 0.95, angle: float = 0.3) -> km.LinearPredictor:
     A = radius * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return LinearPredictor(A, [[0.0], [1.0]], np.eye(2), State(), DT, STATES, INPUTS)
+    return km.LinearPredictor(A, [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
 
 
-def episodes(count: int = 12, steps: int = 30, noise: float = 0.0) -> Episodes:
+def episodes(count: int = 12, steps: int = 30, noise: float = 0.0) -> km.Episodes:
     rng, model = np.random.default_rng(4), turning()
     made = []
     for _ in range(count):
         U = rng.normal(size=(steps, 1))
         X = model.rollout(rng.normal(size=2), U)
-        made.append(Episode(X=X + noise * rng.normal(size=X.shape), U=U))
-    return Episodes(made, DT, STATES, INPUTS)
+        made.append(km.Episode(X=X + noise * rng.normal(size=X.shape), U=U))
+    return km.Episodes(made, DT, STATES, INPUTS)
 
 
 def curve(axes, label: str):

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from koopmpc.errors import DataError
-from koopmpc.figures.eigenfunctions import plot_eigenfunctions
+import koopmpc as km
 from koopmpc.figures.style import save
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
 from tests.figures.models import STATES, episodes, turning
 
 SQUARE = [(-1, 1), (-2, 2)]
@@ -20,7 +17,7 @@ def _mesh(axes):
 
 def test_magnitude_and_phase_of_a_turn() -> None:
     model = turning()
-    made = plot_eigenfunctions(model, 0, ("angle", "rate"), SQUARE, points=20)
+    made = km.plot.eigenfunctions(model, 0, ("angle", "rate"), SQUARE, points=20)
     magnitude, phase = made.axes[:2]
     y, x = (g.reshape(-1) for g in np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-1, 1, 20), indexing="ij"))
     assert _mesh(magnitude) == pytest.approx(np.hypot(x, y) / np.sqrt(5))
@@ -35,20 +32,20 @@ def test_magnitude_and_phase_of_a_turn() -> None:
 def test_real_eigenfunctions_are_one_picture_each_and_pairs_stand_side_by_side(tmp_path) -> None:
     A = np.zeros((3, 3))
     A[0, 0], A[1:, 1:] = 0.99, turning().A
-    model = LinearPredictor(A, np.zeros((3, 0)), np.eye(3), State(), 0.1, ["a [m]", "b", "c"], [])
-    made = plot_eigenfunctions(model, [0, 1], ("a", "b"), [(-1, 1), (0, 1)], points=11)
+    model = km.LinearPredictor(A, np.zeros((3, 0)), np.eye(3), km.State(), 0.1, ["a [m]", "b", "c"], [])
+    made = km.plot.eigenfunctions(model, [0, 1], ("a", "b"), [(-1, 1), (0, 1)], points=11)
     labels = [axes.get_ylabel() for axes in made.axes if axes.get_label() == "<colorbar>"]
     assert labels == ["φ₀", "|φ₁|", "phase of φ₁ [rad]"]
     a = np.tile(np.linspace(-1, 1, 11), 11)
     drawn = _mesh(made.axes[0])
     assert drawn * np.sign(drawn[-1]) == pytest.approx(a)
     save(made, tmp_path / "a.pdf")
-    only = plot_eigenfunctions(model, [0], ("a", "b"), [(-1, 1), (0, 1)], points=5)
+    only = km.plot.eigenfunctions(model, [0], ("a", "b"), [(-1, 1), (0, 1)], points=5)
     assert [axes.get_ylabel() for axes in only.axes] == ["b", "φ₀"]
 
 
 def test_a_picture_of_shades_keeps_its_colours_and_its_labels_stay_inside(tmp_path) -> None:
-    made = plot_eigenfunctions(turning(), 1, (0, 1), SQUARE)
+    made = km.plot.eigenfunctions(turning(), 1, (0, 1), SQUARE)
     save(made, tmp_path / "a.png")
     picture = Image.open(tmp_path / "a.png")
     assert len(picture.convert("RGB").getcolors(1 << 24)) > 1000
@@ -62,13 +59,13 @@ def test_a_picture_of_shades_keeps_its_colours_and_its_labels_stay_inside(tmp_pa
 def test_episodes_give_the_ranges() -> None:
     data = episodes(3)
     X = np.concatenate([episode.X for episode in data])
-    axes = plot_eigenfunctions(turning(), 1, (1, 0), data, points=9).axes[0]
+    axes = km.plot.eigenfunctions(turning(), 1, (1, 0), data, points=9).axes[0]
     assert axes.get_xlim() == pytest.approx((X[:, 1].min(), X[:, 1].max()))
     assert axes.get_ylim() == pytest.approx((X[:, 0].min(), X[:, 0].max()))
 
 
 def test_messages() -> None:
-    with pytest.raises(DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
-        plot_eigenfunctions(turning(), 2, (0, 1), SQUARE)
-    with pytest.raises(DataError, match=r"asked for state 'x'; the states are angle \[rad\]"):
-        plot_eigenfunctions(turning(), 0, ("x", 1), SQUARE)
+    with pytest.raises(km.errors.DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
+        km.plot.eigenfunctions(turning(), 2, (0, 1), SQUARE)
+    with pytest.raises(km.errors.DataError, match=r"asked for state 'x'; the states are angle \[rad\]"):
+        km.plot.eigenfunctions(turning(), 0, ("x", 1), SQUARE)

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.figures.reconstruction import plot_reconstruction
-from koopmpc.figures.runs import plot_runs
+import koopmpc as km
 from tests.recording.runs import make_run
 
 STATES = ("theta [rad]", "omega [rad/s]")
@@ -14,7 +12,7 @@ TRUTH = np.stack([np.sin(np.arange(101) * 0.1), np.cos(np.arange(101) * 0.1)], a
 
 def test_every_state_has_a_panel_and_the_error_is_the_last():
     off = TRUTH + np.array([0.1, 0.0])
-    made = plot_reconstruction({"A": (TRUTH, {"near": off}), "B": (TRUTH, {"exact": TRUTH})}, 0.1, STATES)
+    made = km.plot.reconstruction({"A": (TRUTH, {"near": off}), "B": (TRUTH, {"exact": TRUTH})}, 0.1, STATES)
     assert len(made.axes) == 6
     error = made.axes[4]
     assert error.get_yscale() == "log"
@@ -29,24 +27,24 @@ def test_every_state_has_a_panel_and_the_error_is_the_last():
 def test_what_leaves_the_truth_leaves_the_picture():
     away = TRUTH * 1e9
     away[50:] = np.inf
-    made = plot_reconstruction({"A": (TRUTH, {"away": away})}, 0.1, STATES)
+    made = km.plot.reconstruction({"A": (TRUTH, {"away": away})}, 0.1, STATES)
     low, high = made.axes[0].get_ylim()
     assert -3 < low < -1 < 1 < high < 3
     assert np.isfinite(made.axes[-1].get_ylim()).all()
 
 
 def test_refusals():
-    with pytest.raises(DataError, match="there is no case to draw"):
-        plot_reconstruction({}, 0.1, STATES)
+    with pytest.raises(km.errors.DataError, match="there is no case to draw"):
+        km.plot.reconstruction({}, 0.1, STATES)
     with pytest.raises(
-        ShapeError, match=r"near has shape \(100, 2\), the truth \(101, 2\); pass the same steps"
+        km.errors.ShapeError, match=r"near has shape \(100, 2\), the truth \(101, 2\); pass the same steps"
     ):
-        plot_reconstruction({"A": (TRUTH, {"near": TRUTH[1:]})}, 0.1, STATES)
+        km.plot.reconstruction({"A": (TRUTH, {"near": TRUTH[1:]})}, 0.1, STATES)
 
 
 def test_runs_share_panels_with_reference_and_limits():
     one, two = make_run(nx=2, T=30), make_run(nx=2, T=30)
-    made = plot_runs({"left": {"one": one, "two": two}, "right": {"one": one}})
+    made = km.plot.runs({"left": {"one": one, "two": two}, "right": {"one": one}})
     rows = len(one.states) + len(one.inputs)
     assert len(made.axes) == 2 * rows
     np.testing.assert_array_equal(made.axes[0].lines[0].get_ydata(), one.X[:, 0])
@@ -56,7 +54,7 @@ def test_runs_share_panels_with_reference_and_limits():
 
 
 def test_runs_of_two_plants_are_refused():
-    with pytest.raises(DataError, match="there is no run to draw"):
-        plot_runs({"left": {}})
-    with pytest.raises(DataError, match="different states or inputs"):
-        plot_runs({"left": {"one": make_run(nx=2, T=5), "two": make_run(nx=3, T=5)}})
+    with pytest.raises(km.errors.DataError, match="there is no run to draw"):
+        km.plot.runs({"left": {}})
+    with pytest.raises(km.errors.DataError, match="different states or inputs"):
+        km.plot.runs({"left": {"one": make_run(nx=2, T=5), "two": make_run(nx=3, T=5)}})

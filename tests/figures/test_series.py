@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.figures.eigenfunctions import plot_eigenfunctions
-from koopmpc.figures.error import plot_error
-from koopmpc.figures.series import plot_rollout, plot_run
+import koopmpc as km
 from koopmpc.figures.style import save
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.state import State
-from koopmpc.predict.conformal import conformal
-from koopmpc.predict.forecast import forecast
-from koopmpc.predict.score import score
+from koopmpc.validate.forecast import forecast
 from tests.figures.models import DT, INPUTS, STATES, curve, episodes, turning
 from tests.recording.runs import make_run
 
@@ -28,7 +19,7 @@ def _filled(axes):
 
 def test_a_perfect_model_predicts_the_truth_and_inputs_are_steps() -> None:
     episode = episodes(1)[0]
-    made = plot_rollout(turning(), episode, 20, start=5)
+    made = km.plot.rollout(turning(), episode, 20, start=5)
     for i, axes in enumerate(made.axes[:2]):
         t, truth = curve(axes, "truth")
         assert t == pytest.approx(np.arange(21) * DT)
@@ -43,15 +34,15 @@ def test_a_perfect_model_predicts_the_truth_and_inputs_are_steps() -> None:
 
 def test_bands_lie_around_the_prediction() -> None:
     data, model = episodes(16, noise=0.05), turning(0.9)
-    held = conformal(model, data, 10)
-    scores = score(model, data, 10)
+    held = km.validate.conformal(model, data, 10)
+    scores = km.score(model, data, 10)
     width = np.linspace(0.1, 1, 20).reshape(10, 2)
     for bands, low, high in (
         (held, -held.width, held.width),
         (scores, scores.low, scores.high),
         (width, -width, width),
     ):
-        axes = plot_rollout(model, data[0], 10, bands).axes[1]
+        axes = km.plot.rollout(model, data[0], 10, bands).axes[1]
         predicted = curve(axes, "prediction")[1]
         lower, upper = _filled(axes)
         assert lower[1:, 1] == pytest.approx(predicted[1:] + low[:, 1])
@@ -61,13 +52,13 @@ def test_bands_lie_around_the_prediction() -> None:
 
 def test_an_infinite_band_is_said_not_drawn() -> None:
     data = episodes(4, noise=0.05)
-    made = plot_rollout(turning(), data[0], 10, conformal(turning(), data, 10))
+    made = km.plot.rollout(turning(), data[0], 10, km.validate.conformal(turning(), data, 10))
     assert any("infinite: calibrate on 9 episodes" in t.get_text() for t in made.legends[0].get_texts())
 
 
 def test_a_prediction_that_runs_away_leaves_the_picture_and_not_the_truth(tmp_path) -> None:
     episode = episodes(1)[0]
-    made = plot_rollout(turning(1e12), episode, 30)
+    made = km.plot.rollout(turning(1e12), episode, 30)
     low, high = made.axes[0].get_ylim()
     assert low < episode.X[:, 0].min() < episode.X[:, 0].max() < high
     assert high - low < 4 * np.ptp(episode.X[:, 0])
@@ -79,14 +70,14 @@ def test_relifted_forecasts_and_parts_of_the_state() -> None:
     episode, model = episodes(1)[0], turning(0.9)
     ahead = forecast(model, episode, relift=True)
     assert ahead.predicted == pytest.approx(forecast(model, episode).predicted)  # ψ(x) = x
-    made = plot_rollout(model, episode, states="rate", width="two columns")
+    made = km.plot.rollout(model, episode, states="rate", width="two columns")
     assert [axes.get_ylabel() for axes in made.axes] == [STATES[1], *INPUTS]
 
 
 def test_the_plotted_error_is_the_score() -> None:
     data = episodes(noise=0.05)
-    scores = {"good": score(turning(), data, 12), "bad": score(turning(0.8), data, 9)}
-    made = plot_error(scores)
+    scores = {"good": km.score(turning(), data, 12), "bad": km.score(turning(0.8), data, 9)}
+    made = km.plot.error(scores)
     for i, axes in enumerate(made.axes):
         for name, one in scores.items():
             ahead, rmse = curve(axes, f"{name} RMSE")
@@ -97,12 +88,12 @@ def test_the_plotted_error_is_the_score() -> None:
         assert lower[:, 1] == pytest.approx(scores["good"].low[:, i])
         assert upper[:, 1] == pytest.approx(scores["good"].high[:, i])
     assert made.axes[-1].get_xlabel() == "steps ahead"
-    assert [t.get_text() for t in plot_error(scores["bad"]).legends[0].get_texts()] == ["5 to 95 %", "RMSE"]
+    assert [t.get_text() for t in km.plot.error(scores["bad"]).legends[0].get_texts()] == ["5 to 95 %", "RMSE"]
 
 
 def test_a_run_is_drawn_whole(tmp_path) -> None:
     run = make_run(nx=3, nu=2, T=25)
-    made = plot_run(run)
+    made = km.plot.run(run)
     for i in range(3):
         assert np.array_equal(curve(made.axes[i], "state")[1], run.X[:, i])
         assert np.array_equal(curve(made.axes[i], "reference")[1], run.reference[:, i])
@@ -114,45 +105,45 @@ def test_a_run_is_drawn_whole(tmp_path) -> None:
     assert {name.upper().replace(" ", "_") for name in shown} == {status.name for status in run.status}
     assert sum(len(one.get_xdata()) for one in made.axes[-1].get_lines()) == run.steps
     save(made, tmp_path / "run.svg")
-    save(plot_run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
+    save(km.plot.run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
 
 
 def test_messages() -> None:
     model, data = turning(), episodes(12)
-    with pytest.raises(DataError, match="the episode has 25 steps from step 5 on, the horizon is 26"):
-        plot_rollout(model, data[0], 26, start=5)
-    with pytest.raises(ShapeError, match="the episode has 3 states and 0 inputs, the predictor 2 and 1"):
-        plot_rollout(model, Episode(X=np.zeros((4, 3))))
-    with pytest.raises(ShapeError, match="bands has 4 rows of 2, expected 5 of 2"):
-        plot_rollout(model, data[0], 5, np.ones((4, 2)))
-    with pytest.raises(DataError, match="bands holds -1; half-widths are 0 or above"):
-        plot_rollout(model, data[0], 5, -np.ones((5, 2)))
-    with pytest.raises(DataError, match="the band is for predictions with relift=True; pass relift=True"):
-        plot_rollout(model, data[0], 5, conformal(model, data, 5, relift=True))
-    with pytest.raises(DataError, match="asked for 0 states; choose 1 to 12 with states=…"):
-        plot_rollout(model, data[0], 5, states=[])
-    with pytest.raises(DataError, match="there is no score; pass one"):
-        plot_error({})
-    with pytest.raises(DataError, match="the figure is asked for state 'x'; the states are angle"):
-        plot_error(score(model, data, 3), states="x")
+    with pytest.raises(km.errors.DataError, match="the episode has 25 steps from step 5 on, the horizon is 26"):
+        km.plot.rollout(model, data[0], 26, start=5)
+    with pytest.raises(km.errors.ShapeError, match="the episode has 3 states and 0 inputs, the predictor 2 and 1"):
+        km.plot.rollout(model, km.Episode(X=np.zeros((4, 3))))
+    with pytest.raises(km.errors.ShapeError, match="bands has 4 rows of 2, expected 5 of 2"):
+        km.plot.rollout(model, data[0], 5, np.ones((4, 2)))
+    with pytest.raises(km.errors.DataError, match="bands holds -1; half-widths are 0 or above"):
+        km.plot.rollout(model, data[0], 5, -np.ones((5, 2)))
+    with pytest.raises(km.errors.DataError, match="the band is for predictions with relift=True; pass relift=True"):
+        km.plot.rollout(model, data[0], 5, km.validate.conformal(model, data, 5, relift=True))
+    with pytest.raises(km.errors.DataError, match="asked for 0 states; choose 1 to 12 with states=…"):
+        km.plot.rollout(model, data[0], 5, states=[])
+    with pytest.raises(km.errors.DataError, match="there is no score; pass one"):
+        km.plot.error({})
+    with pytest.raises(km.errors.DataError, match="the figure is asked for state 'x'; the states are angle"):
+        km.plot.error(km.score(model, data, 3), states="x")
 
 
 def test_a_model_with_a_memory_forecasts_from_the_first_known_past() -> None:
-    data = Episodes([Episode(X=e.X[:, :1], U=e.U) for e in episodes(20)], DT, STATES[:1], INPUTS)
-    model = edmd(data, State(), embedding=Delay(1))  # two angles and an input tell the rate
+    data = km.Episodes([km.Episode(X=e.X[:, :1], U=e.U) for e in episodes(20)], DT, STATES[:1], INPUTS)
+    model = km.edmd(data, km.State(), embedding=km.Delay(1))  # two angles and an input tell the rate
     for relift in (False, True):
-        made = plot_rollout(model, data[0], 20, start=3, relift=relift)
+        made = km.plot.rollout(model, data[0], 20, start=3, relift=relift)
         assert curve(made.axes[0], "truth")[1] == pytest.approx(data[0].X[4:25, 0])
         assert curve(made.axes[0], "prediction")[1] == pytest.approx(data[0].X[4:25, 0], abs=1e-6)
-    axes = plot_eigenfunctions(model, 0, ("angle", 2), data, points=5).axes[0]
+    axes = km.plot.eigenfunctions(model, 0, ("angle", 2), data, points=5).axes[0]
     assert axes.get_ylabel() == "angle[k-1] [rad]"
 
 
 def test_a_bad_model_does_not_hide_the_good_one() -> None:
     data = episodes(noise=0.05)
-    good = score(turning(), data, 10)
+    good = km.score(turning(), data, 10)
     for bad in (turning(3.0), turning(1e200)):
         for axes, rmse in zip(
-            plot_error({"good": good, "bad": score(bad, data, 10)}).axes, good.rmse.T, strict=True
+            km.plot.error({"good": good, "bad": km.score(bad, data, 10)}).axes, good.rmse.T, strict=True
         ):
             assert rmse.max() < axes.get_ylim()[1] < 100 * rmse.max()

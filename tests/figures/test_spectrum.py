@@ -3,20 +3,14 @@
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.figures.spectrum import plot_spectrum
-from koopmpc.identify.gather import moments
-from koopmpc.identify.residual_dmd import residual_dmd
-from koopmpc.lifting.state import State
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 from tests.figures.models import episodes, turning
 
 VALUES = np.array([1.2, -0.9, 0.5, 0.1])
 
 
-def _diagonal() -> LinearPredictor:
-    return LinearPredictor(np.diag(VALUES), np.zeros((4, 0)), np.eye(4), State(), 0.1, list("abcd"), [])
+def _diagonal() -> km.LinearPredictor:
+    return km.LinearPredictor(np.diag(VALUES), np.zeros((4, 0)), np.eye(4), km.State(), 0.1, list("abcd"), [])
 
 
 def _named(axes, gid: str):
@@ -27,7 +21,7 @@ def _named(axes, gid: str):
 @pytest.mark.parametrize("residuals", [None, [0.0, 1e-3]])
 def test_the_circle_has_radius_one_and_the_points_are_the_eigenvalues(residuals) -> None:
     model = turning()
-    made = plot_spectrum(model, residuals)
+    made = km.plot.spectrum(model, residuals)
     axes = made.axes[0]
     assert np.hypot(*_named(axes, "unit circle").get_data()) == pytest.approx(1.0)
     points = _named(axes, "eigenvalues")
@@ -39,7 +33,7 @@ def test_the_circle_has_radius_one_and_the_points_are_the_eigenvalues(residuals)
 
 def test_residuals_are_shades_sizes_and_shapes() -> None:
     residuals = np.array([1e-6, 1e-3, 0.5, np.inf])
-    made = plot_spectrum(_diagonal(), residuals)
+    made = km.plot.spectrum(_diagonal(), residuals)
     good, bad = (_named(made.axes[0], gid) for gid in ("eigenvalues", "spurious eigenvalues"))
     assert np.array_equal(good.get_offsets()[:, 0], VALUES[:2])
     assert np.array_equal(bad.get_offsets()[:, 0], VALUES[2:])
@@ -53,38 +47,40 @@ def test_residuals_are_shades_sizes_and_shapes() -> None:
 
 
 def test_eigenvalues_that_crowd_are_drawn_closer() -> None:
-    crowded = plot_spectrum(turning(0.999, 0.01))
+    crowded = km.plot.spectrum(turning(0.999, 0.01))
     x, y = (crowded.axes[1].get_xlim(), crowded.axes[1].get_ylim())
     assert len(crowded.axes) == 2
     assert x[0] < 0.999 * np.cos(0.01) < x[1] < 1.2
     assert -0.2 < y[0] < -0.01 < 0.01 < y[1]
-    assert len(plot_spectrum(_diagonal()).axes) == 1
+    assert len(km.plot.spectrum(_diagonal()).axes) == 1
 
 
 def test_a_bilinear_predictor_has_a_spectrum_too() -> None:
-    model = BilinearPredictor(
-        np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), State(), 0.1, "ab", "u"
+    model = km.BilinearPredictor(
+        np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), km.State(), 0.1, "ab", "u"
     )
-    assert _named(plot_spectrum(model).axes[0], "eigenvalues").get_xdata() == pytest.approx([0.5, 0.5])
+    assert _named(km.plot.spectrum(model).axes[0], "eigenvalues").get_xdata() == pytest.approx([0.5, 0.5])
 
 
 def test_messages() -> None:
-    with pytest.raises(ShapeError, match=r"residuals has shape \(3,\), expected \(2,\)"):
-        plot_spectrum(turning(), [0, 0, 0])
-    with pytest.raises(DataError, match="residuals holds -1; they are norms, from 0 on"):
-        plot_spectrum(turning(), [0, -1])
+    with pytest.raises(km.errors.ShapeError, match=r"residuals has shape \(3,\), expected \(2,\)"):
+        km.plot.spectrum(turning(), [0, 0, 0])
+    with pytest.raises(km.errors.DataError, match="residuals holds -1; they are norms, from 0 on"):
+        km.plot.spectrum(turning(), [0, -1])
     data = episodes(3)
     with pytest.raises(
-        ShapeError, match="there are 2 residuals and 4 eigenvalues; pass the residuals of this"
+        km.errors.ShapeError, match="there are 2 residuals and 4 eigenvalues; pass the residuals of this"
     ):
-        plot_spectrum(_diagonal(), residual_dmd(turning(), moments(data, State())))
-    with pytest.raises(DataError, match="the residuals are those of another predictor"):
-        plot_spectrum(turning(0.5), residual_dmd(turning(), moments(data, State())))
+        km.plot.spectrum(_diagonal(), km.validate.residual_dmd(turning(), km.moments.second_moments(data, km.State())))
+    with pytest.raises(km.errors.DataError, match="the residuals are those of another predictor"):
+        km.plot.spectrum(turning(0.5), km.validate.residual_dmd(turning(), km.moments.second_moments(data, km.State())))
 
 
 def test_residuals_of_the_trust_report_are_taken_with_their_tolerance() -> None:
     data, model = episodes(3), turning()
-    made = plot_spectrum(model, residual_dmd(model, moments(data, State()), tolerance=0.2))
+    made = km.plot.spectrum(
+        model, km.validate.residual_dmd(model, km.moments.second_moments(data, km.State()), tolerance=0.2)
+    )
     assert made.legends[0].get_texts()[0].get_text() == "residual ≤ 0.2"
     points = _named(made.axes[0], "eigenvalues")
     drawn = np.asarray(points.get_offsets())

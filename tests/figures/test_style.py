@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from koopmpc.errors import DataError, LogError
+import koopmpc as km
 from koopmpc.figures.style import WIDTHS, band, figure, line, save, styled
 
 
@@ -79,10 +79,10 @@ assert "matplotlib.pyplot" not in sys.modules
 
 
 def test_messages(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
+    with pytest.raises(km.errors.DataError, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
         save(_drawn(), tmp_path / "a.gif")
     (tmp_path / "file").write_text("")
-    with pytest.raises(LogError, match=r"cannot be written: .*; pass another path"):
+    with pytest.raises(km.errors.LogError, match=r"cannot be written: .*; pass another path"):
         save(_drawn(), tmp_path / "file" / "a.png")
-    with pytest.raises(DataError, match="height is -1 in; it must be above zero"):
+    with pytest.raises(km.errors.DataError, match="height is -1 in; it must be above zero"):
         figure(height=-1.0)

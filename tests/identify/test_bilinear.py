@@ -7,20 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.bilinear import bilinear_edmd
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.gather import moments
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
+import koopmpc as km
 from tests.identify.plants import one_step_pairs, random_episodes
 from tests.identify.test_exact_cases import data_of, slow_manifold
 
-SQUARE = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
+SQUARE = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x0^2"])
 
 
 @given(st.integers(1, 3), st.integers(1, 2), st.booleans(), st.integers(0, 999))
@@ -29,7 +20,7 @@ def test_a_bilinear_system_is_recovered_exactly(nx: int, nu: int, difference: bo
     A, B = rng.uniform(-1, 1, (nx, nx)), rng.uniform(-1, 1, (nx, nu))
     N = rng.uniform(-1, 1, (nu, nx, nx))
     data = one_step_pairs(lambda x, u: A @ x + B @ u + u @ (N @ x), nx, nu, 100, seed)
-    model = bilinear_edmd(data, State(), difference=difference)
+    model = km.bilinear_edmd(data, km.State(), difference=difference)
     for found, true in ((model.A, A), (model.B, B), (model.N, N), (model.C, np.eye(nx))):
         assert np.allclose(found, true, rtol=0, atol=1e-11)
     U = rng.uniform(-0.3, 0.3, (8, nu))
@@ -44,7 +35,7 @@ def test_proctor_2018_inputs_that_enter_linearly_have_no_products() -> None:
     data = one_step_pairs(
         lambda x, u: np.array([lam * x[0], mu * x[1] + (lam**2 - mu) * x[0] ** 2 + delta * u[0]]), 2, 1, 200
     )
-    model = bilinear_edmd(data, SQUARE)
+    model = km.bilinear_edmd(data, SQUARE)
     assert np.allclose(model.A, [[lam, 0, 0], [0, mu, lam**2 - mu], [0, 0, lam**2]], rtol=0, atol=1e-12)
     assert np.allclose(model.B, [[0], [delta], [0]], rtol=0, atol=1e-12)
     assert np.allclose(model.N, 0, rtol=0, atol=1e-12)
@@ -54,7 +45,7 @@ def test_proctor_2018_inputs_that_enter_linearly_have_no_products() -> None:
 
 def test_safedmd_system() -> None:
     data = data_of(*slow_manifold(-2.0, 1.0, 0.01))
-    model = bilinear_edmd(data, State() + Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"]))
+    model = km.bilinear_edmd(data, km.State() + km.Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"]))
     assert model.eigenvalues.real == pytest.approx([1.010050, 0.980199, 0.960789], abs=5e-7)
     assert model.B[:, 0] == pytest.approx([0, 0.01005017, 0.01005017], abs=5e-9)
     assert np.allclose(model.N, 0, rtol=0, atol=1e-12)
@@ -66,10 +57,10 @@ def test_an_input_on_the_squared_state_needs_the_products() -> None:
     lam, sign = 0.8, iter(rng.choice([-1.0, 1.0], 400))
 
     data = one_step_pairs(lambda x, u: lam * x + u, 1, 1, 300)
-    binary = Episodes(
-        [Episode(X=[e.X[0], lam * e.X[0] + v], U=[[v]]) for e, v in zip(data, sign, strict=False)], data.dt
+    binary = km.Episodes(
+        [km.Episode(X=[e.X[0], lam * e.X[0] + v], U=[[v]]) for e, v in zip(data, sign, strict=False)], data.dt
     )
-    model = bilinear_edmd(binary, State() + Monomials(2) + Constant())
+    model = km.bilinear_edmd(binary, km.State() + km.Monomials(2) + km.Constant())
     assert np.allclose(model.A, [[lam, 0, 0], [0, lam**2, 1], [0, 0, 1]], rtol=0, atol=1e-11)
     assert np.allclose(model.B, [[1], [0], [0]], rtol=0, atol=1e-11)
     assert np.allclose(model.N, [[[0, 0, 0], [2 * lam, 0, 0], [0, 0, 0]]], rtol=0, atol=1e-11)
@@ -77,11 +68,14 @@ def test_an_input_on_the_squared_state_needs_the_products() -> None:
 
 
 @pytest.mark.parametrize("route", ["gram", "qr"])
-@pytest.mark.parametrize("lifting", [State() + Fourier(1), Constant() + State() + Monomials(2), Fourier(2)])
+@pytest.mark.parametrize(
+    "lifting", [km.State() + km.Fourier(1), km.Constant() + km.State() + km.Monomials(2), km.Fourier(2)]
+)
 def test_it_is_the_least_squares_of_numpy(route: str, lifting, monkeypatch: pytest.MonkeyPatch) -> None:
     data = random_episodes(1, [40, 900, 300], 2, 2)
-    monkeypatch.setattr("koopmpc.identify.bilinear.moments", lambda *a, **k: moments(*a, route=route, **k))
-    model = bilinear_edmd(data, lifting)
+    read = km.moments.second_moments
+    monkeypatch.setattr("koopmpc.identify.fits.bilinear.second_moments", lambda *a, **k: read(*a, route=route, **k))
+    model = km.bilinear_edmd(data, lifting)
     s, bound = data.snapshots(), lifting.bind(data.states)
     Z, keep = bound(s.X), [i for i, name in enumerate(bound.names) if name != "1"]
     products = np.einsum("mi,mj->mij", s.U, Z[:, keep]).reshape(len(Z), -1)
@@ -99,8 +93,8 @@ def test_a_ridge_draws_towards_zero_or_towards_no_change() -> None:
     heavy = 1e9
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        plain = bilinear_edmd(data, State(), ridge=heavy)
-        still = bilinear_edmd(data, State(), ridge=heavy, difference=True)
+        plain = km.bilinear_edmd(data, km.State(), ridge=heavy)
+        still = km.bilinear_edmd(data, km.State(), ridge=heavy, difference=True)
     assert np.allclose(plain.A, 0, atol=1e-6)
     assert np.allclose(still.A, np.eye(2), atol=1e-6)
     assert np.allclose(still.B, 0, atol=1e-6)
@@ -109,32 +103,32 @@ def test_a_ridge_draws_towards_zero_or_towards_no_change() -> None:
 @given(st.integers(0, 99))
 def test_its_residual_is_no_worse_than_that_of_edmd(seed: int) -> None:
     data = random_episodes(seed, [120], 2, 1)
-    linear, bilinear = edmd(data, State() + Constant()), bilinear_edmd(data, State() + Constant())
+    linear, bilinear = km.edmd(data, km.State() + km.Constant()), km.bilinear_edmd(data, km.State() + km.Constant())
     assert (bilinear.report.residual <= linear.report.residual * (1 + 1e-9)).all()
 
 
 def test_moments_of_parts_add_up() -> None:
     data = random_episodes(3, [50, 70], 2, 1)
-    parts = [moments(data[i : i + 1], SQUARE, route="gram", bilinear=True) for i in range(2)]
-    whole = moments(data, SQUARE, route="gram", bilinear=True)
+    parts = [km.moments.second_moments(data[i : i + 1], SQUARE, route="gram", bilinear=True) for i in range(2)]
+    whole = km.moments.second_moments(data, SQUARE, route="gram", bilinear=True)
     assert np.allclose((parts[0] + parts[1]).sums, whole.sums, rtol=1e-12)
-    with pytest.raises(DataError, match="or one is bilinear"):
-        _ = whole + moments(data, SQUARE, route="gram")
+    with pytest.raises(km.errors.DataError, match="or one is bilinear"):
+        _ = whole + km.moments.second_moments(data, SQUARE, route="gram")
 
 
 def test_doubts_are_said_and_kept() -> None:
     data = one_step_pairs(lambda x, u: x, 2, 1, 4)
-    with pytest.warns(FitWarning, match="4 snapshot pairs cannot determine 5 coefficients") as caught:
-        model = bilinear_edmd(data, State())
+    with pytest.warns(km.FitWarning, match="4 snapshot pairs cannot determine 5 coefficients") as caught:
+        model = km.bilinear_edmd(data, km.State())
     assert len(caught) == 1
     assert model.report.warnings == (str(caught[0].message),)
 
 
 def test_refusals() -> None:
-    with pytest.raises(DataError, match="the episodes have no inputs; pass them to edmd"):
-        bilinear_edmd(random_episodes(0, [20], 2, 0), State())
-    with pytest.raises(DataError, match="ridge is -1; it must be 0 or above"):
-        bilinear_edmd(random_episodes(0, [20], 2, 1), State(), ridge=-1)
-    wild = State() + Expressions(lambda x: [1e200 * x[0]], ["huge"])
-    with np.errstate(over="ignore"), pytest.raises(DataError, match="observable 'huge' is NaN, infinite"):
-        bilinear_edmd(random_episodes(0, [20], 2, 1), wild)
+    with pytest.raises(km.errors.DataError, match="the episodes have no inputs; pass them to edmd"):
+        km.bilinear_edmd(random_episodes(0, [20], 2, 0), km.State())
+    with pytest.raises(km.errors.DataError, match="ridge is -1; it must be 0 or above"):
+        km.bilinear_edmd(random_episodes(0, [20], 2, 1), km.State(), ridge=-1)
+    wild = km.State() + km.Expressions(lambda x: [1e200 * x[0]], ["huge"])
+    with np.errstate(over="ignore"), pytest.raises(km.errors.DataError, match="observable 'huge' is NaN, infinite"):
+        km.bilinear_edmd(random_episodes(0, [20], 2, 1), wild)

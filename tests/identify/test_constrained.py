@@ -6,28 +6,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.constrained import constrained_edmd
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.prior import Combination, Prior, Storage
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.state import State
+import koopmpc as km
+from koopmpc.identify.fits.prior import Combination, Storage
 from koopmpc.values import from_data, to_data
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 
-LIFTING = State() + Constant()
+LIFTING = km.State() + km.Constant()
 NAN = np.nan
 
 
-def linear(A: np.ndarray, B: np.ndarray, noise: float = 0.0, seed: int = 0) -> Episodes:
+def linear(A: np.ndarray, B: np.ndarray, noise: float = 0.0, seed: int = 0) -> km.Episodes:
     rng = np.random.default_rng(seed)
     return one_step_pairs(
         lambda x, u: A @ x + B @ u + noise * rng.standard_normal(len(x)), len(A), B.shape[1], 60, seed
     )
 
 
-def oracle(data: Episodes, lifting, ridge: float, constrain) -> np.ndarray:
+def oracle(data: km.Episodes, lifting, ridge: float, constrain) -> np.ndarray:
     """Solve the program on every row of the data, in raw units; return [A B]."""
     D = brute_force(data, lifting.bind(data.states))
     nz = lifting.bind(data.states).nz
@@ -51,28 +46,28 @@ def found(model) -> np.ndarray:
 STORE = np.diag([2.0, 1.0, 0.0])
 CASES = {
     "known entries": (
-        Prior(A=[[NAN, 0.1, NAN], [NAN] * 3, [0, 0, 1]], B=[[0.0], [NAN], [0.0]]),
+        km.Prior(A=[[NAN, 0.1, NAN], [NAN] * 3, [0, 0, 1]], B=[[0.0], [NAN], [0.0]]),
         lambda A, B: [A[0, 1] == 0.1, B[0, 0] == 0, A[2] == [0, 0, 1], B[2, 0] == 0],
     ),
     "known rows": (
-        Prior(rows={"x0": {"x0": 1.0, "x1": 0.1}, "1": {"1": 1.0}}),
+        km.Prior(rows={"x0": {"x0": 1.0, "x1": 0.1}, "1": {"1": 1.0}}),
         lambda A, B: [A[0] == [1, 0.1, 0], A[2] == [0, 0, 1], B[0] == 0, B[2] == 0],
     ),
     "masks": (
-        Prior(mask_A=[[1, 1, 0], [0, 1, 1], [0, 0, 1]], mask_B=[[0], [1], [0]]),
+        km.Prior(mask_A=[[1, 1, 0], [0, 1, 1], [0, 0, 1]], mask_B=[[0], [1], [0]]),
         lambda A, B: [A[0, 2] == 0, A[1, 0] == 0, A[2, :2] == 0, B[0] == 0, B[2] == 0],
     ),
     "bounds": (
-        Prior(lower_A=0.0, upper_A=[[0.02] * 3, [np.inf] * 3, [1.0] * 3], upper_B=0.01),
+        km.Prior(lower_A=0.0, upper_A=[[0.02] * 3, [np.inf] * 3, [1.0] * 3], upper_B=0.01),
         lambda A, B: [A >= 0, A[0] <= 0.02, A[2] <= 1, B <= 0.01],
     ),
-    "symmetric": (Prior(symmetric=True), lambda A, B: [A == A.T]),
+    "symmetric": (km.Prior(symmetric=True), lambda A, B: [A == A.T]),
     "combinations": (
-        Prior(combinations=[Combination(1, 1, A=np.ones((3, 3))), Combination(0.2, np.inf, B=np.ones((3, 1)))]),
+        km.Prior(combinations=[Combination(1, 1, A=np.ones((3, 3))), Combination(0.2, np.inf, B=np.ones((3, 1)))]),
         lambda A, B: [cp.sum(A) == 1, cp.sum(B) >= 0.2],
     ),
     "contraction": (
-        Prior(storage=Storage(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
+        km.Prior(storage=Storage(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
         lambda A, B: [
             A[:2, 2] == 0,
             cp.bmat([[0.25 * STORE[:2, :2], (np.sqrt(STORE[:2]) @ A[:, :2]).T],
@@ -87,7 +82,7 @@ CASES = {
 def test_equals_brute_force_on_all_rows(name: str, ridge: float) -> None:
     prior, constrain = CASES[name]
     data = random_episodes(3, [40, 30], 2, 1)
-    model = constrained_edmd(data, LIFTING, prior=prior, ridge=ridge)
+    model = km.constrained_edmd(data, LIFTING, prior=prior, ridge=ridge)
     assert np.allclose(found(model), oracle(data, LIFTING, ridge, constrain), rtol=0, atol=2e-6)
     assert model.report.changes
     assert from_data(to_data(prior)) == prior
@@ -96,12 +91,12 @@ def test_equals_brute_force_on_all_rows(name: str, ridge: float) -> None:
 def test_passivity_holds_and_equals_the_program_in_raw_units() -> None:
     data = random_episodes(5, [60], 2, 1)
     P, C, D = np.diag([1.0, 2.0]), np.array([[0.3, 0.1]]), np.array([[0.2]])
-    model = constrained_edmd(data, State(), prior=Prior(storage=Storage(P, C=C, D=D)))
+    model = km.constrained_edmd(data, km.State(), prior=km.Prior(storage=Storage(P, C=C, D=D)))
 
     def passive(A, B):  # in z, u directly: P⁻¹ instead of a factor
         return [cp.bmat([[P, C.T, A.T], [C, D + D.T, B.T], [A, B, np.linalg.inv(P)]]) >> 0]
 
-    assert np.allclose(found(model), oracle(data, State(), 0.0, passive), rtol=0, atol=1e-6)
+    assert np.allclose(found(model), oracle(data, km.State(), 0.0, passive), rtol=0, atol=1e-6)
     rng = np.random.default_rng(0)
     for z, u in zip(rng.standard_normal((200, 2)), rng.standard_normal((200, 1)), strict=True):
         after = model.A @ z + model.B @ u
@@ -113,8 +108,8 @@ def test_passivity_holds_and_equals_the_program_in_raw_units() -> None:
 def test_bounds_meet_the_KKT_conditions(seed: int) -> None:
     data = random_episodes(seed, [50], 3, 1)
     lower = np.where(np.random.default_rng(seed).uniform(size=(3, 3)) < 0.5, 0.02, -np.inf)
-    model = constrained_edmd(data, State(), prior=Prior(lower_A=lower, upper_B=0.0))
-    D = brute_force(data, State().bind(data.states))
+    model = km.constrained_edmd(data, km.State(), prior=km.Prior(lower_A=lower, upper_B=0.0))
+    D = brute_force(data, km.State().bind(data.states))
     P, T = D[:, :4], D[:, 4:]
     slope = (found(model) @ P.T - T.T) @ P / len(P)  # of ½ the mean squared residual
     K = found(model)
@@ -131,20 +126,20 @@ def test_bounds_meet_the_KKT_conditions(seed: int) -> None:
 A_TRUE = np.array([[0.9, 0.1, 0.0], [0.1, 0.7, 0.0], [0.0, 0.0, 0.5]])
 B_TRUE = np.array([[0.0], [0.5], [0.0]])
 TRUTHS = [
-    Prior(rows={"x2": {"x2": 0.5}}),
-    Prior(B=B_TRUE),
-    Prior(mask_A=A_TRUE != 0, mask_B=B_TRUE != 0),
-    Prior(lower_A=-1e-9, lower_B=-1e-9, upper_A=1.0),
-    Prior(symmetric=True),
-    Prior(combinations=[Combination(2.1, 2.1, A=np.eye(3))]),
-    Prior(storage=Storage([1, 1, 1])),
+    km.Prior(rows={"x2": {"x2": 0.5}}),
+    km.Prior(B=B_TRUE),
+    km.Prior(mask_A=A_TRUE != 0, mask_B=B_TRUE != 0),
+    km.Prior(lower_A=-1e-9, lower_B=-1e-9, upper_A=1.0),
+    km.Prior(symmetric=True),
+    km.Prior(combinations=[Combination(2.1, 2.1, A=np.eye(3))]),
+    km.Prior(storage=Storage([1, 1, 1])),
 ]
 
 
 @pytest.mark.parametrize("prior", TRUTHS)
-def test_a_true_prior_does_not_move_the_fit_of_exact_data(prior: Prior) -> None:
+def test_a_true_prior_does_not_move_the_fit_of_exact_data(prior: km.Prior) -> None:
     data = linear(A_TRUE, B_TRUE)
-    model, plain = constrained_edmd(data, State(), prior=prior), edmd(data, State())
+    model, plain = km.constrained_edmd(data, km.State(), prior=prior), km.edmd(data, km.State())
     assert np.allclose(found(model), found(plain), rtol=0, atol=1e-11)
     assert np.allclose(found(model), np.hstack([A_TRUE, B_TRUE]), rtol=0, atol=1e-11)
 
@@ -152,19 +147,17 @@ def test_a_true_prior_does_not_move_the_fit_of_exact_data(prior: Prior) -> None:
 def test_a_known_B_separates_what_feedback_made_inseparable() -> None:
     A, B = np.array([[1.5, 0], [0, 0.1]]), np.array([[1.0], [0.0]])
     data = one_step_pairs(lambda x, u: A @ x + B @ u, 2, 1, 50)
-    closed = Episodes(
-        [type(e)(X=[e.X[0], A @ e.X[0] - B @ e.X[0, :1]], U=[-e.X[0, :1]]) for e in data], data.dt
-    )
-    model = constrained_edmd(closed, State(), prior=Prior(B=B))  # no FitWarning: nothing doubtful is left
+    closed = km.Episodes([type(e)(X=[e.X[0], A @ e.X[0] - B @ e.X[0, :1]], U=[-e.X[0, :1]]) for e in data], data.dt)
+    model = km.constrained_edmd(closed, km.State(), prior=km.Prior(B=B))  # no FitWarning: nothing doubtful is left
     assert np.allclose(model.A, A, atol=1e-12)
 
 
 def test_units_mean_nothing_under_bounds() -> None:
     data = random_episodes(2, [80], 2, 1)
     units = np.array([1e-4, 1e4])
-    scaled = Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
-    a = constrained_edmd(data, State(), prior=Prior(lower_A=0.0, lower_B=0.0))
-    b = constrained_edmd(scaled, State(), prior=Prior(lower_A=0.0, lower_B=0.0))
+    scaled = km.Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
+    a = km.constrained_edmd(data, km.State(), prior=km.Prior(lower_A=0.0, lower_B=0.0))
+    b = km.constrained_edmd(scaled, km.State(), prior=km.Prior(lower_A=0.0, lower_B=0.0))
     assert np.allclose(b.A * units / units[:, None], a.A, atol=1e-7)
     assert np.allclose(b.B * 1e3 / units[:, None], a.B, atol=1e-7)
 
@@ -172,25 +165,25 @@ def test_units_mean_nothing_under_bounds() -> None:
 def test_measured_disturbances_are_the_last_columns_of_B() -> None:
     rng = np.random.default_rng(0)
     X, U, W = rng.standard_normal((40, 2)), rng.standard_normal((39, 1)), rng.standard_normal((39, 1))
-    data = Episodes([type(random_episodes(0, [2], 1, 0)[0])(X=X, U=U, W=W)], 0.1)
-    model = constrained_edmd(data, State(), prior=Prior(B=[[NAN, 0.5], [NAN, 0.0]]))
+    data = km.Episodes([type(random_episodes(0, [2], 1, 0)[0])(X=X, U=U, W=W)], 0.1)
+    model = km.constrained_edmd(data, km.State(), prior=km.Prior(B=[[NAN, 0.5], [NAN, 0.0]]))
     assert np.array_equal(model.E, [[0.5], [0.0]])
     assert model.B.shape == (2, 1)
 
 
 REFUSED = [
-    ({"A": np.eye(2)}, ShapeError, r"Prior.A has shape \(2, 2\), expected \(3, 3\)"),
-    ({"mask_B": [[1, 1]]}, ShapeError, "mask_B has shape"),
-    ({"lower_A": [[0.0]]}, ShapeError, "lower_A has shape"),
-    ({"rows": {"speed": {}}}, DataError, "rows names 'speed'; it can name x0, x1, 1"),
-    ({"rows": {"x0": {"x0": 1.0}}, "A": [[2, NAN, NAN], [NAN] * 3, [NAN] * 3]}, DataError, "another prior says 2"),
-    ({"A": np.full((3, 3), 2.0), "upper_A": 1.0}, DataError, "contradict each other at 'x0'"),
-    ({"lower_B": 1.0, "upper_B": 0.0}, DataError, "contradict each other"),
-    ({"combinations": [Combination(0, 1, A=np.eye(2))]}, ShapeError, "Combination.A has shape"),
-    ({"storage": Storage([1, 1])}, ShapeError, "Storage.P has shape"),
+    ({"A": np.eye(2)}, km.errors.ShapeError, r"Prior.A has shape \(2, 2\), expected \(3, 3\)"),
+    ({"mask_B": [[1, 1]]}, km.errors.ShapeError, "mask_B has shape"),
+    ({"lower_A": [[0.0]]}, km.errors.ShapeError, "lower_A has shape"),
+    ({"rows": {"speed": {}}}, km.errors.DataError, "rows names 'speed'; it can name x0, x1, 1"),
+    ({"rows": {"x0": {"x0": 1.0}}, "A": [[2, NAN, NAN], [NAN] * 3, [NAN] * 3]}, km.errors.DataError, "another prior says 2"),
+    ({"A": np.full((3, 3), 2.0), "upper_A": 1.0}, km.errors.DataError, "contradict each other at 'x0'"),
+    ({"lower_B": 1.0, "upper_B": 0.0}, km.errors.DataError, "contradict each other"),
+    ({"combinations": [Combination(0, 1, A=np.eye(2))]}, km.errors.ShapeError, "Combination.A has shape"),
+    ({"storage": Storage([1, 1])}, km.errors.ShapeError, "Storage.P has shape"),
     (
         {"combinations": [Combination(5, 6, A=np.eye(3))], "upper_A": 1.0},
-        DataError,
+        km.errors.DataError,
         "no A and B meet all priors: Clarabel says 'infeasible",
     ),
 ]  # fmt: skip
@@ -200,17 +193,17 @@ REFUSED = [
 def test_what_cannot_be_is_refused(parts: dict, kind: type[Exception], text: str) -> None:
     data = random_episodes(0, [40], 2, 1)
     with pytest.raises(kind, match=text):
-        constrained_edmd(data, LIFTING, prior=Prior(**parts))
+        km.constrained_edmd(data, LIFTING, prior=km.Prior(**parts))
 
 
 def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
-    with pytest.raises(DataError, match="no weights"):
+    with pytest.raises(km.errors.DataError, match="no weights"):
         Combination(0, 1)
-    with pytest.raises(DataError, match="limits cross"):
+    with pytest.raises(km.errors.DataError, match="limits cross"):
         Combination(1, 0, A=np.eye(2))
-    with pytest.raises(DataError, match="has D but no C"):
+    with pytest.raises(km.errors.DataError, match="has D but no C"):
         Storage([1.0], D=[[1.0]])
-    with pytest.raises(DataError, match="decay is 0"):
+    with pytest.raises(km.errors.DataError, match="decay is 0"):
         Storage([1.0], decay=0)
-    with pytest.raises(DataError, match="ridge is -1"):
-        constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=Prior(), ridge=-1)
+    with pytest.raises(km.errors.DataError, match="ridge is -1"):
+        km.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.Prior(), ridge=-1)

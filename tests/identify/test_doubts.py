@@ -5,23 +5,15 @@ import warnings
 import numpy as np
 import pytest
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import FitWarning
-from koopmpc.identify.dmd import dmd, dmdc
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 from tests.identify.plants import random_episodes
 
 
-def warned(data: Episodes, lifting: Lifting, **options: float) -> tuple[LinearPredictor, list[str]]:
+def warned(data: km.Episodes, lifting: km.Lifting, **options: float) -> tuple[km.LinearPredictor, list[str]]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model = edmd(data, lifting, **options)
-    assert all(issubclass(w.category, FitWarning) for w in caught)
+        model = km.edmd(data, lifting, **options)
+    assert all(issubclass(w.category, km.FitWarning) for w in caught)
     sentences = [str(w.message) for w in caught]
     assert model.report is not None
     assert list(model.report.warnings) == sentences  # each once, and in the report
@@ -32,7 +24,7 @@ def warned(data: Episodes, lifting: Lifting, **options: float) -> tuple[LinearPr
 
 def test_fewer_snapshots_than_coefficients() -> None:
     data = random_episodes(0, [5], 2, 1)
-    model, sentences = warned(data, Constant() + State() + Monomials(2))
+    model, sentences = warned(data, km.Constant() + km.State() + km.Monomials(2))
     assert len(sentences) == 1
     assert sentences[0].startswith("rank-deficient: 5 snapshot pairs cannot determine 7 coefficients a row")
     assert model.report.condition == np.inf
@@ -41,8 +33,8 @@ def test_fewer_snapshots_than_coefficients() -> None:
 
 def test_a_state_that_never_moves_doubles_the_constant() -> None:
     data = random_episodes(0, [60], 2, 1)
-    still = Episodes([Episode(X=e.X * [1, 0] + [0, 3], U=e.U) for e in data], 0.1, ["x [m]", "m [kg]"])
-    model, sentences = warned(still, Constant() + State())
+    still = km.Episodes([km.Episode(X=e.X * [1, 0] + [0, 3], U=e.U) for e in data], 0.1, ["x [m]", "m [kg]"])
+    model, sentences = warned(still, km.Constant() + km.State())
     assert len(sentences) == 1
     assert "1 of 3 observables are linear functions of others" in sentences[0]
     assert "'m [kg]' of '1'" in sentences[0] or "'1' of 'm [kg]'" in sentences[0]
@@ -53,8 +45,8 @@ def test_a_state_that_never_moves_doubles_the_constant() -> None:
 
 def test_a_duplicate_column_is_named() -> None:
     data = random_episodes(0, [60], 2, 0)
-    double = Episodes([Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]])) for e in data], 0.1, ["a", "b", "c"])
-    _, sentences = warned(double, State())
+    double = km.Episodes([km.Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]])) for e in data], 0.1, ["a", "b", "c"])
+    _, sentences = warned(double, km.State())
     assert len(sentences) == 1
     assert "'c' of 'a'" in sentences[0] or "'a' of 'c'" in sentences[0]
     assert "'b'" not in sentences[0]
@@ -62,8 +54,8 @@ def test_a_duplicate_column_is_named() -> None:
 
 def test_inputs_that_move_together_are_named() -> None:
     data = random_episodes(0, [60], 2, 1)
-    both = Episodes([Episode(X=e.X, U=np.hstack([e.U, -e.U])) for e in data], 0.1)
-    model, sentences = warned(both, State())
+    both = km.Episodes([km.Episode(X=e.X, U=np.hstack([e.U, -e.U])) for e in data], 0.1)
+    model, sentences = warned(both, km.State())
     assert len(sentences) == 1
     assert "1 of 2 inputs are linear functions of others" in sentences[0]
     assert np.allclose(model.B[:, 0], -model.B[:, 1])
@@ -71,9 +63,9 @@ def test_inputs_that_move_together_are_named() -> None:
 
 def test_feedback_makes_A_and_B_inseparable() -> None:
     data = random_episodes(0, [60], 2, 1)
-    fed = Episodes([Episode(X=e.X, U=e.X[:-1] @ [[0.5], [-2]]) for e in data], 0.1)
+    fed = km.Episodes([km.Episode(X=e.X, U=e.X[:-1] @ [[0.5], [-2]]) for e in data], 0.1)
     for ridge in (0.0, 1e-3):  # a ridge hides it, and cures nothing
-        _, sentences = warned(fed, State(), ridge=ridge)
+        _, sentences = warned(fed, km.State(), ridge=ridge)
         assert len(sentences) == 1
         assert sentences[0].startswith("feedback made A and B inseparable")
         assert "rank [Z U] = 2, rank Z + rank U = 3" in sentences[0]
@@ -82,55 +74,55 @@ def test_feedback_makes_A_and_B_inseparable() -> None:
 
 def test_noise_on_the_feedback_separates_them() -> None:
     data = random_episodes(0, [60], 2, 1)
-    fed = Episodes([Episode(X=e.X, U=e.X[:-1] @ [[0.5], [-2]] + 0.1 * e.U) for e in data], 0.1)
-    _, sentences = warned(fed, State())
+    fed = km.Episodes([km.Episode(X=e.X, U=e.X[:-1] @ [[0.5], [-2]] + 0.1 * e.U) for e in data], 0.1)
+    _, sentences = warned(fed, km.State())
     assert not sentences
 
 
 def test_an_input_that_was_always_zero_is_named_and_gets_a_zero_column() -> None:
     data = random_episodes(0, [60], 2, 2)
-    idle = Episodes([Episode(X=e.X, U=e.U * [1, 0]) for e in data], 0.1, inputs=["u [N]", "idle [N]"])
-    model, sentences = warned(idle, State())
+    idle = km.Episodes([km.Episode(X=e.X, U=e.U * [1, 0]) for e in data], 0.1, inputs=["u [N]", "idle [N]"])
+    model, sentences = warned(idle, km.State())
     assert len(sentences) == 1
     assert "'idle [N]' was 0 in all snapshots" in sentences[0]
     assert np.array_equal(model.B[:, 1], [0, 0])
-    alone = edmd(Episodes([Episode(X=e.X, U=e.U[:, :1]) for e in idle], 0.1), State())
+    alone = km.edmd(km.Episodes([km.Episode(X=e.X, U=e.U[:, :1]) for e in idle], 0.1), km.State())
     assert np.allclose(model.A, alone.A, atol=1e-12)
     assert np.allclose(model.B[:, :1], alone.B, atol=1e-12)
 
 
 def test_data_of_zeros_do_not_crash() -> None:
-    still = Episodes([Episode(X=np.zeros((9, 2)), U=np.zeros((8, 1)))], 0.1)
-    model, sentences = warned(still, State())
+    still = km.Episodes([km.Episode(X=np.zeros((9, 2)), U=np.zeros((8, 1)))], 0.1)
+    model, sentences = warned(still, km.State())
     assert len(sentences) == 1
     assert "'x0', 'x1', 'u0' was 0 in all snapshots" in sentences[0]
     assert not model.A.any()
-    model, sentences = warned(still, State(), rank=1)
+    model, sentences = warned(still, km.State(), rank=1)
     assert not model.A.any()
     assert "the snapshots have rank 0" in sentences[1]
-    with pytest.warns(FitWarning, match="was 0 in all snapshots"):
-        dmdc(still)
-    with pytest.warns(FitWarning, match="was 0 in all snapshots"):
-        dmd(Episodes([Episode(X=np.zeros((9, 2)))], 0.1))
+    with pytest.warns(km.FitWarning, match="was 0 in all snapshots"):
+        km.dmdc(still)
+    with pytest.warns(km.FitWarning, match="was 0 in all snapshots"):
+        km.dmd(km.Episodes([km.Episode(X=np.zeros((9, 2)))], 0.1))
 
 
 def test_nearly_parallel_observables_are_ill_conditioned() -> None:
     rng = np.random.default_rng(0)
     X = rng.uniform(-1, 1, (60, 1))
-    data = Episodes([Episode(X=np.hstack([X, X + 1e-11 * rng.uniform(-1, 1, X.shape)]))], 0.1)
-    model, sentences = warned(data, State())
+    data = km.Episodes([km.Episode(X=np.hstack([X, X + 1e-11 * rng.uniform(-1, 1, X.shape)]))], 0.1)
+    model, sentences = warned(data, km.State())
     assert len(sentences) == 1
     assert sentences[0].startswith("ill-conditioned: the observables have condition number")
     assert "pass a ridge" in sentences[0]
     assert model.report.condition > 1e10
-    assert not warned(data, State(), ridge=1e-6)[1]  # the user has seen to it
+    assert not warned(data, km.State(), ridge=1e-6)[1]  # the user has seen to it
 
 
 def test_a_rank_that_the_data_do_not_have_is_lowered() -> None:
     data = random_episodes(0, [60], 2, 0)
-    flat = Episodes([Episode(X=e.X[:, [0, 1, 0]]) for e in data], 0.1)
-    model, sentences = warned(flat, State(), rank=3)
+    flat = km.Episodes([km.Episode(X=e.X[:, [0, 1, 0]]) for e in data], 0.1)
+    model, sentences = warned(flat, km.State(), rank=3)
     assert len(sentences) == 1
     assert "rank 3 was asked for, the snapshots have rank 2, which is taken" in sentences[0]
     assert model.A.shape == (2, 2)
-    assert not warned(flat, State(), rank=2)[1]
+    assert not warned(flat, km.State(), rank=2)[1]

@@ -5,18 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.projected import Projected
-from koopmpc.lifting.state import State
+import koopmpc as km
+from koopmpc.lifting.reduced import Projected
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 
-LIFTING = Constant() + State() + Monomials(2)
+LIFTING = km.Constant() + km.State() + km.Monomials(2)
 
 
 def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -27,7 +20,7 @@ def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
 @given(st.lists(st.integers(1, 40), min_size=3, max_size=8), st.integers(0, 2), st.integers(0, 999))
 def test_coefficients_are_those_of_lstsq(lengths: list[int], nu: int, seed: int) -> None:
     data = random_episodes(seed, [*lengths, 40], 2, nu)
-    model = edmd(data, LIFTING)
+    model = km.edmd(data, LIFTING)
     D = brute_force(data, model.lifting)
     nz = model.nz
     K = np.linalg.lstsq(D[:, : nz + nu], D[:, nz + nu :], rcond=None)[0]
@@ -43,8 +36,8 @@ def test_coefficients_are_those_of_lstsq(lengths: list[int], nu: int, seed: int)
 @given(st.permutations(range(6)), st.integers(0, 99))
 def test_the_order_of_episodes_changes_nothing(order: list[int], seed: int) -> None:
     data = random_episodes(seed, [30] * 6, 2, 1)
-    mixed = Episodes([data[i] for i in order], data.dt)
-    a, b = edmd(data, LIFTING), edmd(mixed, LIFTING)
+    mixed = km.Episodes([data[i] for i in order], data.dt)
+    a, b = km.edmd(data, LIFTING), km.edmd(mixed, LIFTING)
     assert np.allclose(a.A, b.A, rtol=0, atol=1e-11)
     assert np.allclose(a.B, b.B, rtol=0, atol=1e-11)
 
@@ -52,28 +45,28 @@ def test_the_order_of_episodes_changes_nothing(order: list[int], seed: int) -> N
 def test_episodes_of_two_regimes_are_not_paired() -> None:
     # within each regime x⁺ = x/2; a pair across the seam would be −100 → +100
     halves = 0.5 ** np.arange(6)[:, None]
-    data = Episodes([Episode(X=-100 * halves), Episode(X=100 * halves), Episode(X=-100 * halves)], 0.1)
-    assert np.allclose(edmd(data, State()).A, 0.5, rtol=0, atol=1e-14)
+    data = km.Episodes([km.Episode(X=-100 * halves), km.Episode(X=100 * halves), km.Episode(X=-100 * halves)], 0.1)
+    assert np.allclose(km.edmd(data, km.State()).A, 0.5, rtol=0, atol=1e-14)
 
 
 def test_no_observable_is_added() -> None:
     data = one_step_pairs(step, 2, 1, 100)
-    for lifting in (State(), Fourier(1), Monomials(2) + State()):
-        assert edmd(data, lifting).lifting.names == lifting.bind(data.states).names
+    for lifting in (km.State(), km.Fourier(1), km.Monomials(2) + km.State()):
+        assert km.edmd(data, lifting).lifting.names == lifting.bind(data.states).names
 
 
 def test_C_picks_the_states_by_name() -> None:
     data = one_step_pairs(step, 2, 1, 100)
-    model = edmd(data, Monomials(2) + State())
+    model = km.edmd(data, km.Monomials(2) + km.State())
     assert np.array_equal(model.C, np.eye(5)[3:])
     assert np.array_equal(model.report.state_residual, [0, 0])
 
 
 def test_C_is_a_least_squares_fit_where_the_lifting_lacks_a_state() -> None:
     data = one_step_pairs(step, 2, 1, 100)
-    theta = Expressions(lambda x: [x[0]], ["x0"])  # one state is held, the other is not
-    lifting = (theta + Fourier(1)).bind(data.states)
-    model = edmd(data, lifting)
+    theta = km.Expressions(lambda x: [x[0]], ["x0"])  # one state is held, the other is not
+    lifting = (theta + km.Fourier(1)).bind(data.states)
+    model = km.edmd(data, lifting)
     snapshots = data.snapshots()
     Z, X = lifting(snapshots.X), snapshots.X
     C = np.linalg.lstsq(Z, X, rcond=None)[0].T
@@ -90,7 +83,7 @@ def test_C_is_a_least_squares_fit_where_the_lifting_lacks_a_state() -> None:
 @given(st.floats(1e-6, 10), st.integers(0, 99))
 def test_ridge_solves_the_normal_equations_on_unit_norm_columns(ridge: float, seed: int) -> None:
     data = random_episodes(seed, [50, 20], 2, 1)
-    model = edmd(data, LIFTING, ridge=ridge)
+    model = km.edmd(data, LIFTING, ridge=ridge)
     D = brute_force(data, model.lifting)
     P, T = D[:, : model.nz + 1], D[:, model.nz + 1 :]
     size = np.linalg.norm(P, axis=0)
@@ -110,8 +103,8 @@ def test_units_of_the_states_mean_nothing() -> None:
         return np.sin(A @ x) + u[0] * np.array([0, 0.1, 0, 1])
 
     data = one_step_pairs(four, 4, 1, 400)
-    other = Episodes([Episode(X=e.X * units, U=e.U) for e in data], data.dt)
-    plain, scaled = edmd(data, LIFTING), edmd(other, LIFTING)
+    other = km.Episodes([km.Episode(X=e.X * units, U=e.U) for e in data], data.dt)
+    plain, scaled = km.edmd(data, LIFTING), km.edmd(other, LIFTING)
     U = rng.uniform(-0.2, 0.2, (20, 1))
     x0 = rng.uniform(-0.5, 0.5, 4)
     assert np.allclose(scaled.rollout(x0 * units, U) / units, plain.rollout(x0, U), rtol=0, atol=1e-10)
@@ -120,7 +113,7 @@ def test_units_of_the_states_mean_nothing() -> None:
 
 def test_ridge_zero_says_what_it_cuts() -> None:
     data = random_episodes(0, [200], 2, 1)
-    report = edmd(data, LIFTING).report
+    report = km.edmd(data, LIFTING).report
     cut = 200 * np.finfo(float).eps
     assert report.route == f"gram, singular values cut at {cut:.1e} of the largest on unit-norm columns"
     assert report.method == "edmd"
@@ -131,7 +124,7 @@ def test_ridge_zero_says_what_it_cuts() -> None:
 def test_a_truncated_fit_is_the_regression_on_the_leading_directions(rank: int, nu: int) -> None:
     data = random_episodes(0, [80, 40], 2, nu)
     lifting = LIFTING.bind(data.states)
-    model = edmd(data, LIFTING, rank=rank)
+    model = km.edmd(data, LIFTING, rank=rank)
     s = data.snapshots()
     Z, Z_next = lifting(s.X), lifting(s.X_next)
     U_r = np.linalg.svd(Z.T, full_matrices=False)[0][:, :rank]
@@ -161,7 +154,7 @@ def lifting_rows() -> np.ndarray:
 def test_exact_modes_are_eigenvectors_of_the_fitted_operator() -> None:
     # Tu et al. 2014, theorem 1: Φ = X′VΣ⁻¹W are eigenvectors of X′X⁺ on the rank-r data
     data = random_episodes(0, [120], 2, 0)
-    model = edmd(data, LIFTING, rank=3)
+    model = km.edmd(data, LIFTING, rank=3)
     lifting = LIFTING.bind(data.states)
     s = data.snapshots()
     Z, Z_next = lifting(s.X).T, lifting(s.X_next).T
@@ -176,16 +169,16 @@ def test_exact_modes_are_eigenvectors_of_the_fitted_operator() -> None:
 
 def test_full_rank_without_truncation_predicts_the_same() -> None:
     data = one_step_pairs(step, 2, 1, 200)
-    whole, reduced = edmd(data, LIFTING), edmd(data, LIFTING, rank=6)
+    whole, reduced = km.edmd(data, LIFTING), km.edmd(data, LIFTING, rank=6)
     U = np.random.default_rng(0).uniform(-1, 1, (20, 1))
     assert np.allclose(whole.rollout([0.3, -0.2], U), reduced.rollout([0.3, -0.2], U), atol=1e-10)
 
 
 def test_bad_settings_are_refused() -> None:
     data = random_episodes(0, [50], 2, 1)
-    with pytest.raises(DataError, match=r"ridge is -1; it must be 0 or above"):
-        edmd(data, LIFTING, ridge=-1)
-    with pytest.raises(DataError, match=r"rank is 7, but the lifting has 6 observables; pass 6 or less"):
-        edmd(data, LIFTING, rank=7)
-    with pytest.raises(DataError, match=r"rank is 0; it must be at least 1"):
-        edmd(data, LIFTING, rank=0)
+    with pytest.raises(km.errors.DataError, match=r"ridge is -1; it must be 0 or above"):
+        km.edmd(data, LIFTING, ridge=-1)
+    with pytest.raises(km.errors.DataError, match=r"rank is 7, but the lifting has 6 observables; pass 6 or less"):
+        km.edmd(data, LIFTING, rank=7)
+    with pytest.raises(km.errors.DataError, match=r"rank is 0; it must be at least 1"):
+        km.edmd(data, LIFTING, rank=0)

@@ -4,17 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, logm, solve_continuous_are
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import FitWarning
-from koopmpc.identify.dmd import dmd, dmdc
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
+import koopmpc as km
 from tests.identify.plants import one_step_pairs
 
-SQUARE = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
+SQUARE = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x0^2"])
 
 
 def held_input(Ac: np.ndarray, Bc: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -30,14 +23,14 @@ def slow_manifold(mu: float, lam: float, dt: float) -> tuple[np.ndarray, np.ndar
     return held_input(Ac, np.array([[0.0], [1], [0]]), dt)
 
 
-def data_of(A: np.ndarray, B: np.ndarray, count: int = 300) -> Episodes:
+def data_of(A: np.ndarray, B: np.ndarray, count: int = 300) -> km.Episodes:
     """One-step data of x⁺ = the first two rows of A [x; x₁²] + B u."""
     return one_step_pairs(lambda x, u: A[:2] @ [*x, x[0] ** 2] + B[:2] @ u, 2, 1, count)
 
 
 def test_brunton_2016_slow_manifold() -> None:
     A, B = slow_manifold(-0.1, 1.0, 0.01)
-    model = edmd(data_of(A, B), SQUARE)
+    model = km.edmd(data_of(A, B), SQUARE)
     assert np.allclose(model.A, A, rtol=0, atol=1e-12)
     assert np.allclose(model.B, B, rtol=0, atol=1e-12)
     # back in continuous time, its Riccati gain is the printed one
@@ -49,7 +42,7 @@ def test_brunton_2016_slow_manifold() -> None:
 
 def test_brunton_2016_long_predictions_stay_exact() -> None:
     A, B = slow_manifold(-0.1, 1.0, 0.01)
-    model = edmd(data_of(A, B), SQUARE)
+    model = km.edmd(data_of(A, B), SQUARE)
     U = np.random.default_rng(0).uniform(-1, 1, (200, 1))
     z = np.array([-2.0, 1.5, 4.0])
     expected = [z]
@@ -59,9 +52,9 @@ def test_brunton_2016_long_predictions_stay_exact() -> None:
     assert np.allclose(model.rollout([-2, 1.5], U), np.array(expected)[:, :2], rtol=1e-9)
 
 
-PROCTOR = Episodes(
+PROCTOR = km.Episodes(
     [
-        Episode(
+        km.Episode(
             X=np.array([[4, 2, 1, 0.5, 0.25], [7, 0.7, 0.07, 0.007, 0.0007]]).T,
             U=np.array([[-4, -2, -1, -0.5]]).T,
         )
@@ -71,18 +64,18 @@ PROCTOR = Episodes(
 
 
 def test_proctor_2016_without_inputs_the_plant_looks_stable() -> None:
-    assert np.allclose(dmd(PROCTOR).A, np.diag([0.5, 0.1]), rtol=0, atol=1e-14)
+    assert np.allclose(km.dmd(PROCTOR).A, np.diag([0.5, 0.1]), rtol=0, atol=1e-14)
 
 
 def test_proctor_2016_with_B_known_it_is_not() -> None:
-    model = dmdc(PROCTOR, B=[[1], [0]])
+    model = km.dmdc(PROCTOR, B=[[1], [0]])
     assert np.allclose(model.A, np.diag([1.5, 0.1]), rtol=0, atol=1e-14)
     assert np.array_equal(model.B, [[1], [0]])
 
 
 def test_proctor_2016_with_B_unknown_feedback_makes_them_inseparable() -> None:
-    with pytest.warns(FitWarning, match="feedback made A and B inseparable") as caught:
-        model = dmdc(PROCTOR)
+    with pytest.warns(km.FitWarning, match="feedback made A and B inseparable") as caught:
+        model = km.dmdc(PROCTOR)
     assert len(caught) == 1
     assert np.allclose(model.A, np.diag([0.25, 0.1]), rtol=0, atol=1e-14)
     assert np.allclose(model.B, [[-0.25], [0]], rtol=0, atol=1e-14)
@@ -93,7 +86,7 @@ def test_proctor_2016_with_B_unknown_feedback_makes_them_inseparable() -> None:
 def test_williams_2015_eigenvalues_are_the_products() -> None:
     A = np.array([[0.9, -0.04], [0, 0.8]])
     data = one_step_pairs(lambda x, u: A @ x, 2, 0, 200)
-    model = edmd(data, Constant() + State() + Monomials(4))
+    model = km.edmd(data, km.Constant() + km.State() + km.Monomials(4))
     products = sorted((0.9**i * 0.8**j for i in range(5) for j in range(5 - i)), reverse=True)
     assert len(products) == model.nz == 15
     assert np.abs(model.eigenvalues - products).max() < 1e-10
@@ -102,8 +95,8 @@ def test_williams_2015_eigenvalues_are_the_products() -> None:
 def test_safedmd_system() -> None:
     A, B = slow_manifold(-2.0, 1.0, 0.01)
     data = data_of(A, B)
-    lifting = State() + Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"])
-    model = edmd(data, lifting)
+    lifting = km.State() + km.Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"])
+    model = km.edmd(data, lifting)
     assert np.sort(model.eigenvalues.real) == pytest.approx([0.960789, 0.980199, 1.010050], abs=5e-7)
     assert np.abs(model.eigenvalues.imag).max() < 1e-12
     assert model.B[:, 0] == pytest.approx([0, 0.01005017, 0.01005017], abs=5e-9)
@@ -117,6 +110,6 @@ def test_proctor_kic_example(lam: float, mu: float, delta: float) -> None:
     def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.array([lam * x[0], mu * x[1] + (lam**2 - mu) * x[0] ** 2 + delta * u[0]])
 
-    model = edmd(one_step_pairs(step, 2, 1, 200), SQUARE)
+    model = km.edmd(one_step_pairs(step, 2, 1, 200), SQUARE)
     assert np.allclose(model.A, [[lam, 0, 0], [0, mu, lam**2 - mu], [0, 0, lam**2]], rtol=0, atol=1e-12)
     assert np.allclose(model.B, [[0], [delta], [0]], rtol=0, atol=1e-12)

@@ -10,24 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.chunks import chunks, lifted
-from koopmpc.identify.gather import moments
-from koopmpc.identify.moments import Moments
+import koopmpc as km
+from koopmpc.identify.moments.rows import chunks, lifted
 from koopmpc.identify.solve import solve
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
 from tests.identify.plants import brute_force, random_episodes
 
 LENGTHS = st.lists(st.integers(1, 9), min_size=1, max_size=8)
-LIFTING = Constant() + State() + Monomials(2)
+LIFTING = km.Constant() + km.State() + km.Monomials(2)
 
 
-def gram(m: Moments) -> np.ndarray:
+def gram(m: km.moments.Moments) -> np.ndarray:
     return m.sums if m.route == "gram" else m.sums.T @ m.sums
 
 
@@ -40,7 +32,7 @@ def test_moments_are_the_products_of_the_rows_of_each_episode(
     lengths: list[int], nx: int, nu: int, seed: int, route: str
 ) -> None:
     data = random_episodes(seed, lengths, nx, nu)
-    m = moments(data, LIFTING, route=route)
+    m = km.moments.second_moments(data, LIFTING, route=route)
     D = brute_force(data, LIFTING.bind(data.states))
     assert m.samples == sum(lengths) == len(D)
     assert close(gram(m), D.T @ D)
@@ -51,7 +43,7 @@ def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed
     data = random_episodes(seed, lengths, 2, 1)
     pieces = chunks(data, rows)
     assert all(sum(p.last - p.first for p in chunk) == rows for chunk in pieces[:-1])
-    lifting = State().bind(data.states)
+    lifting = km.State().bind(data.states)
     assert np.array_equal(
         np.vstack([lifted(data, lifting, chunk).pairs() for chunk in pieces]), brute_force(data, lifting)
     )
@@ -60,8 +52,8 @@ def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed
 @given(LENGTHS, st.integers(0, 999), st.sampled_from(["gram", "qr"]), st.randoms(use_true_random=False))
 def test_moments_add_in_any_order_and_grouping(lengths: list[int], seed: int, route: str, random) -> None:
     data = random_episodes(seed, lengths, 2, 1)
-    whole = moments(data, LIFTING, route=route)
-    parts = [moments(data[i : i + 1], LIFTING, route=route) for i in range(len(data))]
+    whole = km.moments.second_moments(data, LIFTING, route=route)
+    parts = [km.moments.second_moments(data[i : i + 1], LIFTING, route=route) for i in range(len(data))]
     random.shuffle(parts)
     left = reduce(add, parts)
     right = reduce(lambda a, b: b + a, reversed(parts))
@@ -75,12 +67,10 @@ def test_a_long_episode_in_many_chunks_equals_its_parts() -> None:
     data = random_episodes(0, [5000], 2, 1)
     X, U = data[0].X, data[0].U
     cuts = [0, 1, 1023, 1024, 3333, 5000]
-    parts = [
-        Episode(X=X[a : b + 1], U=U[a:b]) for a, b in pairwise(cuts)
-    ]  # neighbours share a state and no pair
+    parts = [km.Episode(X=X[a : b + 1], U=U[a:b]) for a, b in pairwise(cuts)]  # neighbours share a state and no pair
     for route in ("gram", "qr"):
-        a = moments(data, LIFTING, route=route)
-        b = moments(Episodes(parts, data.dt), LIFTING, route=route)
+        a = km.moments.second_moments(data, LIFTING, route=route)
+        b = km.moments.second_moments(km.Episodes(parts, data.dt), LIFTING, route=route)
         assert a.samples == b.samples == 5000
         assert close(gram(a), gram(b))
 
@@ -88,8 +78,8 @@ def test_a_long_episode_in_many_chunks_equals_its_parts() -> None:
 def test_a_huge_last_state_takes_no_digits_from_the_others() -> None:
     huge = np.append(np.ones(50), 1e9)[:, None]
     given = random_episodes(0, [50] * 20, 2, 1)
-    data = Episodes([Episode(X=e.X * huge, U=e.U) for e in given], given.dt)
-    m = moments(data, State(), route="gram")
+    data = km.Episodes([km.Episode(X=e.X * huge, U=e.U) for e in given], given.dt)
+    m = km.moments.second_moments(data, km.State(), route="gram")
     now = np.vstack([np.hstack([e.X[:-1], e.U]) for e in data])
     assert close(m.sums[np.ix_(m.regressors, m.regressors)], now.T @ now)
 
@@ -97,19 +87,19 @@ def test_a_huge_last_state_takes_no_digits_from_the_others() -> None:
 def test_weights_of_one_are_no_weights() -> None:
     data = random_episodes(1, [1, 30, 1, 1, 500, 2, 900, 1], 2, 1)
     for bilinear in (False, True):
-        plain = moments(data, LIFTING, route="gram", bilinear=bilinear)
-        weighted = moments(data, LIFTING, route="gram", bilinear=bilinear, weights=[1.0] * len(data))
+        plain = km.moments.second_moments(data, LIFTING, route="gram", bilinear=bilinear)
+        weighted = km.moments.second_moments(data, LIFTING, route="gram", bilinear=bilinear, weights=[1.0] * len(data))
         assert close(plain.sums, weighted.sums)
 
 
 def test_one_source_gives_the_same_bits_each_time() -> None:
     data = random_episodes(0, [700] * 5, 2, 1)
-    assert moments(data, LIFTING) == moments(data, LIFTING)
+    assert km.moments.second_moments(data, LIFTING) == km.moments.second_moments(data, LIFTING)
 
 
 def test_a_state_that_the_lifting_lacks_is_appended_to_the_rows() -> None:
     data = random_episodes(0, [20], 2, 1)
-    m = moments(data, Fourier(1), route="gram")
+    m = km.moments.second_moments(data, km.Fourier(1), route="gram")
     assert m.nz == 4
     assert m.full.names == (*m.lifting.names, *data.states)
     D = brute_force(data, m.full)
@@ -121,7 +111,7 @@ def test_a_state_that_the_lifting_lacks_is_appended_to_the_rows() -> None:
 @pytest.mark.parametrize("route", ["gram", "qr"])
 def test_rows_have_the_second_moments_of_the_columns_asked_for(route: str) -> None:
     data = random_episodes(3, [60, 40], 2, 1)
-    m = moments(data, LIFTING, route=route)
+    m = km.moments.second_moments(data, LIFTING, route=route)
     D = brute_force(data, m.full)
     rows = m.rows(m.regressors, m.targets)
     P, T = D[:, m.regressors], D[:, m.targets]
@@ -134,20 +124,20 @@ def test_rows_have_the_second_moments_of_the_columns_asked_for(route: str) -> No
     assert np.allclose(rows.residual(np.arange(T.shape[1]), K), size, rtol=1e-9, atol=1e-6)
 
 
-def nearly_parallel(gap: float, count: int = 400) -> tuple[Episodes, np.ndarray]:
+def nearly_parallel(gap: float, count: int = 400) -> tuple[km.Episodes, np.ndarray]:
     """Data whose states differ by `gap`: scaled cond(Z) ≈ 2/gap; and the A that made them."""
     rng = np.random.default_rng(1)
     A = np.array([[0.5, 0.25], [-0.75, 0.5]])
     starts = rng.uniform(-1, 1, count)
     X = np.column_stack([starts, starts + gap * rng.uniform(-1, 1, count)])
-    return Episodes([Episode(X=[x, A @ x]) for x in X], 0.1), A
+    return km.Episodes([km.Episode(X=[x, A @ x]) for x in X], 0.1), A
 
 
 def test_gram_loses_at_condition_1e10_and_qr_does_not() -> None:
     data, A = nearly_parallel(1e-10)
     error = {}
     for route in ("gram", "qr"):
-        m = moments(data, State(), route=route)
+        m = km.moments.second_moments(data, km.State(), route=route)
         K = solve(m.rows(m.regressors, m.targets)).K
         error[route] = np.abs(K.T - A).max()
     assert error["qr"] < 1e-4
@@ -157,7 +147,7 @@ def test_gram_loses_at_condition_1e10_and_qr_does_not() -> None:
 @pytest.mark.parametrize(("gap", "route"), [(1e-3, "gram"), (1e-5, "gram"), (1e-7, "qr"), (1e-10, "qr")])
 def test_the_condition_number_chooses_the_route(gap: float, route: str) -> None:
     data, _ = nearly_parallel(gap)
-    m = moments(data, State())
+    m = km.moments.second_moments(data, km.State())
     assert m.route == route
     D = brute_force(data, m.lifting)[:, :2]
     assert m.condition == pytest.approx(np.linalg.cond(D / np.linalg.norm(D, axis=0)), rel=1e-3)
@@ -169,10 +159,10 @@ def test_data_that_turn_out_worse_than_the_pilot_are_read_again() -> None:
     parts = list(data)
     wild = np.array(parts[2].X)
     wild[500] = [1e9, 1e9]
-    parts[2] = Episode(X=wild)
-    spoiled = Episodes(parts, data.dt)
-    assert moments(data, State()).route == "gram"
-    m = moments(spoiled, State())
+    parts[2] = km.Episode(X=wild)
+    spoiled = km.Episodes(parts, data.dt)
+    assert km.moments.second_moments(data, km.State()).route == "gram"
+    m = km.moments.second_moments(spoiled, km.State())
     assert m.condition > 1e6
     assert m.route == "qr"
 
@@ -180,32 +170,37 @@ def test_data_that_turn_out_worse_than_the_pilot_are_read_again() -> None:
 def test_columns_are_scaled_before_they_are_judged() -> None:
     data = random_episodes(0, [300], 3, 0)
     D = [1.0, 1e9, 1e-9]
-    scaled = Episodes([Episode(X=e.X * D) for e in data], data.dt)
-    assert moments(scaled, State()).route == "gram"
-    assert moments(scaled, State()).condition == pytest.approx(moments(data, State()).condition)
+    scaled = km.Episodes([km.Episode(X=e.X * D) for e in data], data.dt)
+    assert km.moments.second_moments(scaled, km.State()).route == "gram"
+    assert km.moments.second_moments(scaled, km.State()).condition == pytest.approx(
+        km.moments.second_moments(data, km.State()).condition
+    )
 
 
 def test_a_triangle_and_gram_sums_become_gram_sums_and_warn() -> None:
     data = random_episodes(0, [30, 30], 2, 1)
-    a, b = moments(data[:1], LIFTING, route="qr"), moments(data[1:], LIFTING, route="gram")
-    with pytest.warns(FitWarning, match="triangular factor was added to Gram sums.*half the digits"):
+    a, b = (
+        km.moments.second_moments(data[:1], LIFTING, route="qr"),
+        km.moments.second_moments(data[1:], LIFTING, route="gram"),
+    )
+    with pytest.warns(km.FitWarning, match="triangular factor was added to Gram sums.*half the digits"):
         total = a + b
     assert total.route == "gram"
-    assert close(total.sums, gram(moments(data, LIFTING, route="gram")))
+    assert close(total.sums, gram(km.moments.second_moments(data, LIFTING, route="gram")))
 
 
 def test_moments_of_other_liftings_do_not_add() -> None:
     data = random_episodes(0, [30], 2, 1)
-    a = moments(data, LIFTING)
-    with pytest.raises(DataError, match="moments differ in lifting, inputs or dt"):
-        _ = a + moments(data, State())
-    with pytest.raises(DataError, match="one plant in one lifting"):
+    a = km.moments.second_moments(data, LIFTING)
+    with pytest.raises(km.errors.DataError, match="moments differ in lifting, inputs or dt"):
+        _ = a + km.moments.second_moments(data, km.State())
+    with pytest.raises(km.errors.DataError, match="one plant in one lifting"):
         _ = a + replace(a, dt=0.2)
 
 
 @pytest.mark.parametrize("route", ["gram", "qr"])
 def test_an_observable_that_is_not_finite_is_named(route: str) -> None:
-    data = Episodes([Episode(X=[[1.0], [0.5], [0.0], [0.5]])], 0.1, ["x [m]"])
-    inverse = State() + Expressions(lambda x: [1 / x[0]], ["1/x"])
-    with pytest.raises(DataError, match="the observable '1/x' is NaN, infinite"):
-        moments(data, inverse, route=route)
+    data = km.Episodes([km.Episode(X=[[1.0], [0.5], [0.0], [0.5]])], 0.1, ["x [m]"])
+    inverse = km.State() + km.Expressions(lambda x: [1 / x[0]], ["1/x"])
+    with pytest.raises(km.errors.DataError, match="the observable '1/x' is NaN, infinite"):
+        km.moments.second_moments(data, inverse, route=route)

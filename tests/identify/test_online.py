@@ -5,31 +5,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.online import OnlineEDMD
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
+import koopmpc as km
 from tests.identify.plants import brute_force, random_episodes
 
-LIFTING = State() + Constant() + Monomials(2)
+LIFTING = km.State() + km.Constant() + km.Monomials(2)
 
 
-def weighted(data: Episodes, lifting, weights: np.ndarray) -> np.ndarray:
+def weighted(data: km.Episodes, lifting, weights: np.ndarray) -> np.ndarray:
     """Return [A B] of the least squares over all rows with these weights."""
     bound = lifting.bind(data.states)
     D = brute_force(data, bound)[-len(weights) :] * np.sqrt(weights)[:, None]
     return np.linalg.lstsq(D[:, : -bound.nz], D[:, -bound.nz :], rcond=None)[0].T
 
 
-def found(online: OnlineEDMD) -> np.ndarray:
+def found(online: km.OnlineEDMD) -> np.ndarray:
     model = online.predictor()
     return np.hstack([model.A, model.B])
 
@@ -38,11 +27,11 @@ def found(online: OnlineEDMD) -> np.ndarray:
 @settings(max_examples=8)
 def test_without_forgetting_it_is_the_batch_fit(seed: int, nu: int, lengths: list[int]) -> None:
     data = random_episodes(seed, [*lengths, 40], 2, nu)
-    online = OnlineEDMD.start(data[:-1], LIFTING)
+    online = km.OnlineEDMD.start(data[:-1], LIFTING)
     last = data[-1]
     for x, u, x_next in zip(last.X[:-1], last.U, last.X[1:], strict=True):
         online.update(x, u, x_next)
-    batch, model = edmd(data, LIFTING), online.predictor()
+    batch, model = km.edmd(data, LIFTING), online.predictor()
     assert online.pairs == sum(lengths) + 40
     assert np.allclose(model.A, batch.A, rtol=0, atol=1e-10)
     assert np.allclose(model.B, batch.B, rtol=0, atol=1e-10)
@@ -60,7 +49,7 @@ def test_without_forgetting_it_is_the_batch_fit(seed: int, nu: int, lengths: lis
 @settings(max_examples=6)
 def test_forgetting_is_the_weighted_fit(seed: int, forgetting: float) -> None:
     data = random_episodes(seed, [33, 64, 50], 2, 1)
-    online = OnlineEDMD.start(data, LIFTING, forgetting=forgetting)
+    online = km.OnlineEDMD.start(data, LIFTING, forgetting=forgetting)
     M = 147
     expected = weighted(data, LIFTING, forgetting ** np.arange(M - 1.0, -1.0, -1.0))
     assert np.allclose(found(online), expected, rtol=0, atol=1e-7)
@@ -70,7 +59,7 @@ def test_forgetting_is_the_weighted_fit(seed: int, forgetting: float) -> None:
 @settings(max_examples=8)
 def test_a_window_is_the_fit_of_its_pairs(seed: int, window: int, extra: int) -> None:
     data = random_episodes(seed, [window + extra, 37], 2, 1)
-    online = OnlineEDMD.start(data[:1], LIFTING, window=window)
+    online = km.OnlineEDMD.start(data[:1], LIFTING, window=window)
     for x, u, x_next in zip(data[1].X[:-1], data[1].U, data[1].X[1:], strict=True):
         online.update(x, u, x_next)
     expected = weighted(data, LIFTING, np.ones(window))
@@ -82,7 +71,7 @@ def test_a_window_is_the_fit_of_its_pairs(seed: int, window: int, extra: int) ->
 def test_every_moment_of_a_window(window: int) -> None:
     data = random_episodes(1, [230], 1, 0)
     X = data[0].X
-    online = OnlineEDMD(State() + Constant(), dt=0.1, states=data.states, window=window)
+    online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=data.states, window=window)
     for k in range(230):
         online.update(X[k], [], X[k + 1])
         R, count = online._memory.factor(online._rows[: online._waiting])
@@ -96,9 +85,9 @@ def test_every_moment_of_a_window(window: int) -> None:
 def test_states_that_the_lifting_lacks_and_measured_disturbances() -> None:
     rng = np.random.default_rng(0)
     X, U, W = rng.uniform(-1, 1, (91, 2)), rng.uniform(-1, 1, (90, 1)), rng.uniform(-1, 1, (90, 2))
-    data = Episodes([Episode(X=X, U=U, W=W)], 0.1)
-    for lifting in (Fourier(1), LIFTING):
-        model, batch = OnlineEDMD.start(data, lifting).predictor(), edmd(data, lifting)
+    data = km.Episodes([km.Episode(X=X, U=U, W=W)], 0.1)
+    for lifting in (km.Fourier(1), LIFTING):
+        model, batch = km.OnlineEDMD.start(data, lifting).predictor(), km.edmd(data, lifting)
         for name in ("A", "B", "C", "E"):
             assert np.allclose(getattr(model, name), getattr(batch, name), rtol=0, atol=1e-10), name
         assert model.disturbances == batch.disturbances
@@ -108,21 +97,21 @@ def test_states_that_the_lifting_lacks_and_measured_disturbances() -> None:
 def test_a_ridge_is_that_of_the_batch() -> None:
     data = random_episodes(0, [80], 2, 1)
     assert np.allclose(
-        OnlineEDMD.start(data, LIFTING, ridge=0.1).predictor().A,
-        edmd(data, LIFTING, ridge=0.1).A,
+        km.OnlineEDMD.start(data, LIFTING, ridge=0.1).predictor().A,
+        km.edmd(data, LIFTING, ridge=0.1).A,
         rtol=0,
         atol=1e-10,
     )
-    chosen = OnlineEDMD.start(data, LIFTING, ridge="gcv").predictor()
-    batch = edmd(data, LIFTING, ridge="gcv")
+    chosen = km.OnlineEDMD.start(data, LIFTING, ridge="gcv").predictor()
+    batch = km.edmd(data, LIFTING, ridge="gcv")
     assert np.allclose(chosen.A, batch.A, atol=1e-6)
     assert np.isclose(chosen.report.ridge, batch.report.ridge, rtol=1e-3)
 
 
 def test_points_of_a_delay_are_its_states() -> None:
     data = random_episodes(0, [40, 30], 2, 1)
-    online = OnlineEDMD.start(Delay(1)(data), State()).predictor()
-    assert np.allclose(online.A, edmd(data, State(), embedding=Delay(1)).A, atol=1e-9)
+    online = km.OnlineEDMD.start(km.Delay(1)(data), km.State()).predictor()
+    assert np.allclose(online.A, km.edmd(data, km.State(), embedding=km.Delay(1)).A, atol=1e-9)
 
 
 def moving(A: np.ndarray, B: np.ndarray, x: np.ndarray, U: np.ndarray) -> np.ndarray:
@@ -146,7 +135,7 @@ def test_a_plant_at_rest_unlearns_nothing_and_learns_again(forgetting: float) ->
     rng = np.random.default_rng(0)
     U = rng.uniform(-1, 1, (300, 1))
     X = moving(A_ONE, B_ONE, np.zeros(2), U)
-    online = OnlineEDMD(State() + Constant(), dt=0.1, states=("a", "b"), inputs=("u",), forgetting=forgetting)
+    online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=("a", "b"), inputs=("u",), forgetting=forgetting)
     online.update(X[:-1], U, X[1:])
     before = found(online)
     for _ in range(3):
@@ -165,7 +154,7 @@ def test_one_silent_input_does_not_keep_the_others_from_adapting() -> None:
     B = np.array([[0.5, 0.2], [1.0, -0.3]])
     U = rng.uniform(-1, 1, (400, 2))
     X = moving(A_ONE, B, np.zeros(2), U)
-    online = OnlineEDMD(State(), dt=0.1, states=("a", "b"), inputs=("u", "v"), forgetting=0.97)
+    online = km.OnlineEDMD(km.State(), dt=0.1, states=("a", "b"), inputs=("u", "v"), forgetting=0.97)
     online.update(X[:-1], U, X[1:])
     for _ in range(10):
         U = rng.uniform(-1, 1, (500, 2))
@@ -181,7 +170,7 @@ def test_one_silent_input_does_not_keep_the_others_from_adapting() -> None:
 def long_run(updates: int, block: int, forgetting: float, rest: int) -> float:
     """Feed a long noisy record with a long rest in its middle; return the largest error against the exact answer."""
     rng = np.random.default_rng(0)
-    online = OnlineEDMD(State() + Constant(), dt=0.1, states=("a", "b"), inputs=("u",), forgetting=forgetting)
+    online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=("a", "b"), inputs=("u",), forgetting=forgetting)
     tail = round(40 / (1 - forgetting)) if forgetting < 1 else updates + rest
     kept: list[np.ndarray] = []
     D = np.zeros((7, 7), dtype=np.longdouble)
@@ -206,9 +195,7 @@ def long_run(updates: int, block: int, forgetting: float, rest: int) -> float:
         x, done = X[-1], done + block
     if forgetting < 1:
         rows = np.vstack(kept)
-        rows *= np.longdouble(forgetting) ** (
-            (len(rows) - 1 - np.arange(len(rows))[:, None]) / np.longdouble(2)
-        )
+        rows *= np.longdouble(forgetting) ** ((len(rows) - 1 - np.arange(len(rows))[:, None]) / np.longdouble(2))
         D = rows.T @ rows
     G, H = D[:4, :4].astype(float), D[:4, 4:].astype(float)
     return float(np.abs(found(online) - np.linalg.solve(G, H).T).max())
@@ -238,7 +225,7 @@ def test_single_updates() -> None:
 @pytest.mark.slow
 def test_a_window_over_ten_million_updates() -> None:
     rng = np.random.default_rng(0)
-    online = OnlineEDMD(State() + Constant(), dt=0.1, states=("a", "b"), inputs=("u",), window=1234)
+    online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=("a", "b"), inputs=("u",), window=1234)
     for _ in range(1000):
         X, U = rng.standard_normal((10_000, 2)), rng.standard_normal((10_000, 1))
         online.update(X, U, X[::-1] * 1e3)
@@ -249,7 +236,7 @@ def test_a_window_over_ten_million_updates() -> None:
     assert error < 1e-9
 
 
-def run(mpc: KoopmanMPC, online: OnlineEDMD | None) -> float:
+def run(mpc: km.KoopmanMPC, online: km.OnlineEDMD | None) -> float:
     """Follow steps with a plant that stiffens and loses gain at step 60; return the settled squared error after."""
     x, loss = np.zeros(2), 0.0
     mpc.reset()
@@ -273,19 +260,19 @@ def test_a_controller_that_learns_tracks_a_changed_plant_better() -> None:
     A, B = np.array([[1, 0.1], [-0.1, 0.95]]), np.array([[0.0], [0.4]])
     U = rng.uniform(-2, 2, (200, 1))
     X = moving(A, B, np.zeros(2), U) + 1e-4 * rng.standard_normal((201, 2))
-    data = Episodes([Episode(X=X, U=U)], 0.1)
-    lifting = State() + Constant()
-    model = edmd(data, lifting)
-    cost, limits = Cost(Q=[10, 0.1], R=1e-3), Limits(u_min=-2, u_max=2)
-    frozen = run(KoopmanMPC(model, cost, limits, horizon=20), None)
-    online = OnlineEDMD.start(data, lifting, forgetting=0.97)
-    learning = run(KoopmanMPC(online.predictor(), cost, limits, horizon=20), online)
+    data = km.Episodes([km.Episode(X=X, U=U)], 0.1)
+    lifting = km.State() + km.Constant()
+    model = km.edmd(data, lifting)
+    cost, limits = km.Cost(Q=[10, 0.1], R=1e-3), km.Limits(u_min=-2, u_max=2)
+    frozen = run(km.KoopmanMPC(model, cost, limits, horizon=20), None)
+    online = km.OnlineEDMD.start(data, lifting, forgetting=0.97)
+    learning = run(km.KoopmanMPC(online.predictor(), cost, limits, horizon=20), online)
     assert learning < 0.1 * frozen
 
 
 def test_few_pairs_are_told_in_the_report_and_do_not_warn() -> None:
-    online = OnlineEDMD(LIFTING, dt=0.1, states=("a", "b"), inputs=("u",))
-    with pytest.raises(DataError, match="nothing was learned yet"):
+    online = km.OnlineEDMD(LIFTING, dt=0.1, states=("a", "b"), inputs=("u",))
+    with pytest.raises(km.errors.DataError, match="nothing was learned yet"):
         online.predictor()
     online.update([1, 2], [3], [4, 5])
     model = online.predictor()
@@ -294,33 +281,33 @@ def test_few_pairs_are_told_in_the_report_and_do_not_warn() -> None:
 
 
 def test_bad_arguments() -> None:
-    def make(**options: float) -> OnlineEDMD:
-        return OnlineEDMD(State(), dt=0.1, states=("a", "b"), inputs=("u",), **options)
+    def make(**options: float) -> km.OnlineEDMD:
+        return km.OnlineEDMD(km.State(), dt=0.1, states=("a", "b"), inputs=("u",), **options)
 
     for value in (0.0, -0.5):
-        with pytest.raises(DataError, match="forgetting is"):
+        with pytest.raises(km.errors.DataError, match="forgetting is"):
             make(forgetting=value)
-    with pytest.raises(DataError, match=r"forgetting is 1.1; it must lie in \(0, 1\]"):
+    with pytest.raises(km.errors.DataError, match=r"forgetting is 1.1; it must lie in \(0, 1\]"):
         make(forgetting=1.1)
-    with pytest.raises(DataError, match=r"window is 50 and forgetting 0\.9; choose one"):
+    with pytest.raises(km.errors.DataError, match=r"window is 50 and forgetting 0\.9; choose one"):
         make(forgetting=0.9, window=50)
-    with pytest.raises(DataError, match="window is 0"):
+    with pytest.raises(km.errors.DataError, match="window is 0"):
         make(window=0)
-    with pytest.raises(DataError, match="keep is 1"):
+    with pytest.raises(km.errors.DataError, match="keep is 1"):
         make(keep=1.0)
-    with pytest.raises(DataError, match="ridge is -1"):
+    with pytest.raises(km.errors.DataError, match="ridge is -1"):
         make(ridge=-1.0)
     online = make()
-    with pytest.raises(ShapeError, match=r"x has shape \(3,\), expected \(2,\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"x has shape \(3,\), expected \(2,\)"):
         online.update([1, 2, 3], [1], [1, 2])
-    with pytest.raises(ShapeError, match="u has shape"):
+    with pytest.raises(km.errors.ShapeError, match="u has shape"):
         online.update([1, 2], [1, 2], [1, 2])
-    with pytest.raises(ShapeError, match="x_next has shape"):
+    with pytest.raises(km.errors.ShapeError, match="x_next has shape"):
         online.update([[1, 2]], [[1]], [1, 2])
-    with pytest.raises(DataError, match="x_next holds 1 NaN"):
+    with pytest.raises(km.errors.DataError, match="x_next holds 1 NaN"):
         online.update([1, 2], [1], [1, np.nan])
-    with pytest.raises(DataError, match=r"observable 'a\^2' is not finite"):
-        OnlineEDMD(State() + Monomials(2), dt=0.1, states=("a",)).update([1e200], [], [1])
-    pushed = OnlineEDMD(State(), dt=0.1, states=("a",), disturbances=("w",))
-    with pytest.raises(DataError, match="1 measured disturbances; pass w"):
+    with pytest.raises(km.errors.DataError, match=r"observable 'a\^2' is not finite"):
+        km.OnlineEDMD(km.State() + km.Monomials(2), dt=0.1, states=("a",)).update([1e200], [], [1])
+    pushed = km.OnlineEDMD(km.State(), dt=0.1, states=("a",), disturbances=("w",))
+    with pytest.raises(km.errors.DataError, match="1 measured disturbances; pass w"):
         pushed.update([1], [], [1])

@@ -8,21 +8,11 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
-from koopmpc.plant.dynamics import Dynamics
-from koopmpc.plant.step_map import StepMap, discretize
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 
 
 @dataclass(frozen=True)
-class Motor(Dynamics):
+class Motor(km.Dynamics):
     """Scaled so that |u| ≤ 1; x₁ is the current, x₂ the speed."""
 
     states: ClassVar[tuple[str, ...]] = ("current", "speed")
@@ -35,21 +25,21 @@ class Motor(Dynamics):
 
 
 @pytest.fixture(scope="module")
-def plant() -> StepMap:
-    return discretize(Motor(), 0.01)
+def plant() -> km.StepMap:
+    return km.discretize(Motor(), 0.01)
 
 
 @pytest.fixture(scope="module")
-def model(plant: StepMap) -> LinearPredictor:
+def model(plant: km.StepMap) -> km.LinearPredictor:
     rng = np.random.default_rng(0)
     U = rng.uniform(-1, 1, (200, 1000, 1))
     X = plant.rollouts(rng.uniform(-1, 1, (200, 2)), U)
-    data = Episodes([Episode(X=x[:, 1:], U=u) for x, u in zip(X, U, strict=True)], 0.01, ("speed",), ("u",))
-    return edmd(data, State() + ThinPlate(rng.uniform(-1, 1, (100, 3))), embedding=Delay(1))
+    data = km.Episodes([km.Episode(X=x[:, 1:], U=u) for x, u in zip(X, U, strict=True)], 0.01, ("speed",), ("u",))
+    return km.edmd(data, km.State() + km.ThinPlate(rng.uniform(-1, 1, (100, 3))), embedding=km.Delay(1))
 
 
 def closed_loop(
-    plant: StepMap, mpc: KoopmanMPC, x: Float[np.ndarray, " nx"], reference: Float[np.ndarray, " T"]
+    plant: km.StepMap, mpc: km.KoopmanMPC, x: Float[np.ndarray, " nx"], reference: Float[np.ndarray, " T"]
 ) -> tuple[float, Float[np.ndarray, " T"], set[str]]:
     """Return Σ (y_k − r_k)² + 0.01 u_k² over k ≥ 1, y, and the statuses; the first input, 0, fills the delay."""
     mpc.reset(u_prev=[0.0])
@@ -67,9 +57,9 @@ def closed_loop(
 
 
 @pytest.mark.slow
-def test_the_step_costs_what_the_paper_s_data_give(plant: StepMap, model: LinearPredictor) -> None:
+def test_the_step_costs_what_the_paper_s_data_give(plant: km.StepMap, model: km.LinearPredictor) -> None:
     """3.31 to 3.34 over random data; 2.61 is what preview would give, and 3.77 the local linear model."""
-    mpc = KoopmanMPC(model, Cost(Q=[1.0], R=0.01, Q_N=[[1.0]]), Limits(u_min=-1, u_max=1), 100)
+    mpc = km.KoopmanMPC(model, km.Cost(Q=[1.0], R=0.01, Q_N=[[1.0]]), km.Limits(u_min=-1, u_max=1), 100)
     reference = np.where(np.arange(301) <= 150, -0.3, 0.3)
     total, speeds, statuses = closed_loop(plant, mpc, np.array([0.0, 0.6]), reference)
     assert 3.28 < total < 3.36
@@ -78,10 +68,10 @@ def test_the_step_costs_what_the_paper_s_data_give(plant: StepMap, model: Linear
 
 
 @pytest.mark.slow
-def test_the_cosine_stays_within_its_band(plant: StepMap, model: LinearPredictor) -> None:
+def test_the_cosine_stays_within_its_band(plant: km.StepMap, model: km.LinearPredictor) -> None:
     """Every step is solved, at a cost near 2.36, and y stays within ±0.41 where ±0.4 is the limit."""
-    limits = Limits(u_min=-1, u_max=1, x_min=[-0.4], x_max=[0.4])
-    mpc = KoopmanMPC(model, Cost(Q=[1.0], R=0.01, Q_N=[[1.0]]), limits, 100)
+    limits = km.Limits(u_min=-1, u_max=1, x_min=[-0.4], x_max=[0.4])
+    mpc = km.KoopmanMPC(model, km.Cost(Q=[1.0], R=0.01, Q_N=[[1.0]]), limits, 100)
     reference = 0.5 * np.cos(2 * np.pi * np.arange(301) / 300)
     total, speeds, statuses = closed_loop(plant, mpc, np.array([-0.1, 0.1]), reference)
     assert abs(total - 2.36) < 0.05

@@ -13,14 +13,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
 
-from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.regressor import KoopmanRegressor
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
+import koopmpc as km
 from tests.identify.plants import one_step_pairs
 
 
@@ -28,14 +21,12 @@ def step(x, u):
     return np.array([0.9 * x[0] + 0.1 * np.sin(x[1]), 0.8 * x[1] + 0.2 * x[0] ** 2 + 0.3 * u[0]])
 
 
-def rows_of(data: Episodes):
+def rows_of(data: km.Episodes):
     parts = data.snapshots()
     return np.hstack([parts.X, parts.U]), parts.X_next
 
 
-@pytest.mark.parametrize(
-    "estimator", [KoopmanRegressor(), KoopmanRegressor(degree=1, harmonics=1, alpha=1e-6)]
-)
+@pytest.mark.parametrize("estimator", [km.KoopmanRegressor(), km.KoopmanRegressor(degree=1, harmonics=1, alpha=1e-6)])
 def test_all_checks_of_scikit_learn_pass(estimator):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)  # of pandas and of array API, which are not here
@@ -48,8 +39,8 @@ def test_all_checks_of_scikit_learn_pass(estimator):
 def test_the_predictor_is_that_of_edmd_and_predicts_what_predict_does(alpha):
     data = one_step_pairs(step, 2, 1, 200)
     X, y = rows_of(data)
-    found = KoopmanRegressor(degree=3, alpha=alpha, n_inputs=1, dt=data.dt).fit(X, y)
-    other = edmd(data, State() + Constant() + Monomials(3), ridge=alpha)
+    found = km.KoopmanRegressor(degree=3, alpha=alpha, n_inputs=1, dt=data.dt).fit(X, y)
+    other = km.edmd(data, km.State() + km.Constant() + km.Monomials(3), ridge=alpha)
     model = found.predictor_
     assert pytest.approx(other.A, abs=1e-8) == model.A
     assert pytest.approx(other.B, abs=1e-8) == model.B
@@ -61,7 +52,7 @@ def test_the_predictor_is_that_of_edmd_and_predicts_what_predict_does(alpha):
 
 def test_a_target_that_is_no_next_state_gives_no_predictor():
     X, y = rows_of(one_step_pairs(step, 2, 1, 60))
-    found = KoopmanRegressor(n_inputs=1).fit(X, y)
+    found = km.KoopmanRegressor(n_inputs=1).fit(X, y)
     assert found.predict(X[:3]).shape == (3, 2)
     found.fit(X, y[:, 0])
     assert found.predict(X[:3]).shape == (3,)
@@ -70,7 +61,7 @@ def test_a_target_that_is_no_next_state_gives_no_predictor():
 
 def test_a_lifting_without_the_state_gets_a_fitted_C():
     X, y = rows_of(one_step_pairs(step, 2, 1, 200))
-    found = KoopmanRegressor(lifting=Constant() + Fourier(3), n_inputs=1).fit(X, y)
+    found = km.KoopmanRegressor(lifting=km.Constant() + km.Fourier(3), n_inputs=1).fit(X, y)
     Z = found.lifting_(X[:, :2])
     expected = np.linalg.lstsq(Z, X[:, :2], rcond=None)[0].T
     assert pytest.approx(expected, abs=1e-8) == found.predictor_.C
@@ -89,7 +80,7 @@ def test_a_grid_search_over_episodes_finds_the_dictionary_that_is_true():
             groups.append(episode)
             x = x_next
     search = GridSearchCV(
-        KoopmanRegressor(n_inputs=1),
+        km.KoopmanRegressor(n_inputs=1),
         {"degree": [1, 2], "harmonics": [0, 2], "alpha": [0.0, 1e-6, 1e-1]},
         cv=GroupKFold(4),
         error_score="raise",
@@ -102,9 +93,9 @@ def test_a_grid_search_over_episodes_finds_the_dictionary_that_is_true():
 
 def test_it_stands_at_the_end_of_a_pipeline_and_clones():
     X, y = rows_of(one_step_pairs(step, 2, 1, 100))
-    pipeline = make_pipeline(StandardScaler(), KoopmanRegressor(degree=3, n_inputs=1))
+    pipeline = make_pipeline(StandardScaler(), km.KoopmanRegressor(degree=3, n_inputs=1))
     assert clone(pipeline).fit(X, y).score(X, y) > 0.999
-    own = KoopmanRegressor(lifting=State() + Constant())
+    own = km.KoopmanRegressor(lifting=km.State() + km.Constant())
     assert clone(own).get_params()["lifting"] == own.lifting
 
 
@@ -119,8 +110,8 @@ def test_it_stands_at_the_end_of_a_pipeline_and_clones():
     ],
 )
 def test_a_mistake_is_told_at_fit(parameters, words):
-    with pytest.raises(DataError, match=words):
-        KoopmanRegressor(**parameters).fit(np.eye(3), np.eye(3))
+    with pytest.raises(km.errors.DataError, match=words):
+        km.KoopmanRegressor(**parameters).fit(np.eye(3), np.eye(3))
 
 
 def run(code):

@@ -6,20 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError
-from koopmpc.identify.bilinear import bilinear_edmd
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
+import koopmpc as km
 from tests.bare import shown
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 
-LIFTING = Constant() + State() + Monomials(3)
+LIFTING = km.Constant() + km.State() + km.Monomials(3)
 
 
-def noisy(seed: int, count: int, noise: float, nu: int = 1) -> Episodes:
+def noisy(seed: int, count: int, noise: float, nu: int = 1) -> km.Episodes:
     """Pairs of a smooth map, with noise on what follows."""
     rng = np.random.default_rng(seed)
     A = rng.uniform(-0.6, 0.6, (2, 2))
@@ -39,16 +33,14 @@ def score(P: np.ndarray, T: np.ndarray, ridge: float) -> float:
 
 @settings(max_examples=15)
 @given(st.integers(0, 999), st.integers(25, 80), st.floats(0.02, 1), st.integers(0, 2))
-def test_no_ridge_on_a_fine_grid_scores_better_on_the_full_data(
-    seed: int, count: int, noise: float, nu: int
-) -> None:
+def test_no_ridge_on_a_fine_grid_scores_better_on_the_full_data(seed: int, count: int, noise: float, nu: int) -> None:
     data = noisy(seed, count, noise, nu)
-    model = edmd(data, LIFTING, ridge="gcv")
+    model = km.edmd(data, LIFTING, ridge="gcv")
     D = brute_force(data, model.lifting)
     P, T = D[:, : model.nz + nu], D[:, model.nz + nu :]
     best = min(score(P, T, ridge) for ridge in np.geomspace(1e-8, 1e3, 45))
     assert score(P, T, model.report.ridge) <= best * (1 + 1e-7)
-    plain = edmd(data, LIFTING, ridge=model.report.ridge)
+    plain = km.edmd(data, LIFTING, ridge=model.report.ridge)
     assert np.array_equal(model.A, plain.A)
     assert "chosen by generalised cross-validation" in model.report.route
 
@@ -58,8 +50,8 @@ def test_on_an_orthogonal_design_it_is_leave_one_out() -> None:
     rng = np.random.default_rng(3)
     X = hadamard(32)[:, 1:9].astype(float)
     ahead = 0.6 * X + rng.standard_normal(X.shape)
-    data = Episodes([Episode(X=[x, y]) for x, y in zip(X, ahead, strict=True)], 0.1)
-    ridge = edmd(data, State(), ridge="gcv").report.ridge
+    data = km.Episodes([km.Episode(X=[x, y]) for x, y in zip(X, ahead, strict=True)], 0.1)
+    ridge = km.edmd(data, km.State(), ridge="gcv").report.ridge
     S = X / np.linalg.norm(X, axis=0)
     T = ahead / np.linalg.norm(ahead, axis=0)
 
@@ -81,8 +73,8 @@ def test_on_an_orthogonal_design_it_is_leave_one_out() -> None:
 def test_units_mean_nothing(seed: int) -> None:
     data = noisy(seed, 40, 0.3)
     units = np.array([1e4, 1e-3])
-    other = Episodes([Episode(X=e.X * units, U=e.U) for e in data], data.dt)
-    a, b = edmd(data, LIFTING, ridge="gcv"), edmd(other, LIFTING, ridge="gcv")
+    other = km.Episodes([km.Episode(X=e.X * units, U=e.U) for e in data], data.dt)
+    a, b = km.edmd(data, LIFTING, ridge="gcv"), km.edmd(other, LIFTING, ridge="gcv")
     assert b.report.ridge == pytest.approx(a.report.ridge, rel=1e-3)
 
 
@@ -103,7 +95,7 @@ def test_few_noisy_pairs_predict_better_with_it() -> None:
         )
         error = [
             np.linalg.norm(s.X_next - (m.lift(s.X) @ m.A.T + s.U @ m.B.T) @ m.C.T)
-            for m in (edmd(data, LIFTING), edmd(data, LIFTING, ridge="gcv"))
+            for m in (km.edmd(data, LIFTING), km.edmd(data, LIFTING, ridge="gcv"))
         ]
         won += error[1] < error[0]
     assert won >= 18
@@ -111,20 +103,20 @@ def test_few_noisy_pairs_predict_better_with_it() -> None:
 
 def test_exact_data_need_none() -> None:
     data = one_step_pairs(lambda x, u: np.array([0.9 * x[0] + u[0], 0.5 * x[1]]), 2, 1, 60)
-    model = edmd(data, State(), ridge="gcv")
+    model = km.edmd(data, km.State(), ridge="gcv")
     assert model.report.ridge == 0
     assert np.allclose(model.A, np.diag([0.9, 0.5]), rtol=0, atol=1e-13)
     assert "ridge 0, chosen by generalised cross-validation" in model.report.route
 
 
 def test_white_noise_is_shrunk_away() -> None:
-    data = Episodes([Episode(X=x) for x in np.random.default_rng(1).standard_normal((60, 2, 6))], 0.1)
-    assert edmd(data, State(), ridge="gcv").report.ridge > 1
+    data = km.Episodes([km.Episode(X=x) for x in np.random.default_rng(1).standard_normal((60, 2, 6))], 0.1)
+    assert km.edmd(data, km.State(), ridge="gcv").report.ridge > 1
 
 
 def test_of_fewer_pairs_than_coefficients_it_chooses_too() -> None:
     data = noisy(0, 8, 0.3)
-    model = edmd(data, LIFTING, ridge="gcv")
+    model = km.edmd(data, LIFTING, ridge="gcv")
     D = brute_force(data, model.lifting)
     P, T = D[:, :11], D[:, 11:]
     best = min(score(P, T, ridge) for ridge in np.geomspace(1e-6, 1e3, 37))
@@ -134,17 +126,17 @@ def test_of_fewer_pairs_than_coefficients_it_chooses_too() -> None:
 @given(st.integers(0, 99))
 def test_of_a_bilinear_model(seed: int) -> None:
     data = random_episodes(seed, [60], 2, 1)
-    model = bilinear_edmd(data, State(), ridge="gcv")
+    model = km.bilinear_edmd(data, km.State(), ridge="gcv")
     D = brute_force(data, model.lifting)
     P, T = np.hstack([D[:, :3], D[:, 2:3] * D[:, :2]]), D[:, 3:]
     best = min(score(P, T, ridge) for ridge in np.geomspace(1e-6, 1e3, 37))
     assert score(P, T, model.report.ridge) <= best * (1 + 1e-6)
-    plain = bilinear_edmd(data, State(), ridge=model.report.ridge)
+    plain = km.bilinear_edmd(data, km.State(), ridge=model.report.ridge)
     assert np.array_equal(model.N, plain.N)
 
 
 def test_another_word_is_refused() -> None:
     code = 'data = km.Episodes([km.Episode(X=np.eye(4))], 0.1)\nshow(lambda: km.edmd(data, km.State(), ridge="cv"))'
     assert shown(code) == ["DataError ridge is 'cv'; pass a number, or \"gcv\""]
-    with pytest.raises(DataError, match="ridge is -1; it must be 0 or above"):
-        edmd(noisy(0, 30, 0.1), State(), ridge=-1)
+    with pytest.raises(km.errors.DataError, match="ridge is -1; it must be 0 or above"):
+        km.edmd(noisy(0, 30, 0.1), km.State(), ridge=-1)

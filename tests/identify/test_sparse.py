@@ -6,28 +6,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.lasso import lasso
-from koopmpc.identify.sparse import sparse_edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.picked import Picked
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import load_predictor
+import koopmpc as km
+from koopmpc.identify.fits.sparse import lasso
+from koopmpc.lifting.reduced import Picked
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs
 
-SMALL = Constant() + State() + Monomials(4)
-DICTIONARY = SMALL + Fourier(2)  # collinear to 1e-13
+SMALL = km.Constant() + km.State() + km.Monomials(4)
+DICTIONARY = SMALL + km.Fourier(2)  # collinear to 1e-13
 
 
 CODE = "show(lambda: km.sparse_edmd(km.Episodes([km.Episode(X=np.eye(4))], 0.1), km.State(), over='rows'))"
 
 
-def slow_manifold(noise: float = 0.0, seed: int = 0, count: int = 600) -> Episodes:
+def slow_manifold(noise: float = 0.0, seed: int = 0, count: int = 600) -> km.Episodes:
     """x₀⁺ = 0.9 x₀, x₁⁺ = 0.5 x₁ + 0.3 x₀² + u: exact on x₀, x₁, x₀² (Brunton et al., PLoS ONE 11, 2016)."""
     rng = np.random.default_rng(seed)
 
@@ -74,7 +66,7 @@ def test_the_solver_equals_cvxpy(seed: int, grouped: bool, penalty: float, targe
 @pytest.mark.parametrize("over", ["observables", "entries"])
 def test_the_right_observables_are_found(noise: float, penalty: float, over: str) -> None:
     dictionary = SMALL if noise else DICTIONARY
-    model = sparse_edmd(slow_manifold(noise, seed=1), dictionary, penalty=penalty, over=over)
+    model = km.sparse_edmd(slow_manifold(noise, seed=1), dictionary, penalty=penalty, over=over)
     assert model.lifting.names == ("1", "x0", "x1", "x0^2")
     true = np.array([[1, 0, 0, 0], [0, 0.9, 0, 0], [0, 0, 0.5, 0.3], [noise**2, 0, 0, 0.81]])
     assert np.allclose(model.A, true, rtol=0, atol=1e-9 + noise / 2)
@@ -92,15 +84,15 @@ def test_the_right_observables_are_found(noise: float, penalty: float, over: str
 
 
 def test_entries_that_are_zero_are_exactly_zero() -> None:
-    model = sparse_edmd(slow_manifold(0.02, seed=1), SMALL, over="entries")
+    model = km.sparse_edmd(slow_manifold(0.02, seed=1), SMALL, over="entries")
     assert np.array_equal(model.A[1:] != 0, np.array([[0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]], bool))
     assert np.array_equal(model.B[:, 0] != 0, [False, False, True, False])
 
 
 def test_least_squares_on_what_is_kept() -> None:
     data = slow_manifold(0.02, seed=2)
-    model = sparse_edmd(data, SMALL)
-    refit = edmd(data, model.lifting)
+    model = km.sparse_edmd(data, SMALL)
+    refit = km.edmd(data, model.lifting)
     assert np.allclose(model.A, refit.A, rtol=0, atol=1e-9)
     assert np.allclose(model.B, refit.B, rtol=0, atol=1e-9)
     assert np.allclose(model.report.residual, refit.report.residual, rtol=1e-6)
@@ -108,41 +100,39 @@ def test_least_squares_on_what_is_kept() -> None:
 
 def test_a_large_penalty_leaves_the_states_and_a_small_one_everything() -> None:
     data = slow_manifold(0.02)
-    assert sparse_edmd(data, DICTIONARY, penalty=1e3).lifting.names == ("1", "x0", "x1")
-    every = State() + Monomials(2)
-    whole = sparse_edmd(data, every, penalty=1e-12, adaptive=False)
+    assert km.sparse_edmd(data, DICTIONARY, penalty=1e3).lifting.names == ("1", "x0", "x1")
+    every = km.State() + km.Monomials(2)
+    whole = km.sparse_edmd(data, every, penalty=1e-12, adaptive=False)
     assert whole.lifting.names == every.bind(data.states).names
-    assert np.allclose(whole.A, edmd(data, every).A, rtol=0, atol=1e-9)
+    assert np.allclose(whole.A, km.edmd(data, every).A, rtol=0, atol=1e-9)
 
 
 def test_units_mean_nothing() -> None:
     data = slow_manifold(0.02, seed=3)
     units = np.array([1e-4, 1e4])
-    scaled = Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
-    a, b = (sparse_edmd(d, SMALL).lifting.names for d in (data, scaled))
+    scaled = km.Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
+    a, b = (km.sparse_edmd(d, SMALL).lifting.names for d in (data, scaled))
     assert a == b
 
 
 def test_the_chosen_lifting_is_data_and_the_same_function_twice(tmp_path) -> None:
-    model = sparse_edmd(slow_manifold(), DICTIONARY, penalty=1e-6)
+    model = km.sparse_edmd(slow_manifold(), DICTIONARY, penalty=1e-6)
     model.save(tmp_path / "model.npz")
-    again = load_predictor(tmp_path / "model.npz")
+    again = km.load_model(tmp_path / "model.npz")
     assert again == model
     X = np.random.default_rng(0).uniform(-1, 1, (7, 2))
     whole = DICTIONARY.bind(("x0", "x1"))
     places = [whole.names.index(name) for name in model.lifting.names]
     assert np.allclose(again.lift(X), whole(X)[:, places], rtol=0, atol=1e-15)
-    assert np.allclose(
-        model.step_map()(X[0], [0.3]), [0.9 * X[0, 0], 0.5 * X[0, 1] + 0.3 * X[0, 0] ** 2 + 0.3]
-    )
+    assert np.allclose(model.step_map()(X[0], [0.3]), [0.9 * X[0, 0], 0.5 * X[0, 1] + 0.3 * X[0, 0] ** 2 + 0.3])
 
 
 def test_bad_arguments() -> None:
     assert shown(CODE) == ['DataError over is \'rows\'; pass "observables" or "entries"']
     data = slow_manifold(count=30)
-    with pytest.raises(DataError, match="penalty is 0"):
-        sparse_edmd(data, DICTIONARY, penalty=0)
-    with pytest.raises(DataError, match="the lifting lacks the state 'x0'"):
-        sparse_edmd(data, Monomials(2), penalty=1)
-    with pytest.raises(DataError, match="which holds 9"):
-        Picked(State(), (9,)).bind(("a", "b"))
+    with pytest.raises(km.errors.DataError, match="penalty is 0"):
+        km.sparse_edmd(data, DICTIONARY, penalty=0)
+    with pytest.raises(km.errors.DataError, match="the lifting lacks the state 'x0'"):
+        km.sparse_edmd(data, km.Monomials(2), penalty=1)
+    with pytest.raises(km.errors.DataError, match="which holds 9"):
+        Picked(km.State(), (9,)).bind(("a", "b"))

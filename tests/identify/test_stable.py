@@ -6,40 +6,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.constrained import constrained_edmd
-from koopmpc.identify.contraction import Misfit, clipped, nearest, radius_of
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.gather import moments
-from koopmpc.identify.lyapunov import lyapunov_fit
-from koopmpc.identify.prior import Prior
-from koopmpc.identify.sparse import sparse_edmd
-from koopmpc.identify.stable import stable_edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
+import koopmpc as km
+from koopmpc.identify.fits.contraction import Misfit, clipped, nearest, radius_of
+from koopmpc.identify.fits.stable import lyapunov_fit
 from tests.identify.plants import brute_force, random_episodes
 
 
-def runs(seed: int, nx: int, nu: int, *, radius: float, noise: float, offset: float = 0.0) -> Episodes:
+def runs(seed: int, nx: int, nu: int, *, radius: float, noise: float, offset: float = 0.0) -> km.Episodes:
     """Noisy measurements of a linear plant with this spectral radius."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((nx, nx))
     A *= radius / radius_of(A)
     B = rng.standard_normal((nx, nu))
-    parts: list[Episode] = []
+    parts: list[km.Episode] = []
     for _ in range(2 + nx // 10):
         X, U = [rng.standard_normal(nx)], rng.uniform(-1, 1, (15, nu))
         for u in U:
             X.append(A @ X[-1] + B @ u + offset)
-        parts.append(Episode(X=np.array(X) + noise * rng.standard_normal((16, nx)), U=U))
-    return Episodes(parts, 0.1)
+        parts.append(km.Episode(X=np.array(X) + noise * rng.standard_normal((16, nx)), U=U))
+    return km.Episodes(parts, 0.1)
 
 
-def objective(data: Episodes, model) -> float:
+def objective(data: km.Episodes, model) -> float:
     """Return Σᵢ ‖ψᵢ(x⁺) − …‖² / ‖ψᵢ(x)‖² over all rows."""
     D = brute_force(data, model.lifting)
     nz = model.nz
@@ -47,7 +35,7 @@ def objective(data: Episodes, model) -> float:
     return float(np.sum(np.sum(error**2, axis=0) / np.sum(D[:, :nz] ** 2, axis=0)))
 
 
-def refitted(data: Episodes, model, A: np.ndarray) -> float:
+def refitted(data: km.Episodes, model, A: np.ndarray) -> float:
     """Return the objective of another A with the best B."""
     D = brute_force(data, model.lifting)
     nz = model.nz
@@ -62,7 +50,7 @@ def refitted(data: Episodes, model, A: np.ndarray) -> float:
 @settings(max_examples=10)
 def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radius: float) -> None:
     data = runs(seed, nx, nu, radius=1.0, noise=0.3)
-    plain, model = edmd(data, State()), stable_edmd(data, State(), radius=radius)
+    plain, model = km.edmd(data, km.State()), km.stable_edmd(data, km.State(), radius=radius)
     assert radius_of(model.A) <= radius + 1e-9
     if radius_of(plain.A) <= radius:
         assert np.allclose(model.A, plain.A, rtol=0, atol=1e-12)
@@ -73,10 +61,7 @@ def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radi
     assert own == pytest.approx(refitted(data, model, model.A), rel=1e-9)  # B is the best for this A
     others = (clipped(plain.A, radius), plain.A * radius / radius_of(plain.A))
     assert own <= min(refitted(data, model, A) for A in others) * (1 + 1e-9)
-    assert (
-        f"spectral radius {radius_of(plain.A):.6g} before, {radius_of(model.A):.6g} after"
-        in model.report.changes
-    )
+    assert f"spectral radius {radius_of(plain.A):.6g} before, {radius_of(model.A):.6g} after" in model.report.changes
     losses = zip(data.states, plain.report.residual, model.report.residual, strict=True)
     said = tuple(f"one-step residual of {n!r}: {b:.3g} before, {a:.3g} after" for n, b, a in losses)
     assert model.report.changes[2:] == said
@@ -84,7 +69,7 @@ def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radi
 
 def test_one_observable_moves_to_the_circle() -> None:
     x = 1.2 ** np.arange(10)[:, None]
-    model = stable_edmd(Episodes([Episode(X=x)], 0.1), State(), radius=0.9)
+    model = km.stable_edmd(km.Episodes([km.Episode(X=x)], 0.1), km.State(), radius=0.9)
     assert np.allclose(model.A, 0.9, rtol=0, atol=1e-9)
 
 
@@ -130,8 +115,8 @@ def test_the_matrix_inequality_is_solved_to_its_optimum() -> None:
 
 def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
     data = runs(4, 3, 1, radius=1.0, noise=0.3, offset=0.5)
-    lifting = State() + Constant() + Monomials(2)
-    model = stable_edmd(data, lifting, radius=0.8)
+    lifting = km.State() + km.Constant() + km.Monomials(2)
+    model = km.stable_edmd(data, lifting, radius=0.8)
     row = model.lifting.names.index("1")
     assert np.array_equal(model.A[row], np.eye(model.nz)[row])
     assert np.array_equal(model.B[row], [0.0])
@@ -142,37 +127,37 @@ def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
 
 def test_a_ridge_is_kept() -> None:
     data = runs(4, 3, 1, radius=1.0, noise=0.3)
-    plain = stable_edmd(data, State(), ridge=0.1, radius=5.0)
-    assert np.allclose(plain.A, edmd(data, State(), ridge=0.1).A, atol=1e-12)
-    model = stable_edmd(data, State(), ridge=0.1, radius=0.5)
+    plain = km.stable_edmd(data, km.State(), ridge=0.1, radius=5.0)
+    assert np.allclose(plain.A, km.edmd(data, km.State(), ridge=0.1).A, atol=1e-12)
+    model = km.stable_edmd(data, km.State(), ridge=0.1, radius=0.5)
     assert radius_of(model.A) <= 0.5 + 1e-9
     assert model.report.ridge == 0.1
 
 
 def test_the_ridge_of_cross_validation_is_that_of_the_plain_fit() -> None:
     data = runs(1, 3, 1, radius=1.05, noise=0.3)
-    plain = edmd(data, State(), ridge="gcv")
+    plain = km.edmd(data, km.State(), ridge="gcv")
     assert plain.report.ridge > 0
-    free = Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]])
+    free = km.Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]])
     for model, same in (
-        (stable_edmd(data, State(), ridge="gcv", radius=5.0), stable_edmd(data, State(), radius=5.0)),
-        (stable_edmd(data, State(), ridge="gcv", radius=0.5), stable_edmd(data, State(), radius=0.5)),
-        (constrained_edmd(data, State(), prior=Prior(), ridge="gcv"), edmd(data, State())),
-        (constrained_edmd(data, State(), prior=free, ridge="gcv"), edmd(data, State())),
+        (km.stable_edmd(data, km.State(), ridge="gcv", radius=5.0), km.stable_edmd(data, km.State(), radius=5.0)),
+        (km.stable_edmd(data, km.State(), ridge="gcv", radius=0.5), km.stable_edmd(data, km.State(), radius=0.5)),
+        (km.constrained_edmd(data, km.State(), prior=km.Prior(), ridge="gcv"), km.edmd(data, km.State())),
+        (km.constrained_edmd(data, km.State(), prior=free, ridge="gcv"), km.edmd(data, km.State())),
     ):
         assert model.report.ridge == plain.report.ridge
         assert "chosen by generalised cross-validation" in model.report.route
         assert not np.array_equal(model.A, same.A)
-    fixed = constrained_edmd(data, State(), prior=free, ridge=plain.report.ridge)
-    assert np.array_equal(fixed.A, constrained_edmd(data, State(), prior=free, ridge="gcv").A)
-    assert np.allclose(constrained_edmd(data, State(), prior=Prior(), ridge="gcv").A, plain.A, atol=1e-12)
+    fixed = km.constrained_edmd(data, km.State(), prior=free, ridge=plain.report.ridge)
+    assert np.array_equal(fixed.A, km.constrained_edmd(data, km.State(), prior=free, ridge="gcv").A)
+    assert np.allclose(km.constrained_edmd(data, km.State(), prior=km.Prior(), ridge="gcv").A, plain.A, atol=1e-12)
 
 
 def test_more_observables_than_the_inequality_takes() -> None:
     data = runs(0, 24, 2, radius=1.02, noise=0.3)
-    model = stable_edmd(data, State(), radius=0.9)
+    model = km.stable_edmd(data, km.State(), radius=0.9)
     assert radius_of(model.A) <= 0.9 + 1e-9
-    plain = edmd(data, State())
+    plain = km.edmd(data, km.State())
     assert objective(data, model) <= refitted(data, model, clipped(plain.A, 0.9))
 
 
@@ -184,13 +169,13 @@ def test_nearly_dependent_observables_stay_as_close_as_a_ridge_would_have_them()
         for (u,) in U:
             v = X[-1][1] + 0.05 * (u - 9.81 * np.sin(X[-1][0]))
             X.append(np.array([X[-1][0] + 0.05 * v, v]))
-        episodes.append(Episode(X=np.array(X), U=U))
-    data = Episodes(episodes, 0.05)
-    lifting = State() + ThinPlate(generator.uniform(-2, 2, (30, 2)))
+        episodes.append(km.Episode(X=np.array(X), U=U))
+    data = km.Episodes(episodes, 0.05)
+    lifting = km.State() + km.ThinPlate(generator.uniform(-2, 2, (30, 2)))
     plain, model, ridged = (
-        edmd(data, lifting),
-        stable_edmd(data, lifting),
-        stable_edmd(data, lifting, ridge=1e-10),
+        km.edmd(data, lifting),
+        km.stable_edmd(data, lifting),
+        km.stable_edmd(data, lifting, ridge=1e-10),
     )
     assert radius_of(plain.A) > 1 >= radius_of(model.A) - 1e-9
     least, with_ridge = objective(data, plain), objective(data, ridged)
@@ -199,11 +184,9 @@ def test_nearly_dependent_observables_stay_as_close_as_a_ridge_would_have_them()
 
 def test_a_stable_model_that_keeps_little_of_the_plant_says_so() -> None:
     X = np.array([[1.5**k, 0.5**k] for k in range(9)])
-    data = Episodes([Episode(X=X, U=np.zeros((8, 0)))], 0.1)
-    with pytest.warns(
-        FitWarning, match=r"stability costs much: the stable model misses \d+% .* larger radius"
-    ):
-        stable_edmd(data, State(), radius=0.5)
+    data = km.Episodes([km.Episode(X=X, U=np.zeros((8, 0)))], 0.1)
+    with pytest.warns(km.FitWarning, match=r"stability costs much: the stable model misses \d+% .* larger radius"):
+        km.stable_edmd(data, km.State(), radius=0.5)
 
 
 @pytest.mark.slow
@@ -211,10 +194,10 @@ def test_two_hundred_observables() -> None:
     import time
 
     data = runs(0, 200, 2, radius=1.0, noise=0.5)
-    total = moments(data, State())
-    plain = edmd(data, State())
+    total = km.moments.second_moments(data, km.State())
+    plain = km.edmd(data, km.State())
     start = time.perf_counter()
-    model = stable_edmd(data, State(), radius=0.95)
+    model = km.stable_edmd(data, km.State(), radius=0.95)
     seconds = time.perf_counter() - start
     assert radius_of(model.A) <= 0.95 + 1e-9
     clip = refitted(data, model, clipped(plain.A, 0.95))
@@ -225,13 +208,13 @@ def test_two_hundred_observables() -> None:
 
 
 def test_delays_weights_and_the_past_in_all_three_fits() -> None:
-    data, lifting = random_episodes(3, [60, 40], 2, 1), State() + Constant()
-    how = {"embedding": Delay(1), "weights": lambda episode: len(episode) / 50}
-    plain = edmd(data, lifting, **how)
+    data, lifting = random_episodes(3, [60, 40], 2, 1), km.State() + km.Constant()
+    how = {"embedding": km.Delay(1), "weights": lambda episode: len(episode) / 50}
+    plain = km.edmd(data, lifting, **how)
     for model in (
-        stable_edmd(data, lifting, radius=5.0, **how),
-        constrained_edmd(data, lifting, prior=Prior(), **how),
-        sparse_edmd(data, lifting, penalty=1e-12, adaptive=False, **how),
+        km.stable_edmd(data, lifting, radius=5.0, **how),
+        km.constrained_edmd(data, lifting, prior=km.Prior(), **how),
+        km.sparse_edmd(data, lifting, penalty=1e-12, adaptive=False, **how),
     ):
         assert np.allclose(model.A, plain.A, rtol=0, atol=1e-9)
         assert np.allclose(model.B, plain.B, rtol=0, atol=1e-9)
@@ -243,9 +226,9 @@ def test_delays_weights_and_the_past_in_all_three_fits() -> None:
 def test_bad_arguments() -> None:
     data = random_episodes(0, [30], 2, 1)
     for radius in (0.0, -1.0):
-        with pytest.raises(DataError, match="radius is"):
-            stable_edmd(data, State(), radius=radius)
-    with pytest.raises(DataError, match="radius holds 1 NaN"):
-        stable_edmd(data, State(), radius=np.nan)
-    with pytest.raises(DataError, match="ridge is -1"):
-        stable_edmd(data, State(), ridge=-1)
+        with pytest.raises(km.errors.DataError, match="radius is"):
+            km.stable_edmd(data, km.State(), radius=radius)
+    with pytest.raises(km.errors.DataError, match="radius holds 1 NaN"):
+        km.stable_edmd(data, km.State(), radius=np.nan)
+    with pytest.raises(km.errors.DataError, match="ridge is -1"):
+        km.stable_edmd(data, km.State(), ridge=-1)

@@ -6,16 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.errors import ShapeError
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.projected import Projected
-from koopmpc.lifting.state import State
+import koopmpc as km
+from koopmpc.lifting.reduced import Projected
 from koopmpc.values import from_data, to_data
 
 STATES = ("a [m]", "b [m/s]")
-INNER = Constant() + State() + Monomials(3)
+INNER = km.Constant() + km.State() + km.Monomials(3)
 
 
 @given(st.integers(1, 10), st.integers(0, 999))
@@ -33,7 +29,7 @@ def test_it_is_the_product_with_the_basis_on_arrays_and_symbols(r: int, seed: in
 
 
 def test_it_is_saved_as_data_with_a_traced_function_inside() -> None:
-    inner = State() + Expressions(lambda x: [ca.sin(x[0]) * x[1]], ["swing"])
+    inner = km.State() + km.Expressions(lambda x: [ca.sin(x[0]) * x[1]], ["swing"])
     lifting = Projected(inner, np.arange(6.0).reshape(3, 2)).bind(STATES)
     arrays: dict[str, np.ndarray] = {}
     again = from_data(to_data(lifting, arrays), arrays)
@@ -42,5 +38,5 @@ def test_it_is_saved_as_data_with_a_traced_function_inside() -> None:
 
 
 def test_a_basis_of_another_height_is_refused() -> None:
-    with pytest.raises(ShapeError, match="basis has 4 rows, the lifting returns 2 observables"):
-        Projected(State(), np.ones((4, 2))).bind(STATES)
+    with pytest.raises(km.errors.ShapeError, match="basis has 4 rows, the lifting returns 2 observables"):
+        Projected(km.State(), np.ones((4, 2))).bind(STATES)

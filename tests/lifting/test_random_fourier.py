@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError, ShapeError
+import koopmpc as km
 from koopmpc.lifting.buffered import buffered
-from koopmpc.lifting.random_fourier import RandomFourier
 from koopmpc.values import from_data, to_data
 from tests.lifting.families import NAMES
 
@@ -14,16 +13,14 @@ def _error(count: int, seed: int) -> float:
     """Return the root-mean-square error of ψ(x)·ψ(y) against the kernel over pairs of points."""
     rng = np.random.default_rng(99)
     X, Y, width = rng.normal(size=(60, 2)), rng.normal(size=(60, 2)), 1.3
-    lifting = RandomFourier(count, width, seed).bind(NAMES[:2])
+    lifting = km.RandomFourier(count, width, seed).bind(NAMES[:2])
     kernel = np.exp(-((X - Y) ** 2).sum(axis=1) / (2 * width**2))
     return float(np.sqrt(np.mean(((lifting(X) * lifting(Y)).sum(axis=1) - kernel) ** 2)))
 
 
 def test_inner_products_approach_the_gaussian_kernel_at_rate_one_over_the_root_of_count() -> None:
     counts = np.array([50, 200, 800, 3200])
-    errors = np.array(
-        [np.sqrt(np.mean([_error(n, seed) ** 2 for seed in range(12)])) for n in counts.tolist()]
-    )
+    errors = np.array([np.sqrt(np.mean([_error(n, seed) ** 2 for seed in range(12)])) for n in counts.tolist()])
     slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert -0.6 < slope < -0.4
     assert (errors * np.sqrt(counts) < 1.0).all()  # the variance of a feature's product is at most 1
@@ -31,25 +28,25 @@ def test_inner_products_approach_the_gaussian_kernel_at_rate_one_over_the_root_o
 
 def test_on_average_over_seeds_the_inner_product_is_the_kernel() -> None:
     x, y = np.array([0.4, -0.3]), np.array([-0.5, 0.6])
-    drawn = [RandomFourier(50, 0.8, seed).bind(NAMES[:2]) for seed in range(400)]
+    drawn = [km.RandomFourier(50, 0.8, seed).bind(NAMES[:2]) for seed in range(400)]
     products = np.array([lifting(x) @ lifting(y) for lifting in drawn])
     kernel = np.exp(-np.sum((x - y) ** 2) / (2 * 0.8**2))
     assert abs(products.mean() - kernel) < 4 * products.std() / np.sqrt(len(products))
 
 
 def test_one_seed_is_one_lifting_and_a_generator_gives_one() -> None:
-    a, b = RandomFourier(5, 1.0, 3).bind(NAMES), RandomFourier(5, 1.0, 3).bind(NAMES)
+    a, b = km.RandomFourier(5, 1.0, 3).bind(NAMES), km.RandomFourier(5, 1.0, 3).bind(NAMES)
     assert a == b
-    assert RandomFourier(5, 1.0, 4).bind(NAMES) != a
-    assert RandomFourier(5, 1.0, np.random.default_rng(1)) == RandomFourier(5, 1.0, np.random.default_rng(1))
-    assert (a + RandomFourier(5, 1.0, 4).bind(NAMES) + b).nz == 10
+    assert km.RandomFourier(5, 1.0, 4).bind(NAMES) != a
+    assert km.RandomFourier(5, 1.0, np.random.default_rng(1)) == km.RandomFourier(5, 1.0, np.random.default_rng(1))
+    assert (a + km.RandomFourier(5, 1.0, 4).bind(NAMES) + b).nz == 10
 
 
 def test_a_bound_copy_keeps_what_it_drew_in_a_file_too() -> None:
-    lifting = RandomFourier(4, 0.5, 7).bind(NAMES[:2])
+    lifting = km.RandomFourier(4, 0.5, 7).bind(NAMES[:2])
     assert lifting.bind(("a", "b")).frequencies is not None
     assert np.array_equal(lifting.bind(("a", "b")).frequencies, lifting.frequencies)
-    assert lifting.bind(NAMES) == RandomFourier(4, 0.5, 7).bind(NAMES)
+    assert lifting.bind(NAMES) == km.RandomFourier(4, 0.5, 7).bind(NAMES)
     arrays: dict[str, np.ndarray] = {}
     again = from_data(to_data(lifting, arrays), arrays)
     assert again == lifting
@@ -59,13 +56,13 @@ def test_a_bound_copy_keeps_what_it_drew_in_a_file_too() -> None:
 
 
 def test_messages() -> None:
-    with pytest.raises(DataError, match="count is 0; it must be at least 1"):
-        RandomFourier(0, 1.0)
-    with pytest.raises(DataError, match="width is 0; it must be above zero"):
-        RandomFourier(3, 0.0)
-    with pytest.raises(DataError, match="frequencies and phases belong together"):
-        RandomFourier(3, 1.0, phases=[0, 0, 0])
-    with pytest.raises(ShapeError, match="frequencies has 1 columns and there are 3 states"):
-        RandomFourier(1, 1.0, frequencies=[[1.0]], phases=[0.0], bound=NAMES)
-    with pytest.raises(DataError, match=r"RandomFourier does not know its states yet"):
-        RandomFourier(1, 1.0)([1.0])
+    with pytest.raises(km.errors.DataError, match="count is 0; it must be at least 1"):
+        km.RandomFourier(0, 1.0)
+    with pytest.raises(km.errors.DataError, match="width is 0; it must be above zero"):
+        km.RandomFourier(3, 0.0)
+    with pytest.raises(km.errors.DataError, match="frequencies and phases belong together"):
+        km.RandomFourier(3, 1.0, phases=[0, 0, 0])
+    with pytest.raises(km.errors.ShapeError, match="frequencies has 1 columns and there are 3 states"):
+        km.RandomFourier(1, 1.0, frequencies=[[1.0]], phases=[0.0], bound=NAMES)
+    with pytest.raises(km.errors.DataError, match=r"RandomFourier does not know its states yet"):
+        km.RandomFourier(1, 1.0)([1.0])

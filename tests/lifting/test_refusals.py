@@ -7,22 +7,15 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError, KoopmpcError, LogError, ShapeError
-from koopmpc.lifting.base import Lifting, Traced
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.gaussian import Gaussian
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
+import koopmpc as km
+from koopmpc.lifting.base import Traced
 from koopmpc.values import from_data, to_data
 from tests.bare import shown
 from tests.lifting.families import NAMES
 
 
 @dataclass(frozen=True, eq=False)
-class Drag(Lifting):
+class Drag(km.Lifting):
     """A user's own family: |ω| ω and its multiple."""
 
     gain: float = 2.0
@@ -36,7 +29,7 @@ class Drag(Lifting):
 
 
 @dataclass(frozen=True, eq=False)
-class Error(Lifting):
+class Error(km.Lifting):
     """A user's own family with an operation that no graph holds."""
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
@@ -48,7 +41,7 @@ class Error(Lifting):
 
 def test_a_family_of_ones_own_needs_two_methods_and_is_saved_traced() -> None:
     X = np.random.default_rng(0).normal(size=(20, 2))
-    lifting = (State() + Drag()).bind(NAMES[:2])
+    lifting = (km.State() + Drag()).bind(NAMES[:2])
     drag = np.abs(X[:, 1]) * X[:, 1]
     np.testing.assert_allclose(lifting(X), np.column_stack([X, drag, 2 * drag]), rtol=1e-15)
     again = from_data(to_data(lifting))
@@ -59,8 +52,8 @@ def test_a_family_of_ones_own_needs_two_methods_and_is_saved_traced() -> None:
 
 
 def test_unbound_liftings_are_saved_too() -> None:
-    lifting = State() + Constant() + Monomials(3) + Fourier(2, [0, "omega"]) + ThinPlate([[0, 1]])
-    lifting += Gaussian([[0, 1]], 0.5)
+    lifting = km.State() + km.Constant() + km.Monomials(3) + km.Fourier(2, [0, "omega"]) + km.ThinPlate([[0, 1]])
+    lifting += km.Gaussian([[0, 1]], 0.5)
     again = from_data(to_data(lifting))
     assert again == lifting
     assert again.bind(NAMES[:2]) == lifting.bind(NAMES[:2])
@@ -73,7 +66,7 @@ def test_expressions_keep_no_python_function_once_bound() -> None:
         calls.append(1)
         return [x[0] ** 2]
 
-    lifting = Expressions(fn, ["square"]).bind(NAMES)
+    lifting = km.Expressions(fn, ["square"]).bind(NAMES)
     lifting([[1, 2, 3], [2, 2, 3]])
     lifting.symbolic(ca.SX.sym("x", 3))
     assert len(calls) == 1
@@ -84,82 +77,90 @@ def test_expressions_keep_no_python_function_once_bound() -> None:
     ("act", "kind", "text"),
     [
         (
-            lambda: Fourier(2)([[1.0]]),
-            DataError,
+            lambda: km.Fourier(2)([[1.0]]),
+            km.errors.DataError,
             r"Fourier does not know its states yet; call .bind\(states\)",
         ),
-        (lambda: (State() + Constant()).names, DataError, "Sum does not know its states yet"),
-        (lambda: State().symbolic(ca.SX.sym("x", 2)), DataError, "State does not know its states yet"),
+        (lambda: (km.State() + km.Constant()).names, km.errors.DataError, "Sum does not know its states yet"),
+        (lambda: km.State().symbolic(ca.SX.sym("x", 2)), km.errors.DataError, "State does not know its states yet"),
         (
-            lambda: State().bind(NAMES)([[1.0, 2.0]]),
-            ShapeError,
+            lambda: km.State().bind(NAMES)([[1.0, 2.0]]),
+            km.errors.ShapeError,
             r"x has 2 states, the lifting was bound to 3 \(theta \[rad\], omega \[rad/s\], p \[m\]\)",
         ),
         (
-            lambda: State().bind(NAMES)(np.zeros((2, 2, 3))),
-            ShapeError,
+            lambda: km.State().bind(NAMES)(np.zeros((2, 2, 3))),
+            km.errors.ShapeError,
             r"x has shape \(2, 2, 3\), the lifting",
         ),
-        (lambda: State().bind(NAMES)(1.0), ShapeError, r"x has shape \(\), the lifting was bound to 3"),
-        (lambda: State().bind(NAMES).symbolic(ca.SX.sym("x", 4)), ShapeError, "x has 4 states, the lifting"),
-        (lambda: State().bind(NAMES).symbolic(ca.SX.sym("x", 1, 3)), ShapeError, r"x has shape \(1, 3\)"),
-        (lambda: State().bind(("a", "a")), DataError, "two states are named 'a'; rename one"),
+        (lambda: km.State().bind(NAMES)(1.0), km.errors.ShapeError, r"x has shape \(\), the lifting was bound to 3"),
         (
-            lambda: Monomials(2).bind(("a [m]", "a [s]")),
-            DataError,
+            lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 4)),
+            km.errors.ShapeError,
+            "x has 4 states, the lifting",
+        ),
+        (lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 1, 3)), km.errors.ShapeError, r"x has shape \(1, 3\)"),
+        (lambda: km.State().bind(("a", "a")), km.errors.DataError, "two states are named 'a'; rename one"),
+        (
+            lambda: km.Monomials(2).bind(("a [m]", "a [s]")),
+            km.errors.DataError,
             r"two observables are named 'a\^2'; rename one",
         ),
-        (lambda: Monomials(1), DataError, "degree is 1; it must be at least 2"),
-        (lambda: Fourier(0), DataError, "harmonics is 0; it must be at least 1"),
+        (lambda: km.Monomials(1), km.errors.DataError, "degree is 1; it must be at least 2"),
+        (lambda: km.Fourier(0), km.errors.DataError, "harmonics is 0; it must be at least 1"),
         (
-            lambda: Fourier(1, "phi").bind(NAMES),
-            DataError,
+            lambda: km.Fourier(1, "phi").bind(NAMES),
+            km.errors.DataError,
             r"state 'phi'; the states are theta \[rad\], omega",
         ),
-        (lambda: Fourier(1, 3).bind(NAMES), DataError, r"state 3; the states are .* or 0 … 2"),
-        (lambda: ThinPlate([[0, 1]]).bind(NAMES), ShapeError, "centers has 2 columns and there are 3 states"),
-        (lambda: ThinPlate(np.zeros((0, 3))), DataError, "pass at least one row, a row a centre"),
-        (lambda: ThinPlate([0, 1]), ShapeError, r"centers has shape \(2,\), expected \(any, any\)"),
-        (lambda: Gaussian([[0, np.nan]], 1), DataError, "centers holds 1 NaN or inf"),
-        (lambda: Gaussian([[0, 1]], 0), DataError, "width is 0; it must be above zero"),
+        (lambda: km.Fourier(1, 3).bind(NAMES), km.errors.DataError, r"state 3; the states are .* or 0 … 2"),
         (
-            lambda: Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES),
-            DataError,
+            lambda: km.ThinPlate([[0, 1]]).bind(NAMES),
+            km.errors.ShapeError,
+            "centers has 2 columns and there are 3 states",
+        ),
+        (lambda: km.ThinPlate(np.zeros((0, 3))), km.errors.DataError, "pass at least one row, a row a centre"),
+        (lambda: km.ThinPlate([0, 1]), km.errors.ShapeError, r"centers has shape \(2,\), expected \(any, any\)"),
+        (lambda: km.Gaussian([[0, np.nan]], 1), km.errors.DataError, "centers holds 1 NaN or inf"),
+        (lambda: km.Gaussian([[0, 1]], 0), km.errors.DataError, "width is 0; it must be above zero"),
+        (
+            lambda: km.Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES),
+            km.errors.DataError,
             r"fn returns shape \(1, 1\) and names has 2; return one expression for each name",
         ),
         (
-            lambda: Expressions(lambda x: [x[0], x[1]], ["a", "a"]).bind(NAMES),
-            DataError,
+            lambda: km.Expressions(lambda x: [x[0], x[1]], ["a", "a"]).bind(NAMES),
+            km.errors.DataError,
             "two observables are named",
         ),
         (
-            lambda: Expressions(lambda x: [ca.erf(x[0])], ["a"]).bind(NAMES),
-            DataError,
+            lambda: km.Expressions(lambda x: [ca.erf(x[0])], ["a"]).bind(NAMES),
+            km.errors.DataError,
             "uses the operation 'erf'",
         ),
         (
-            lambda: to_data(Expressions(lambda x: [x[0]], ["a"])),
-            DataError,
+            lambda: to_data(km.Expressions(lambda x: [x[0]], ["a"])),
+            km.errors.DataError,
             r"call .bind\(states\), which traces",
         ),
-        (lambda: to_data(Error().bind(NAMES)), DataError, "uses the operation 'erf'"),
-        (lambda: to_data(Drag()), DataError, "Drag does not know its states yet"),
+        (lambda: to_data(Error().bind(NAMES)), km.errors.DataError, "uses the operation 'erf'"),
+        (lambda: to_data(Drag()), km.errors.DataError, "Drag does not know its states yet"),
         (
             lambda: Traced(Drag().bind(NAMES)._graph, ("a",), bound=NAMES).symbolic(ca.SX.sym("x", 3)),
-            ShapeError,
+            km.errors.ShapeError,
             r"Traced.formula returns shape \(2, 1\), but names 1 observables; return a column of 1",
         ),
     ],
 )
-def test_messages(act: Callable[[], object], kind: type[KoopmpcError], text: str) -> None:
+def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
     with pytest.raises(kind, match=text):
         act()
 
 
 def test_a_lifting_that_a_file_spoils_is_a_log_error() -> None:
-    tree = to_data(Monomials(3))
+    tree = to_data(km.Monomials(3))
     tree["degree"] = 0
-    with pytest.raises(LogError, match="'Monomials' that cannot be built: degree is 0"):
+    with pytest.raises(km.errors.LogError, match="'Monomials' that cannot be built: degree is 0"):
         from_data(tree)
 
 

@@ -5,47 +5,33 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.folder import Files
-from koopmpc.data.stream import Stream
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.edmd import edmd
+import koopmpc as km
 from koopmpc.lifting.buffered import buffered
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.gaussian import Gaussian
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.random_fourier import RandomFourier
-from koopmpc.lifting.standardized import Standardized
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
 from koopmpc.values import from_data, to_data
 from tests.lifting.families import NAMES
 
 CENTERS = np.random.default_rng(3).normal(size=(6, 2))
-FAMILIES = [Gaussian(CENTERS, 1.0), ThinPlate(CENTERS), RandomFourier(8, 1.5, 4), Monomials(3)]
+FAMILIES = [km.Gaussian(CENTERS, 1.0), km.ThinPlate(CENTERS), km.RandomFourier(8, 1.5, 4), km.Monomials(3)]
 
 
-def _data(scale: np.ndarray | float = 1.0, offset: np.ndarray | float = 0.0) -> Episodes:
+def _data(scale: np.ndarray | float = 1.0, offset: np.ndarray | float = 0.0) -> km.Episodes:
     rng, made = np.random.default_rng(0), []
     for _ in range(20):
         X, U = [rng.normal(size=2)], rng.normal(size=(25, 1))
         for u in U:
             a, b = X[-1]
             X.append(np.array([a + 0.1 * b, b + 0.1 * (-np.sin(a) - 0.3 * b + u[0])]))
-        made.append(Episode(X=np.array(X) * scale + offset, U=U))
-    return Episodes(made, 0.1, NAMES[:2])
+        made.append(km.Episode(X=np.array(X) * scale + offset, U=U))
+    return km.Episodes(made, 0.1, NAMES[:2])
 
 
 def test_it_is_the_inner_lifting_of_standardized_states() -> None:
     data = _data(3.0, 5.0)
-    lifting = Standardized.of(data, Gaussian(CENTERS, 0.7)).bind(NAMES[:2])
+    lifting = km.Standardized.of(data, km.Gaussian(CENTERS, 0.7)).bind(NAMES[:2])
     X = np.concatenate([episode.X[:-1] for episode in data])
     assert lifting.mean == pytest.approx(X.mean(0), rel=1e-13)
     assert lifting.scale == pytest.approx(X.std(0), rel=1e-13)
-    assert np.allclose(
-        lifting(X), Gaussian(CENTERS, 0.7).bind(NAMES[:2])((X - X.mean(0)) / X.std(0)), atol=1e-12
-    )
+    assert np.allclose(lifting(X), km.Gaussian(CENTERS, 0.7).bind(NAMES[:2])((X - X.mean(0)) / X.std(0)), atol=1e-12)
     assert buffered(lifting)(X[7])[0] == pytest.approx(lifting(X[7]), rel=1e-12)
 
 
@@ -56,7 +42,7 @@ def test_scaling_states_changes_no_prediction(family, powers: tuple[int, int], o
     scale = 10.0 ** np.array(powers)
     plain, scaled = _data(), _data(scale, offset * scale)
     first, second = (
-        edmd(data, State() + Constant() + Standardized.of(data, family)) for data in (plain, scaled)
+        km.edmd(data, km.State() + km.Constant() + km.Standardized.of(data, family)) for data in (plain, scaled)
     )
     episode, other = plain[0], scaled[0]
     a = first.rollout(episode.X[0], episode.U)
@@ -66,17 +52,17 @@ def test_scaling_states_changes_no_prediction(family, powers: tuple[int, int], o
 
 def test_other_numbers_are_other_observables_and_one_stays_one() -> None:
     a, b = (
-        Standardized(Fourier(1, "theta"), [0, 0], [1, 2]),
-        Standardized(Fourier(1, "theta"), [0, 0], [1, 3]),
+        km.Standardized(km.Fourier(1, "theta"), [0, 0], [1, 2]),
+        km.Standardized(km.Fourier(1, "theta"), [0, 0], [1, 3]),
     )
     assert (a + b + a).bind(NAMES[:2]).nz == 4
     assert a.bind(NAMES[:2]).names[0].startswith("sin(theta)~")
-    assert (State() + Standardized(State(), [0, 0], [1, 2])).bind(NAMES[:2]).nz == 4
-    assert Standardized(Constant(), [0.0], [1.0]).bind(["x"]).names == ("1",)
+    assert (km.State() + km.Standardized(km.State(), [0, 0], [1, 2])).bind(NAMES[:2]).nz == 4
+    assert km.Standardized(km.Constant(), [0.0], [1.0]).bind(["x"]).names == ("1",)
 
 
 def test_saved_bound_or_not() -> None:
-    lifting = Standardized(RandomFourier(3, 1.0, 2) + State(), [1 / 3, -1], [0.1, 7])
+    lifting = km.Standardized(km.RandomFourier(3, 1.0, 2) + km.State(), [1 / 3, -1], [0.1, 7])
     assert from_data(to_data(lifting)) == lifting
     bound = lifting.bind(NAMES[:2])
     arrays: dict[str, np.ndarray] = {}
@@ -85,24 +71,24 @@ def test_saved_bound_or_not() -> None:
 
 def test_a_state_that_stands_still_keeps_its_unit() -> None:
     X = np.column_stack([np.arange(6.0), np.full(6, 7.0)])
-    assert Standardized.of(Episodes([Episode(X=X)], 0.1), State()).scale == pytest.approx([np.sqrt(2), 1])
+    assert km.Standardized.of(km.Episodes([km.Episode(X=X)], 0.1), km.State()).scale == pytest.approx([np.sqrt(2), 1])
 
 
 def test_files_are_read_part_by_part(tmp_path) -> None:
     data = _data(2.0, -3.0)
     for i, episode in enumerate(data):
-        Episodes([episode], data.dt, data.states).save(tmp_path / f"{i:02d}.npz")
-    read, whole = Standardized.of(Files(tmp_path), State()), Standardized.of(data, State())
+        km.Episodes([episode], data.dt, data.states).save(tmp_path / f"{i:02d}.npz")
+    read, whole = km.Standardized.of(km.Files(tmp_path), km.State()), km.Standardized.of(data, km.State())
     assert read.mean == pytest.approx(whole.mean, rel=1e-13)
     assert read.scale == pytest.approx(whole.scale, rel=1e-13)
 
 
 def test_messages() -> None:
-    with pytest.raises(DataError, match=r"a stream is read once, by the fit; take Standardized\.of from"):
-        Standardized.of(Stream(iter([_data()])), State())
-    with pytest.raises(DataError, match="scale holds 0; it must be above zero for every state"):
-        Standardized(State(), [0, 0], [1, 0])
-    with pytest.raises(ShapeError, match=r"scale has shape \(1,\), expected \(2,\)"):
-        Standardized(State(), [0, 0], [1])
-    with pytest.raises(ShapeError, match="mean and scale have 2 entries and there are 3 states"):
-        Standardized(State(), [0, 0], [1, 1]).bind(NAMES)
+    with pytest.raises(km.errors.DataError, match=r"a stream is read once, by the fit; take Standardized\.of from"):
+        km.Standardized.of(km.Stream(iter([_data()])), km.State())
+    with pytest.raises(km.errors.DataError, match="scale holds 0; it must be above zero for every state"):
+        km.Standardized(km.State(), [0, 0], [1, 0])
+    with pytest.raises(km.errors.ShapeError, match=r"scale has shape \(1,\), expected \(2,\)"):
+        km.Standardized(km.State(), [0, 0], [1])
+    with pytest.raises(km.errors.ShapeError, match="mean and scale have 2 entries and there are 3 states"):
+        km.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES)

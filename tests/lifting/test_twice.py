@@ -6,20 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.gaussian import Gaussian
-from koopmpc.lifting.monomials import Monomials
+import koopmpc as km
 from koopmpc.lifting.radial import squared_distances
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
 from koopmpc.values import from_data, to_data
 from tests.lifting.families import NAMES, Case, cases, made, swing
 
 
-def symbolically(lifting: Lifting, X: np.ndarray) -> np.ndarray:
+def symbolically(lifting: km.Lifting, X: np.ndarray) -> np.ndarray:
     x = ca.SX.sym("x", X.shape[1])
     psi = ca.Function("psi", [x], [lifting.symbolic(x)])
     return np.array([np.array(psi(row)).ravel() for row in X])
@@ -64,25 +57,23 @@ def test_saved_as_data_and_back(case: Case) -> None:
 @pytest.mark.parametrize(
     ("lifting", "expected"),
     [
-        (State(), lambda x: [x[0], x[1]]),
-        (Constant(), lambda x: [1.0]),
+        (km.State(), lambda x: [x[0], x[1]]),
+        (km.Constant(), lambda x: [1.0]),
         (
-            Monomials(3),
-            lambda x: [
-                x[0] ** a * x[1] ** b for a, b in [(2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
-            ],
+            km.Monomials(3),
+            lambda x: [x[0] ** a * x[1] ** b for a, b in [(2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]],
         ),
-        (Fourier(2, 1), lambda x: [f(k * x[1]) for k in (1, 2) for f in (np.sin, np.cos)]),
-        (ThinPlate([[1, 2], [0, -1]]), lambda x: [r**2 * np.log(r) for r in _distances(x)]),
-        (Gaussian([[1, 2], [0, -1]], 0.7), lambda x: [np.exp(-((r / 0.7) ** 2) / 2) for r in _distances(x)]),
+        (km.Fourier(2, 1), lambda x: [f(k * x[1]) for k in (1, 2) for f in (np.sin, np.cos)]),
+        (km.ThinPlate([[1, 2], [0, -1]]), lambda x: [r**2 * np.log(r) for r in _distances(x)]),
+        (km.Gaussian([[1, 2], [0, -1]], 0.7), lambda x: [np.exp(-((r / 0.7) ** 2) / 2) for r in _distances(x)]),
         (
-            Expressions(swing, ["a", "b", "c"]),
+            km.Expressions(swing, ["a", "b", "c"]),
             lambda x: [x[0] * np.cos(x[0]), max(x[0], 0.3), np.hypot(1, x[0])],
         ),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_each_family_is_its_formula(lifting: Lifting, expected: object) -> None:
+def test_each_family_is_its_formula(lifting: km.Lifting, expected: object) -> None:
     X = np.random.default_rng(1).normal(size=(50, 2))
     Z = lifting.bind(NAMES[:2])(X)
     assert callable(expected)
@@ -95,7 +86,7 @@ def _distances(x: np.ndarray) -> list[float]:
 
 def test_a_thin_plate_is_zero_and_smooth_at_its_centre() -> None:
     center = [0.3, -1.7]
-    lifting = ThinPlate([center]).bind(NAMES[:2])
+    lifting = km.ThinPlate([center]).bind(NAMES[:2])
     x = ca.SX.sym("x", 2)
     z = lifting.symbolic(x)
     hessian, gradient = ca.hessian(z, x)

@@ -8,44 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.control.linear_mpc import LinearMPC
-from koopmpc.control.lqr import LQR
-from koopmpc.control.move import Fallback, Fallible, Move, Status
-from koopmpc.control.nonlinear_mpc import NonlinearMPC
-from koopmpc.data.collect import Uniform, collect
-from koopmpc.data.excitation import Feedback, Noise
-from koopmpc.errors import DataError
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.state import State
-from koopmpc.loop.faults import (
-    ActuatorDelay,
-    ActuatorLoss,
-    DroppedSamples,
-    FrozenSensor,
-    NaNSensor,
-    SensorDelay,
-    SolverFailure,
-)
-from koopmpc.loop.injection import Fault, Injection
-from koopmpc.loop.metrics import metrics
-from koopmpc.loop.simulate import simulate
-from koopmpc.plant.dynamics import Dynamics
-from koopmpc.plant.step_map import discretize
-from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import record
+import koopmpc as km
+from koopmpc.control.move import Fallback, Fallible
 from tests.bare import shown
 
-COST = Cost(Q=[10.0, 1.0], R=0.1)
-LIMITS = Limits(u_min=-3.0, u_max=5.0)
-GOOD = {Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED, Status.SATURATED}
+COST = km.Cost(Q=[10.0, 1.0], R=0.1)
+LIMITS = km.Limits(u_min=-3.0, u_max=5.0)
+GOOD = {km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED, km.Status.SATURATED}
 
 
-class Swing(Dynamics):
+class Swing(km.Dynamics):
     """θ̈ = sin θ + u, upright at θ = 0."""
 
     states = ("theta [rad]", "omega [rad/s]")
@@ -55,7 +27,7 @@ class Swing(Dynamics):
         return ca.vertcat(x[1], ca.sin(x[0]) + u[0])
 
 
-PLANT = discretize(Swing(), 0.1)
+PLANT = km.discretize(Swing(), 0.1)
 
 
 class Recorded:
@@ -95,28 +67,28 @@ class Ramp:
 
     def __call__(self, y, reference, applied=None):
         self._k += 1
-        return Move(np.array([float(self._k)]), Status.OPTIMAL, Fallback.NONE, 0.0, 0)
+        return km.Move(np.array([float(self._k)]), km.Status.OPTIMAL, Fallback.NONE, 0.0, 0)
 
 
 @pytest.fixture(scope="module")
 def controllers():
-    upright = Feedback([[5.0, 3.0]], Noise(-2.0, 2.0))
-    data = collect(PLANT, Uniform([-1.0, -1.0], [1.0, 1.0]), upright, episodes=40, steps=20)
-    model = edmd(data, State() + Fourier(1, states="theta") + Constant())
+    upright = km.Feedback([[5.0, 3.0]], km.Noise(-2.0, 2.0))
+    data = km.collect(PLANT, km.Uniform([-1.0, -1.0], [1.0, 1.0]), upright, episodes=40, steps=20)
+    model = km.edmd(data, km.State() + km.Fourier(1, states="theta") + km.Constant())
     origin = ([0.0, 0.0], [0.0])
     built = {
-        "lqr": LQR(model.local(PLANT, *origin), COST, LIMITS),
-        "koopman-lqr": LQR(model, COST, LIMITS),
-        "linear-mpc": LinearMPC(PLANT, *origin, COST, LIMITS, 8),
-        "koopman-mpc": KoopmanMPC(model, COST, LIMITS, 8),
-        "nonlinear-mpc": NonlinearMPC(PLANT, COST, LIMITS, 8),
+        "lqr": km.LQR(model.local(PLANT, *origin), COST, LIMITS),
+        "koopman-lqr": km.LQR(model, COST, LIMITS),
+        "linear-mpc": km.LinearMPC(PLANT, *origin, COST, LIMITS, 8),
+        "koopman-mpc": km.KoopmanMPC(model, COST, LIMITS, 8),
+        "nonlinear-mpc": km.NonlinearMPC(PLANT, COST, LIMITS, 8),
     }
     assert len(built) == 5
     return built
 
 
 def closed_loop(controller, faults, *, steps=12, x0=(0.9, 0.0), limits=LIMITS, **rest):
-    return simulate(
+    return km.simulate(
         PLANT,
         controller,
         x0=x0,
@@ -136,9 +108,7 @@ def ramp(faults, steps=8, limits=None, x0=(0.9, 0.0), **rest):
 
 def test_no_faults_leave_a_run_as_it_was(controllers):
     for controller in controllers.values():
-        bare = simulate(
-            PLANT, controller, x0=[0.9, 0.0], reference=[0.0, 0.0], steps=6, cost=COST, limits=LIMITS
-        )
+        bare = km.simulate(PLANT, controller, x0=[0.9, 0.0], reference=[0.0, 0.0], steps=6, cost=COST, limits=LIMITS)
         run = closed_loop(controller, (), steps=6)
         assert "faults" not in run.metadata
         assert replace(run, solve_time=bare.solve_time) == bare
@@ -146,13 +116,13 @@ def test_no_faults_leave_a_run_as_it_was(controllers):
 
 def test_faults_that_never_strike_change_only_the_metadata(controllers):
     never = (
-        NaNSensor(probability=0.0),
-        FrozenSensor(begin=100),
-        DroppedSamples(0.0),
-        SensorDelay(0),
-        ActuatorLoss(0.0),
-        ActuatorDelay(0),
-        SolverFailure(0.0),
+        km.faults.NaNSensor(probability=0.0),
+        km.faults.FrozenSensor(begin=100),
+        km.faults.DroppedSamples(0.0),
+        km.faults.SensorDelay(0),
+        km.faults.ActuatorLoss(0.0),
+        km.faults.ActuatorDelay(0),
+        km.faults.SolverFailure(0.0),
     )
     noise = [0.01, 0.02]
     for controller in controllers.values():
@@ -163,49 +133,49 @@ def test_faults_that_never_strike_change_only_the_metadata(controllers):
 
 
 def test_a_nan_sensor_hides_its_channels_in_its_window():
-    run = ramp((NaNSensor([1], begin=2, end=5),))
+    run = ramp((km.faults.NaNSensor([1], begin=2, end=5),))
     assert np.isnan(run.Y[2:5, 1]).all()
     assert np.isnan(run.Y).sum() == 3
     assert np.isfinite(run.X).all()
-    everywhere = ramp((NaNSensor(),))
+    everywhere = ramp((km.faults.NaNSensor(),))
     assert np.isnan(everywhere.Y).all()
 
 
 def test_a_nan_sensor_strikes_as_often_as_it_says():
-    run = ramp((NaNSensor(probability=0.3),), steps=2000)
+    run = ramp((km.faults.NaNSensor(probability=0.3),), steps=2000)
     lost = np.isnan(run.Y)
     assert (lost[:, 0] == lost[:, 1]).all()
     assert abs(lost[:, 0].mean() - 0.3) < 4 * np.sqrt(0.3 * 0.7 / 2000)
 
 
 def test_a_frozen_sensor_shows_what_it_showed_at_the_beginning_of_its_window():
-    run = ramp((FrozenSensor([0], begin=2, end=6),))
+    run = ramp((km.faults.FrozenSensor([0], begin=2, end=6),))
     assert (run.Y[2:6, 0] == run.X[2, 0]).all()
     assert (run.Y[[0, 1, 6, 7, 8], 0] == run.X[[0, 1, 6, 7, 8], 0]).all()
     assert np.array_equal(run.Y[:, 1], run.X[:, 1])
 
 
 def test_a_dropped_sample_repeats_the_last_that_arrived():
-    run = ramp((DroppedSamples(0.5),), steps=400, x0=(0.9, 0.0))
+    run = ramp((km.faults.DroppedSamples(0.5),), steps=400, x0=(0.9, 0.0))
     arrived = (run.Y == run.X).all(axis=1)
     assert arrived[0]
     last = np.maximum.accumulate(np.where(arrived, np.arange(401), 0))
     assert np.array_equal(run.Y, run.X[last])
     assert abs(arrived.mean() - 0.5) < 0.1
-    assert (ramp((DroppedSamples(1.0, begin=3),)).Y[3:] == run.X[2]).all()
+    assert (ramp((km.faults.DroppedSamples(1.0, begin=3),)).Y[3:] == run.X[2]).all()
 
 
 @pytest.mark.parametrize("d", [0, 1, 3, 50])
 def test_a_delay_shifts_by_its_steps(d):
-    seen = ramp((SensorDelay(d),))
+    seen = ramp((km.faults.SensorDelay(d),))
     assert np.array_equal(seen.Y, seen.X[np.maximum(np.arange(9) - d, 0)])
-    run = ramp((ActuatorDelay(d),))
+    run = ramp((km.faults.ActuatorDelay(d),))
     expected = np.maximum(np.arange(8.0) + 1 - d, 0.0)
     assert np.array_equal(run.U[:, 0], expected)
 
 
 def test_before_the_first_input_arrives_the_actuator_rests_inside_its_limits():
-    run = ramp((ActuatorDelay(2),), limits=Limits(u_min=0.5, u_max=100.0))
+    run = ramp((km.faults.ActuatorDelay(2),), limits=km.Limits(u_min=0.5, u_max=100.0))
     assert run.U[:, 0].tolist() == [0.5, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
 
 
@@ -214,24 +184,24 @@ def test_before_the_first_input_arrives_the_actuator_rests_inside_its_limits():
     [(-8.0, 8.0, (-4.0, 4.0)), (0.0, 8.0, (0.0, 4.0)), (-6.0, 8.0, (-3.0, 4.0)), (2.0, 8.0, (2.0, 5.0))],
 )
 def test_half_the_range_is_lost_about_the_input_nearest_to_zero(low, high, kept):
-    limits = Limits(u_min=low, u_max=high)
-    run = ramp((ActuatorLoss(0.5),), limits=limits)
+    limits = km.Limits(u_min=low, u_max=high)
+    run = ramp((km.faults.ActuatorLoss(0.5),), limits=limits)
     assert np.array_equal(run.U[:, 0], np.clip(np.arange(1.0, 9.0), *kept))
-    whole = ramp((ActuatorLoss(1.0),), limits=limits)
+    whole = ramp((km.faults.ActuatorLoss(1.0),), limits=limits)
     assert (np.clip(0.0, low, high) == whole.U).all()
-    later = ramp((ActuatorLoss(0.5, begin=3, end=7),), limits=limits)
+    later = ramp((km.faults.ActuatorLoss(0.5, begin=3, end=7),), limits=limits)
     assert np.array_equal(later.U[3:7, 0], run.U[3:7, 0])
     assert later.U[7, 0] == 8.0
 
 
 def test_a_limit_on_one_side_alone_is_all_that_an_actuator_can_lose():
-    assert ramp((ActuatorLoss(0.5),), limits=Limits(u_max=8.0)).U.max() == 4.0
+    assert ramp((km.faults.ActuatorLoss(0.5),), limits=km.Limits(u_max=8.0)).U.max() == 4.0
 
 
 def test_the_controller_is_told_what_the_plant_got(controllers):
     for name, controller in controllers.items():
         watched = Recorded(controller)
-        run = closed_loop(watched, (ActuatorLoss(0.5), ActuatorDelay(1)), x0=(1.2, 1.0))
+        run = closed_loop(watched, (km.faults.ActuatorLoss(0.5), km.faults.ActuatorDelay(1)), x0=(1.2, 1.0))
         assert watched.told[0] is None
         assert np.array_equal(np.array(watched.told[1:]), run.U[:-1]), name
         assert np.array_equal(np.array(watched.got), run.Y[:-1])
@@ -244,11 +214,11 @@ def test_the_controller_is_told_what_the_plant_got(controllers):
 
 
 def test_a_signal_passes_through_the_faults_in_order():
-    first = ramp((ActuatorLoss(0.5), ActuatorDelay(2)), limits=Limits(u_min=1.0, u_max=5.0))
+    first = ramp((km.faults.ActuatorLoss(0.5), km.faults.ActuatorDelay(2)), limits=km.Limits(u_min=1.0, u_max=5.0))
     assert first.U[:, 0].tolist() == [1.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0, 3.0]
-    then = ramp((NaNSensor(begin=2, end=3), SensorDelay(1)))
+    then = ramp((km.faults.NaNSensor(begin=2, end=3), km.faults.SensorDelay(1)))
     assert np.flatnonzero(np.isnan(then.Y[:, 0])).tolist() == [3]
-    assert np.isnan(ramp((SensorDelay(1), NaNSensor(begin=2, end=3))).Y[2]).all()
+    assert np.isnan(ramp((km.faults.SensorDelay(1), km.faults.NaNSensor(begin=2, end=3))).Y[2]).all()
 
 
 def test_a_failing_solver_leads_into_the_fallback_of_every_mpc(controllers):
@@ -256,14 +226,14 @@ def test_a_failing_solver_leads_into_the_fallback_of_every_mpc(controllers):
         controller = controllers[name]
         x0 = (1.5, 2.0)  # limits are active, so that a QP is due
         whole = closed_loop(controller, (), x0=x0, steps=6)
-        run = closed_loop(controller, (SolverFailure(1.0, begin=1, end=3),), x0=x0, steps=6)
-        assert run.status[0] is whole.status[0] is not Status.UNCONSTRAINED
-        assert run.status[1:3] == (Status.FAILED, Status.FAILED), name
+        run = closed_loop(controller, (km.faults.SolverFailure(1.0, begin=1, end=3),), x0=x0, steps=6)
+        assert run.status[0] is whole.status[0] is not km.Status.UNCONSTRAINED
+        assert run.status[1:3] == (km.Status.FAILED, km.Status.FAILED), name
         assert run.fallback[1:3] == (Fallback.SHIFTED_PLAN, Fallback.SHIFTED_PLAN)
         assert set(run.status[3:]) <= GOOD
         assert controller.solver_fails is False
-        first = closed_loop(controller, (SolverFailure(1.0),), x0=x0, steps=1)
-        assert first.status == (Status.FAILED,)
+        first = closed_loop(controller, (km.faults.SolverFailure(1.0),), x0=x0, steps=1)
+        assert first.status == (km.Status.FAILED,)
         expected = Fallback.HOLD if name == "nonlinear-mpc" else Fallback.CLIPPED_LQR
         assert first.fallback == (expected,)
 
@@ -271,18 +241,18 @@ def test_a_failing_solver_leads_into_the_fallback_of_every_mpc(controllers):
 def test_what_a_shifted_plan_applies_is_the_plan_of_the_last_good_step(controllers):
     for name in ("koopman-mpc", "nonlinear-mpc"):
         run = closed_loop(
-            controllers[name], (SolverFailure(1.0, begin=1, end=4),), x0=(1.5, 2.0), steps=5, plans=True
+            controllers[name], (km.faults.SolverFailure(1.0, begin=1, end=4),), x0=(1.5, 2.0), steps=5, plans=True
         )
         assert np.array_equal(run.U[:4], run.plans.U[0, :4]), name
         assert np.isnan(run.plans.U[1:4]).all()
 
 
 def test_a_solver_that_nobody_asks_cannot_fail(controllers):
-    near = closed_loop(controllers["koopman-mpc"], (SolverFailure(1.0),), x0=(0.05, 0.0))
-    assert set(near.status) == {Status.UNCONSTRAINED}
+    near = closed_loop(controllers["koopman-mpc"], (km.faults.SolverFailure(1.0),), x0=(0.05, 0.0))
+    assert set(near.status) == {km.Status.UNCONSTRAINED}
     for name in ("lqr", "koopman-lqr"):
         assert not isinstance(controllers[name], Fallible)
-        bare, run = (closed_loop(controllers[name], faults) for faults in ((), (SolverFailure(1.0),)))
+        bare, run = (closed_loop(controllers[name], faults) for faults in ((), (km.faults.SolverFailure(1.0),)))
         assert np.array_equal(bare.U, run.U)
 
 
@@ -296,26 +266,30 @@ def test_a_controller_that_raises_gets_its_solver_back():
 
     controller = Broken()
     with pytest.raises(RuntimeError, match="no more"):
-        closed_loop(controller, (SolverFailure(1.0),))
+        closed_loop(controller, (km.faults.SolverFailure(1.0),))
     assert controller.solver_fails is False
 
 
 def test_faults_of_one_seed_are_the_same_for_every_controller_and_leave_the_noise_alone(controllers):
-    faults = (NaNSensor([0], probability=0.5), DroppedSamples(0.5), SolverFailure(0.5))
+    faults = (km.faults.NaNSensor([0], probability=0.5), km.faults.DroppedSamples(0.5), km.faults.SolverFailure(0.5))
     masks = [np.isnan(closed_loop(c, faults, noise=[0.1, 0.1], rng=3).Y) for c in controllers.values()]
     assert all(np.array_equal(masks[0], mask) for mask in masks)
     assert not np.array_equal(masks[0], np.isnan(ramp(faults, steps=12, rng=4).Y))
-    bare, faulty = (ramp(f, noise=[0.1, 0.1], rng=3) for f in ((), (NaNSensor([0]),)))
+    bare, faulty = (ramp(f, noise=[0.1, 0.1], rng=3) for f in ((), (km.faults.NaNSensor([0]),)))
     assert np.array_equal(bare.Y[:, 1], faulty.Y[:, 1])
 
 
 def test_one_fault_has_the_same_luck_whatever_comes_with_it():
     hidden = [
-        np.isnan(ramp((NaNSensor([0], probability=0.5), other), steps=50).Y[:, 0])
-        for other in (NaNSensor([1], probability=0.9), SensorDelay(0), NaNSensor([1], begin=30))
+        np.isnan(ramp((km.faults.NaNSensor([0], probability=0.5), other), steps=50).Y[:, 0])
+        for other in (
+            km.faults.NaNSensor([1], probability=0.9),
+            km.faults.SensorDelay(0),
+            km.faults.NaNSensor([1], begin=30),
+        )
     ]
     assert all(np.array_equal(hidden[0], mask) for mask in hidden)
-    windowed = ramp((NaNSensor([0], probability=0.5, begin=20, end=30),), steps=50)
+    windowed = ramp((km.faults.NaNSensor([0], probability=0.5, begin=20, end=30),), steps=50)
     assert np.array_equal(np.isnan(windowed.Y[20:30, 0]), hidden[0][20:30])
 
 
@@ -325,10 +299,16 @@ WINDOW = st.tuples(st.integers(0, 10), st.none() | st.integers(1, 10)).map(
     lambda w: {"begin": w[0], "end": None if w[1] is None else w[0] + w[1]}
 )
 FAULT = st.one_of(  # built in the test: beartype picks at random what it checks, and strategies must not
-    st.tuples(st.just(NaNSensor), st.tuples(CHANNELS, SHARE), WINDOW),
-    st.tuples(st.just(FrozenSensor), st.tuples(CHANNELS), WINDOW),
-    st.tuples(st.sampled_from([DroppedSamples, ActuatorLoss, SolverFailure]), st.tuples(SHARE), WINDOW),
-    st.tuples(st.sampled_from([SensorDelay, ActuatorDelay]), st.tuples(st.integers(0, 4)), st.just({})),
+    st.tuples(st.just(km.faults.NaNSensor), st.tuples(CHANNELS, SHARE), WINDOW),
+    st.tuples(st.just(km.faults.FrozenSensor), st.tuples(CHANNELS), WINDOW),
+    st.tuples(
+        st.sampled_from([km.faults.DroppedSamples, km.faults.ActuatorLoss, km.faults.SolverFailure]),
+        st.tuples(SHARE),
+        WINDOW,
+    ),
+    st.tuples(
+        st.sampled_from([km.faults.SensorDelay, km.faults.ActuatorDelay]), st.tuples(st.integers(0, 4)), st.just({})
+    ),
 )
 NAMES = ("lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "nonlinear-mpc")
 SEEDS = st.integers(0, 2**31)
@@ -352,7 +332,7 @@ def test_no_faults_together_move_an_input_out_of_its_limits(controllers, name, f
         assert (u <= high).all()
     assert len(run.status) == len(run.fallback) == run.steps == 12
     for y, status, fallback in zip(run.Y, run.status, run.fallback, strict=False):
-        assert (status is Status.BAD_MEASUREMENT) == bool(np.isnan(y).any())
+        assert (status is km.Status.BAD_MEASUREMENT) == bool(np.isnan(y).any())
         assert (fallback is Fallback.NONE) == (status in GOOD)
     assert run.metadata["faults"] == [str(fault) for fault in faults]
     again = closed_loop(controllers[name], faults, rng=seed, x0=x0)
@@ -366,20 +346,20 @@ def test_a_faulty_run_comes_back_from_its_log_to_the_bit(controllers, tmp_path_f
         controllers["koopman-mpc"], build(faults), rng=seed, x0=(1.5, 1.0), noise=[0.01, 0.01], plans=True
     )
     path = tmp_path_factory.mktemp("log") / "run.rrd"
-    record(run, path)
-    loaded = load_run(path)
+    km.record(run, path)
+    loaded = km.load_run(path)
     assert loaded == run
-    assert metrics(loaded) == metrics(run)
+    assert km.metrics(loaded) == km.metrics(run)
 
 
-class Loud(Fault):
+class Loud(km.faults.Fault):
     """Multiplies every input, by inf if need be."""
 
     def __init__(self, factor):
         self.factor = factor
 
     def start(self, wiring, rng):
-        injection = Injection()
+        injection = km.faults.Injection()
         injection.applied = lambda k, u: self.factor * u
         return injection
 
@@ -387,7 +367,7 @@ class Loud(Fault):
 def test_a_fault_of_ones_own_is_any_object_that_starts():
     assert ramp((Loud(2.0),)).U[:, 0].tolist() == [2.0 * k for k in range(1, 9)]
     with pytest.raises(
-        DataError, match=r"the faults made u = \[inf\] of u = \[1\.\] at step 0; they must keep"
+        km.errors.DataError, match=r"the faults made u = \[inf\] of u = \[1\.\] at step 0; they must keep"
     ):
         ramp((Loud(np.inf),))
 
@@ -395,24 +375,24 @@ def test_a_fault_of_ones_own_is_any_object_that_starts():
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: NaNSensor(probability=1.5), "probability is 1.5; it must be between 0 and 1"),
-        (lambda: DroppedSamples(-0.1), "probability is -0.1; it must be between 0 and 1"),
-        (lambda: SolverFailure(2.0), "probability is 2; it must be between 0 and 1"),
-        (lambda: ActuatorLoss(1.1), "fraction is 1.1; it must be between 0 and 1"),
-        (lambda: FrozenSensor(begin=-1), "begin is -1; it must be at least 0"),
-        (lambda: FrozenSensor(begin=5, end=5), "end is 5; it must be at least 6"),
-        (lambda: SensorDelay(-1), "steps is -1; it must be at least 0"),
-        (lambda: ActuatorDelay(-2), "steps is -2; it must be at least 0"),
-        (lambda: NaNSensor([-1]), "channels is -1; it must be at least 0"),
-        (lambda: ramp((NaNSensor([0, 2]),)), "channels holds 2; pass indices of measurements, 0 to 1"),
+        (lambda: km.faults.NaNSensor(probability=1.5), "probability is 1.5; it must be between 0 and 1"),
+        (lambda: km.faults.DroppedSamples(-0.1), "probability is -0.1; it must be between 0 and 1"),
+        (lambda: km.faults.SolverFailure(2.0), "probability is 2; it must be between 0 and 1"),
+        (lambda: km.faults.ActuatorLoss(1.1), "fraction is 1.1; it must be between 0 and 1"),
+        (lambda: km.faults.FrozenSensor(begin=-1), "begin is -1; it must be at least 0"),
+        (lambda: km.faults.FrozenSensor(begin=5, end=5), "end is 5; it must be at least 6"),
+        (lambda: km.faults.SensorDelay(-1), "steps is -1; it must be at least 0"),
+        (lambda: km.faults.ActuatorDelay(-2), "steps is -2; it must be at least 0"),
+        (lambda: km.faults.NaNSensor([-1]), "channels is -1; it must be at least 0"),
+        (lambda: ramp((km.faults.NaNSensor([0, 2]),)), "channels holds 2; pass indices of measurements, 0 to 1"),
         (
-            lambda: ramp((ActuatorLoss(0.5),)),
+            lambda: ramp((km.faults.ActuatorLoss(0.5),)),
             "takes a share of the input range, and there is none; pass limits=",
         ),
     ],
 )
 def test_mistakes_say_what_was_got_and_what_to_do(make, text):
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(km.errors.DataError) as caught:
         make()
     assert text in str(caught.value)
 
@@ -426,12 +406,12 @@ x, u = ca.SX.sym("x"), ca.SX.sym("u")
 plant = km.StepMap(ca.Function("F", [x, u], [x + u]), 0.1, states=("x",), inputs=("u",))
 mpc = km.LinearMPC(plant, [0], [0], km.Cost(1, 1))
 run = lambda faults: km.simulate(plant, mpc, x0=[1], reference=[0], steps=2, faults=faults)
-show(lambda: run(km.SensorDelay(1)))
-show(lambda: run([km.SensorDelay]))
+show(lambda: run(km.faults.SensorDelay(1)))
+show(lambda: run([km.faults.SensorDelay]))
 """
     )
     assert lines == [
         "DataError faults is SensorDelay(steps=1); pass a list of faults, for example faults=[SensorDelay(steps=1)]",
         "DataError faults holds <class 'koopmpc.loop.faults.SensorDelay'>; pass objects, for example "
-        "faults=[km.NaNSensor()]",
+        "faults=[km.faults.NaNSensor()]",
     ]

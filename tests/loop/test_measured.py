@@ -22,7 +22,7 @@ class Told:
 
     def __call__(self, y, reference, applied=None, w=None):
         self.told.append(None if w is None else np.array(w))
-        return km.Move(np.zeros(1), km.Status.OPTIMAL, km.Fallback.NONE, 0.0, 0)
+        return km.Move(np.zeros(1), km.Status.OPTIMAL, km.control.Fallback.NONE, 0.0, 0)
 
 
 def run(controller, **more):
@@ -47,7 +47,7 @@ def test_a_controller_is_told_the_rows_ahead():
     assert "measured" not in run(controller).metadata
     assert controller.told == [None] * 6
     with pytest.raises(
-        km.ShapeError, match=r"measured has shape \(5, 2\), expected \(nw,\) or \(steps, nw\) = \(6, nw\)"
+        km.errors.ShapeError, match=r"measured has shape \(5, 2\), expected \(nw,\) or \(steps, nw\) = \(6, nw\)"
     ):
         run(Told(3), measured=W[:5])
 
@@ -78,9 +78,7 @@ def test_metrics_count_rates():
     cost, limits = km.Cost(1, 0.1), km.Limits(-1, 1)
     mpc = km.KoopmanMPC(linear(A, B), cost, limits, 10)
     go = lambda cost, limits: km.metrics(  # noqa: E731
-        km.simulate(
-            step_map(A, B), mpc, x0=[0.6, 0.0], reference=[0.0, 0.0], steps=20, cost=cost, limits=limits
-        )
+        km.simulate(step_map(A, B), mpc, x0=[0.6, 0.0], reference=[0.0, 0.0], steps=20, cost=cost, limits=limits)
     )
     plain = go(cost, limits)
     result = km.simulate(step_map(A, B), mpc, x0=[0.6, 0.0], reference=[0.0, 0.0], steps=20)

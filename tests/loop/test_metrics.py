@@ -13,7 +13,7 @@ STATES = ("theta [rad]", "omega [rad/s]")
 
 def random_run(rng, T=12, cost=None, limits=None, nr=2, angles=(), dt=0.1):
     statuses = rng.choice(list(km.Status), T)
-    fallbacks = rng.choice(list(km.Fallback), T)
+    fallbacks = rng.choice(list(km.control.Fallback), T)
     X = 4 * rng.normal(size=(T + 1, 2))
     return km.Run(
         X=X,
@@ -59,9 +59,7 @@ def test_against_loops(seed, angles):
             cost += error @ Q @ error
             squares += error**2
             theta, omega = run.X[k]
-            violation = max(
-                violation, -3 - theta, theta - 2, omega - 5, np.sin(theta) - 0.5, np.cos(theta) - 0.9
-            )
+            violation = max(violation, -3 - theta, theta - 2, omega - 5, np.sin(theta) - 0.5, np.cos(theta) - 0.9)
         if k < T:
             u = run.U[k]
             cost += (u - run.u_reference[k]) @ R @ (u - run.u_reference[k])
@@ -138,7 +136,7 @@ def test_without_a_cost_and_with_a_hidden_state():
 
 def test_a_reference_that_does_not_fit_the_cost():
     run = random_run(np.random.default_rng(4), nr=1)
-    with pytest.raises(km.ShapeError, match=r"the reference has shape \(13, 1\), what it is for \(13, 2\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"the reference has shape \(13, 1\), what it is for \(13, 2\)"):
         km.metrics(run)
 
 

@@ -53,6 +53,4 @@ show(lambda: simulate(plant, Push()))
     assert lines[0].startswith(
         "DataError the controller is a function and has no dt, nu, horizon, reset; a Controller has dt [s]"
     )
-    assert lines[1].startswith(
-        "DataError what the controller returned is a ndarray and has no u, status, fallback, "
-    )
+    assert lines[1].startswith("DataError what the controller returned is a ndarray and has no u, status, fallback, ")

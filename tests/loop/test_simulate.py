@@ -22,7 +22,7 @@ class Recorded:
     def __call__(self, y, reference, applied=None):
         self.calls.append((y.copy(), np.array(reference), None if applied is None else applied.copy()))
         u = np.array([-0.3 * np.nan_to_num(y[0]) + reference[-1][0]])
-        return km.Move(u, km.Status.OPTIMAL, km.Fallback.NONE, 1e-3, len(self.calls))
+        return km.Move(u, km.Status.OPTIMAL, km.control.Fallback.NONE, 1e-3, len(self.calls))
 
 
 def mpc(**kwargs):
@@ -97,9 +97,7 @@ def test_a_reference_that_is_held():
 
 def test_noise_is_on_the_measurement_alone_and_comes_from_the_seed():
     def noisy(rng, noise):
-        return km.simulate(
-            step_map(A, B), mpc(), x0=[0.5, 0], reference=[0, 0], steps=60, noise=noise, rng=rng
-        )
+        return km.simulate(step_map(A, B), mpc(), x0=[0.5, 0], reference=[0, 0], steps=60, noise=noise, rng=rng)
 
     run, same = noisy(3, [0.1, 0.0]), noisy(np.random.default_rng(3), [0.1, 0.0])
     np.testing.assert_array_equal(run.Y, same.Y)
@@ -119,15 +117,13 @@ def test_a_disturbance_is_added_to_the_next_state(kind):
     rows = 0.01 * np.arange(20.0).reshape(10, 2)
     disturbance = {"constant": [0.1, -0.2], "rows": rows, "function": lambda k, rng: rows[k]}[kind]
     expected = np.tile([0.1, -0.2], (10, 1)) if kind == "constant" else rows
-    run = km.simulate(
-        step_map(A, B), Recorded(), x0=[1, 2], reference=[0, 0], steps=10, disturbance=disturbance
-    )
+    run = km.simulate(step_map(A, B), Recorded(), x0=[1, 2], reference=[0, 0], steps=10, disturbance=disturbance)
     np.testing.assert_allclose(run.X[1:] - run.X[:-1] @ A.T - run.U @ B.T, expected, atol=1e-12)
 
 
 def test_the_plant_may_differ_from_the_model():
     stiff = step_map(A + 0.05, B)
-    run = km.simulate(km.SimulatedPlant(stiff), mpc(), x0=[0.5, 0], reference=[0, 0], steps=8)
+    run = km.simulate(km.plants.SimulatedPlant(stiff), mpc(), x0=[0.5, 0], reference=[0, 0], steps=8)
     np.testing.assert_allclose(run.X[1:], run.X[:-1] @ (A + 0.05).T + run.U @ B.T, atol=1e-12)
 
 
@@ -198,7 +194,7 @@ def test_a_sensor_that_fails_does_not_stop_the_loop():
     run = km.simulate(Outside(), mpc(), x0=[0.5, 0], reference=[0, 0], steps=12, plans=True)
     bad = [status is km.Status.BAD_MEASUREMENT for status in run.status]
     assert bad == [3 <= k < 6 for k in range(12)]
-    assert [run.fallback[k] for k in (3, 4, 5)] == [km.Fallback.SHIFTED_PLAN] * 3
+    assert [run.fallback[k] for k in (3, 4, 5)] == [km.control.Fallback.SHIFTED_PLAN] * 3
     assert np.isfinite(run.U).all()
     assert np.isnan(run.X).all()
     assert np.isnan(run.Y[3:6, 0]).all()
@@ -230,64 +226,64 @@ def test_messages():
 
     for error, text, call in (
         (
-            km.DataError,
+            km.errors.DataError,
             r"the controller has dt = 0.1 s, the plant 0.2 s; use one dt for both",
             lambda: run(slow),
         ),
-        (km.ShapeError, r"the controller returns 1 inputs, the plant takes 2", lambda: run(two)),
-        (km.DataError, r"steps is 0; it must be at least 1", lambda: run(steps=0)),
-        (km.ShapeError, r"x0 has shape \(3,\), expected \(2,\)", lambda: run(x0=[0, 0, 0])),
+        (km.errors.ShapeError, r"the controller returns 1 inputs, the plant takes 2", lambda: run(two)),
+        (km.errors.DataError, r"steps is 0; it must be at least 1", lambda: run(steps=0)),
+        (km.errors.ShapeError, r"x0 has shape \(3,\), expected \(2,\)", lambda: run(x0=[0, 0, 0])),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"reference has shape \(5, 2\), expected \(nr,\) or \(steps\+1, nr\) = \(6, nr\)",
             lambda: run(reference=ones),
         ),
-        (km.DataError, r"reference holds 1 NaN or inf", lambda: run(reference=[0, np.nan])),
+        (km.errors.DataError, r"reference holds 1 NaN or inf", lambda: run(reference=[0, np.nan])),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"reference has 2 columns, the cost tracks 3 outputs; pass one a column",
             lambda: run(cost=km.Cost(1, 1, of=km.State() + km.Constant())),
         ),
-        (km.DataError, r"angles holds 2; pass indices of states, 0 to 1", lambda: run(angles=[2])),
+        (km.errors.DataError, r"angles holds 2; pass indices of states, 0 to 1", lambda: run(angles=[2])),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"disturbance has shape \(3,\), expected \(2,\) or a scalar",
             lambda: run(disturbance=[1, 1, 1]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"disturbance has shape \(6, 2\), expected \(5, 2\)",
             lambda: run(disturbance=np.ones((6, 2))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"disturbance has shape \(3,\), expected \(2,\)",
             lambda: run(disturbance=lambda k, r: ones[:3, 0]),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"u_reference has shape \(6, 1\), expected \(5, 1\)",
             lambda: run(u_reference=np.ones((6, 1))),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"u_reference has shape \(2,\), expected \(1,\)",
             lambda: run(u_reference=[1.0, 2.0]),
         ),
-        (km.ShapeError, r"noise has shape \(3,\), expected \(2,\) or a scalar", lambda: run(noise=[1, 1, 1])),
-        (km.ShapeError, r"noise has shape \(5, 2\), expected \(6, 2\)", lambda: run(noise=ones)),
+        (km.errors.ShapeError, r"noise has shape \(3,\), expected \(2,\) or a scalar", lambda: run(noise=[1, 1, 1])),
+        (km.errors.ShapeError, r"noise has shape \(5, 2\), expected \(6, 2\)", lambda: run(noise=ones)),
         (
-            km.DataError,
+            km.errors.DataError,
             r"a disturbance is added to the next state: pass a StepMap or a SimulatedPlant",
             lambda: run(Outside(), disturbance=0.1),
         ),
         (
-            km.DataError,
+            km.errors.DataError,
             r"the controller returned u = \[nan\] at step 0; every input must be finite",
             lambda: run(controller=Says([np.nan])),
         ),
         (
-            km.ShapeError,
+            km.errors.ShapeError,
             r"the controller returned u of shape \(2,\) at step 0, expected \(1,\)",
             lambda: run(controller=Says([1.0, 2.0])),
         ),

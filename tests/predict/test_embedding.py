@@ -5,81 +5,67 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
-from koopmpc.control.lqr import LQR
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.identify.bilinear import bilinear_edmd
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.state import State
-from koopmpc.predict.bilinear import BilinearPredictor, load_bilinear_predictor
-from koopmpc.predict.linear import LinearPredictor, load_predictor
-from koopmpc.predict.spectrum import amplitudes, linearity_error, reconstruct
+import koopmpc as km
 
 # Two states, of which one is measured: y_{k+1} is a function of y_k, u_k, y_{k−1}, u_{k−1}, exactly.
 A = np.array([[0.9, 0.3], [-0.2, 0.95]])
 B = np.array([[0.1], [0.4]])
 
 
-def hidden_state(seed: int, bilinear: bool = False) -> Episodes:
+def hidden_state(seed: int, bilinear: bool = False) -> km.Episodes:
     rng = np.random.default_rng(seed)
-    found: list[Episode] = []
+    found: list[km.Episode] = []
     for _ in range(8):
         x, U = rng.standard_normal(2), rng.uniform(-1, 1, (25, 1))
         Y = [x[:1]]
         for u in U:
             x = A @ x + B @ u + (0.1 * u * x if bilinear else 0.0)
             Y.append(x[:1])
-        found.append(Episode(X=Y, U=U))
-    return Episodes(found, 0.1, ("y [m]",), ("u [N]",))
+        found.append(km.Episode(X=Y, U=U))
+    return km.Episodes(found, 0.1, ("y [m]",), ("u [N]",))
 
 
 @pytest.fixture(scope="module")
-def model() -> LinearPredictor:
-    return edmd(hidden_state(0), State(), embedding=Delay(1))
+def model() -> km.LinearPredictor:
+    return km.edmd(hidden_state(0), km.State(), embedding=km.Delay(1))
 
 
-def test_what_the_past_determines_is_predicted_exactly(model: LinearPredictor) -> None:
+def test_what_the_past_determines_is_predicted_exactly(model: km.LinearPredictor) -> None:
     for episode in hidden_state(1):
-        history = Episode(X=episode.X[:4], U=episode.U[:3])
+        history = km.Episode(X=episode.X[:4], U=episode.U[:3])
         X = model.rollout(episode.X[3], episode.U[3:], history=history)
         assert np.allclose(X, episode.X[3:], atol=1e-10)
-    blind = edmd(hidden_state(0), State())
+    blind = km.edmd(hidden_state(0), km.State())
     assert np.abs(blind.rollout(episode.X[3], episode.U[3:]) - episode.X[3:]).max() > 1e-2
     assert model.states == ("y [m]",)
     assert model.C.shape == (1, 3)
 
 
-def test_modes_and_eigenfunctions_are_those_of_points(model: LinearPredictor) -> None:
+def test_modes_and_eigenfunctions_are_those_of_points(model: km.LinearPredictor) -> None:
     data = hidden_state(2)
-    assert linearity_error(model, data).max() < 1e-6
-    free = Episode(X=data[0].X[:2], U=data[0].U[:1])
-    zeta = model.embed(Episodes([Episode(X=data[0].X, U=data[0].U)], 0.1, data.states, data.inputs))[0].X[0]
+    assert km.spectrum.linearity_error(model, data).max() < 1e-6
+    free = km.Episode(X=data[0].X[:2], U=data[0].U[:1])
+    zeta = model.embed(km.Episodes([km.Episode(X=data[0].X, U=data[0].U)], 0.1, data.states, data.inputs))[0].X[0]
     times = 0.1 * np.arange(6)
     X = model.rollout(free.X[-1], np.zeros((5, 1)), history=free)
-    assert np.allclose(reconstruct(model, zeta, times), X, atol=1e-9)
-    assert amplitudes(model, zeta).shape == (model.nz,)
-    with pytest.raises(ShapeError, match=r"x has shape \(1,\), expected \(3,\)"):
-        reconstruct(model, free.X[-1], times)
+    assert np.allclose(km.spectrum.reconstruct(model, zeta, times), X, atol=1e-9)
+    assert km.spectrum.amplitudes(model, zeta).shape == (model.nz,)
+    with pytest.raises(km.errors.ShapeError, match=r"x has shape \(1,\), expected \(3,\)"):
+        km.spectrum.reconstruct(model, free.X[-1], times)
 
 
-def test_the_re_lifted_map_moves_the_whole_point(model: LinearPredictor) -> None:
-    (episode,) = Delay(1)(hidden_state(1)[:1])
+def test_the_re_lifted_map_moves_the_whole_point(model: km.LinearPredictor) -> None:
+    (episode,) = km.Delay(1)(hidden_state(1)[:1])
     step = model.step_map()
     assert step.states == ("y [m]", "u[k-1] [N]", "y[k-1] [m]")
     assert np.allclose(step.rollout(episode.X[0], episode.U), episode.X, atol=1e-10)
 
 
 def test_a_bilinear_fit_takes_an_embedding(tmp_path: Path) -> None:
-    data = Delay(1)(hidden_state(0, bilinear=True))
-    by_hand = bilinear_edmd(data, State() + Constant())
-    model = bilinear_edmd(hidden_state(0, bilinear=True), State() + Constant(), embedding=Delay(1))
-    assert isinstance(model, BilinearPredictor)
+    data = km.Delay(1)(hidden_state(0, bilinear=True))
+    by_hand = km.bilinear_edmd(data, km.State() + km.Constant())
+    model = km.bilinear_edmd(hidden_state(0, bilinear=True), km.State() + km.Constant(), embedding=km.Delay(1))
+    assert isinstance(model, km.BilinearPredictor)
     for mine, other in ((model.A, by_hand.A), (model.B, by_hand.B), (model.N, by_hand.N)):
         assert np.array_equal(mine, other)
     assert np.array_equal(model.C, by_hand.C[:1])
@@ -88,25 +74,25 @@ def test_a_bilinear_fit_takes_an_embedding(tmp_path: Path) -> None:
         model.step_map().rollout(episode.X[0], episode.U), by_hand.step_map().rollout(episode.X[0], episode.U)
     )
     model.save(tmp_path / "model.npz")
-    assert load_bilinear_predictor(tmp_path / "model.npz") == model
+    assert km.load_model(tmp_path / "model.npz") == model
 
 
-def test_a_file_holds_the_embedding(model: LinearPredictor, tmp_path: Path) -> None:
+def test_a_file_holds_the_embedding(model: km.LinearPredictor, tmp_path: Path) -> None:
     model.save(tmp_path / "model.npz")
-    assert load_predictor(tmp_path / "model.npz") == model
+    assert km.load_model(tmp_path / "model.npz") == model
 
 
-def test_a_controller_keeps_the_history(model: LinearPredictor) -> None:
+def test_a_controller_keeps_the_history(model: km.LinearPredictor) -> None:
     """From y alone it does what the same model on measured ζ does, also where the plant got another input."""
     rng = np.random.default_rng(3)
-    on_points = edmd(Delay(1)(hidden_state(0)), State())
-    limits = Limits(u_min=-0.6, u_max=0.6)
-    cost, whole = Cost(Q=[2.0], R=0.1, Q_N=[[3.0]]), Cost(Q=[2.0], R=0.1, Q_N=[[3.0]], of=State("y"))
-    known = KoopmanMPC(
-        on_points, Cost(Q=[2.0], R=0.1, Q_N=model.C.T @ model.C * 3.0, of=State("y")), limits, 15
+    on_points = km.edmd(km.Delay(1)(hidden_state(0)), km.State())
+    limits = km.Limits(u_min=-0.6, u_max=0.6)
+    cost, whole = km.Cost(Q=[2.0], R=0.1, Q_N=[[3.0]]), km.Cost(Q=[2.0], R=0.1, Q_N=[[3.0]], of=km.State("y"))
+    known = km.KoopmanMPC(
+        on_points, km.Cost(Q=[2.0], R=0.1, Q_N=model.C.T @ model.C * 3.0, of=km.State("y")), limits, 15
     )
-    kept = KoopmanMPC(model, cost, limits, 15)
-    gains = LQR(model, cost, limits), LQR(on_points, whole, limits)
+    kept = km.KoopmanMPC(model, cost, limits, 15)
+    gains = km.LQR(model, cost, limits), km.LQR(on_points, whole, limits)
     for controller in (kept, known, *gains):
         controller.reset(u_prev=[0.2])
     x, y_before, got = np.array([1.0, -0.5]), None, np.array([0.2])
@@ -121,9 +107,9 @@ def test_a_controller_keeps_the_history(model: LinearPredictor) -> None:
     assert abs(x[0] - 0.3) < 0.15
 
 
-def test_a_missed_sample_costs_one_step_and_no_offset_is_left(model: LinearPredictor) -> None:
-    mpc = KoopmanMPC(
-        model, Cost(Q=[2.0], R=0.1), Limits(u_min=-1, u_max=1), 15, estimator=LiftedDisturbance(0.5)
+def test_a_missed_sample_costs_one_step_and_no_offset_is_left(model: km.LinearPredictor) -> None:
+    mpc = km.KoopmanMPC(
+        model, km.Cost(Q=[2.0], R=0.1), km.Limits(u_min=-1, u_max=1), 15, estimator=km.LiftedDisturbance(0.5)
     )
     x = np.array([1.0, -0.5])
     statuses = []
@@ -136,14 +122,14 @@ def test_a_missed_sample_costs_one_step_and_no_offset_is_left(model: LinearPredi
     assert abs(x[0] - 0.3) < 1e-6
 
 
-def test_refusals(model: LinearPredictor) -> None:
-    past = Episode(X=np.ones((3, 1)), U=np.ones((2, 1)))
-    with pytest.raises(DataError, match="the predictor remembers 1 steps: pass history=Episode"):
+def test_refusals(model: km.LinearPredictor) -> None:
+    past = km.Episode(X=np.ones((3, 1)), U=np.ones((2, 1)))
+    with pytest.raises(km.errors.DataError, match="the predictor remembers 1 steps: pass history=Episode"):
         model.rollout([1.0], [[0.0]])
-    with pytest.raises(ShapeError, match="x has shape \\(3,\\), expected \\(1,\\) with a history"):
+    with pytest.raises(km.errors.ShapeError, match="x has shape \\(3,\\), expected \\(1,\\) with a history"):
         model.lift([1.0, 1.0, 1.0], past)
-    plain = edmd(hidden_state(0), State())
-    with pytest.raises(DataError, match="history was passed, but the predictor has no embedding"):
+    plain = km.edmd(hidden_state(0), km.State())
+    with pytest.raises(km.errors.DataError, match="history was passed, but the predictor has no embedding"):
         plain.lift([1.0], past)
     assert np.array_equal(model.held([2.0]), [2.0, 0.0, 2.0])
     assert np.array_equal(plain.held([2.0]), [2.0])

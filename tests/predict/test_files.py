@@ -10,17 +10,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from koopmpc.errors import LogError
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.gaussian import Gaussian
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
-from koopmpc.lifting.thin_plate import ThinPlate
-from koopmpc.predict.files import load_value, save_value
-from koopmpc.predict.linear import LinearPredictor, load_predictor
+import koopmpc as km
+from koopmpc.predict.base import load_value, save_value
 from tests.identify.plants import random_episodes
 
 DATA = random_episodes(0, [80, 60], 2, 1)
@@ -29,24 +20,24 @@ CENTERS = [[0.0, 0.5], [0.2, -0.7]]
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    edmd(DATA, LIFTINGS[0]).save(tmp_path / "model.npz")
+    km.edmd(DATA, LIFTINGS[0]).save(tmp_path / "model.npz")
     return tmp_path / "model.npz"
 
 
 LIFTINGS = [
-    State() + Constant() + Fourier(2, states=[0]),
-    State() + Monomials(3),
-    State() + ThinPlate(CENTERS) + Gaussian(CENTERS, 0.8),
-    State() + Expressions(lambda x: [x[0] * ca.exp(-(x[1] ** 2))], ["bump"]),
+    km.State() + km.Constant() + km.Fourier(2, states=[0]),
+    km.State() + km.Monomials(3),
+    km.State() + km.ThinPlate(CENTERS) + km.Gaussian(CENTERS, 0.8),
+    km.State() + km.Expressions(lambda x: [x[0] * ca.exp(-(x[1] ** 2))], ["bump"]),
 ]
 
 
 @pytest.mark.parametrize("rank", [None, 2])
 @pytest.mark.parametrize("lifting", LIFTINGS, ids=lambda each: str(each.bind(DATA.states).nz))
 def test_a_predictor_comes_back_to_the_bit(lifting, rank: int | None, tmp_path: Path) -> None:
-    model = edmd(DATA, lifting, rank=rank)
+    model = km.edmd(DATA, lifting, rank=rank)
     model.save(tmp_path / "model.npz")
-    again = load_predictor(tmp_path / "model.npz")
+    again = km.load_model(tmp_path / "model.npz")
     assert again == model
     assert again.report == model.report
     U = np.random.default_rng(0).uniform(-1, 1, (20, 1))
@@ -55,57 +46,55 @@ def test_a_predictor_comes_back_to_the_bit(lifting, rank: int | None, tmp_path: 
 
 
 def test_equality_sees_one_bit(saved: Path) -> None:
-    model = load_predictor(saved)
+    model = km.load_model(saved)
     A = np.array(model.A)
     A[0, 0] = np.nextafter(A[0, 0], 2)
-    other = LinearPredictor(
-        A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, model.report
-    )
+    other = km.LinearPredictor(A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, model.report)
     assert other != model
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(
-        LogError, match=r"nothing\.npz does not exist; pass the \.npz of a saved LinearPredictor"
+        km.errors.LogError, match=r"nothing\.npz does not exist; pass the \.npz of a saved LinearPredictor"
     ):
-        load_predictor(tmp_path / "nothing.npz")
+        km.load_model(tmp_path / "nothing.npz")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 no zip", pickle.dumps([1, 2])])
 def test_a_file_of_something_else(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "model.npz").write_bytes(content)
     told = "is no file that koopmpc saved, or is damaged: it is no .npz file, or was cut; pass the .npz of a saved"
-    with pytest.raises(LogError, match=told) as caught:
-        load_predictor(tmp_path / "model.npz")
+    with pytest.raises(km.errors.LogError, match=told) as caught:
+        km.load_model(tmp_path / "model.npz")
     assert "pickle" not in str(caught.value)
 
 
 def test_a_folder_is_said_to_be_one(saved: Path) -> None:
-    with pytest.raises(LogError, match=r"is a folder; pass the \.npz of a saved LinearPredictor"):
-        load_predictor(saved.parent)
-    with pytest.raises(LogError, match=r"is a folder; pass the path of a file in it"):
-        load_predictor(saved).save(saved.parent)
+    with pytest.raises(km.errors.LogError, match=r"is a folder; pass the \.npz of a saved LinearPredictor"):
+        km.load_model(saved.parent)
+    with pytest.raises(km.errors.LogError, match=r"is a folder; pass the path of a file in it"):
+        km.load_model(saved).save(saved.parent)
 
 
 def test_folders_are_made_and_what_cannot_be_written_is_told(saved: Path) -> None:
-    model = load_predictor(saved)
+    model = km.load_model(saved)
     model.save(saved.parent / "new" / "er" / "model.npz")
-    assert load_predictor(saved.parent / "new" / "er" / "model.npz") == model
-    with pytest.raises(LogError, match=r"model\.npz/model\.npz cannot be written: .+; pass another path"):
+    assert km.load_model(saved.parent / "new" / "er" / "model.npz") == model
+    with pytest.raises(km.errors.LogError, match=r"model\.npz/model\.npz cannot be written: .+; pass another path"):
         model.save(saved / "model.npz")
 
 
-def outcome(path: Path) -> LinearPredictor | str:
+def outcome(path: Path) -> km.LinearPredictor | str:
     """Return the predictor, or the text of the LogError."""
     try:
-        return load_predictor(path)
-    except LogError as error:
+        return km.load_model(path)
+    except km.errors.LogError as error:
         return str(error)
 
 
 def test_any_cut_is_refused_and_any_flipped_byte_is_refused_or_harmless(saved: Path, tmp_path: Path) -> None:
     whole = saved.read_bytes()
-    model = load_predictor(saved)
+    model = km.load_model(saved)
     bad = tmp_path / "bad.npz"
     for i in range(0, len(whole), 37):
         bad.write_bytes(whole[:i])
@@ -125,9 +114,9 @@ def test_a_pickle_inside_is_not_opened(tmp_path: Path) -> None:
     path = tmp_path / "trap.npz"
     np.savez(path, tree=np.array([Trap()], dtype=object), allow_pickle=True)
     with pytest.raises(
-        LogError, match="it is damaged, or holds something other than arrays of numbers; pass"
+        km.errors.LogError, match="it is damaged, or holds something other than arrays of numbers; pass"
     ):
-        load_predictor(path)
+        km.load_model(path)
     assert not opened
 
 
@@ -169,23 +158,23 @@ def edited(source: Path, target: Path, change) -> Path:
     ],
 )
 def test_a_file_made_by_hand_is_refused(change, text: str, saved: Path, tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=text):
-        load_predictor(edited(saved, tmp_path / "hostile.npz", change))
+    with pytest.raises(km.errors.LogError, match=text):
+        km.load_model(edited(saved, tmp_path / "hostile.npz", change))
 
 
 def test_a_file_without_its_text(tmp_path: Path) -> None:
     np.savez(tmp_path / "data.npz", X=np.zeros(3))
     with pytest.raises(
-        LogError, match=r"it is of another program: it holds X, and lacks tree; pass the \.npz"
+        km.errors.LogError, match=r"it is of another program: it holds X, and lacks tree; pass the \.npz"
     ):
-        load_predictor(tmp_path / "data.npz")
+        km.load_model(tmp_path / "data.npz")
     np.savez(tmp_path / "data.npz", tree=np.frombuffer(b"no json", dtype=np.uint8))
-    with pytest.raises(LogError, match=r"is damaged: the text in it cannot be read; pass the \.npz"):
-        load_predictor(tmp_path / "data.npz")
+    with pytest.raises(km.errors.LogError, match=r"is damaged: the text in it cannot be read; pass the \.npz"):
+        km.load_model(tmp_path / "data.npz")
 
 
 def test_any_value_goes_through_a_file(tmp_path: Path) -> None:
-    report = edmd(DATA, State()).report
+    report = km.edmd(DATA, km.State()).report
     assert report is not None
     save_value(report, tmp_path / "report.npz")
     assert load_value(tmp_path / "report.npz", type(report)) == report

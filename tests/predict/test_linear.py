@@ -6,17 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.projected import Projected
-from koopmpc.lifting.state import State
-from koopmpc.plant.step_map import StepMap
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
+from koopmpc.lifting.reduced import Projected
 from tests.predict.models import random_predictor
 
-LIFTING = State() + Constant() + Fourier(1)
+LIFTING = km.State() + km.Constant() + km.Fourier(1)
 
 
 @given(st.integers(1, 4), st.integers(0, 2), st.integers(0, 20), st.integers(0, 999))
@@ -47,7 +41,7 @@ def test_the_lift_happens_once_at_the_start(seed: int) -> None:
 
 @given(st.integers(0, 2), st.integers(0, 999))
 def test_the_step_map_is_re_lifted(nu: int, seed: int) -> None:
-    model = random_predictor(seed, 2, nu, LIFTING + Monomials(2))
+    model = random_predictor(seed, 2, nu, LIFTING + km.Monomials(2))
     rng = np.random.default_rng(seed)
     plant = model.step_map()
     assert (plant.states, plant.inputs, plant.dt) == (model.states, model.inputs, model.dt)
@@ -59,7 +53,7 @@ def test_the_step_map_is_re_lifted(nu: int, seed: int) -> None:
 
 def test_a_linear_map_is_its_own_linearisation() -> None:
     model = random_predictor(0, 3, 2)
-    affine = LinearPredictor.local(model.step_map(), [1, 2, 3], [0.5, -1])
+    affine = km.LinearPredictor.local(model.step_map(), [1, 2, 3], [0.5, -1])
     assert np.allclose(affine.A[:3, :3], model.A, atol=1e-14)
     assert np.allclose(affine.A[:3, 3], 0, atol=1e-14)
     assert np.allclose(affine.B[:3], model.B, atol=1e-14)
@@ -70,9 +64,9 @@ def test_a_linear_map_is_its_own_linearisation() -> None:
 def test_a_linearisation_is_tangent_away_from_an_equilibrium() -> None:
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     F = ca.Function("F", [x, u], [ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.1 * ca.sin(x[0]) * u)])
-    plant = StepMap(F, 0.1)
+    plant = km.StepMap(F, 0.1)
     at, push = np.array([0.7, -0.3]), np.array([0.4])
-    model = LinearPredictor.local(plant, at, push)
+    model = km.LinearPredictor.local(plant, at, push)
     assert np.allclose(model.rollout(at, [push])[1], plant(at, push), atol=1e-14)
     sizes = np.array([1e-2, 1e-3])
     gaps = []
@@ -95,50 +89,48 @@ def test_eigenfunctions_evolve_by_their_eigenvalues(seed: int) -> None:
 
 
 def test_a_defective_model_has_no_eigenfunctions() -> None:
-    model = LinearPredictor([[0, 1], [0, 0]], np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
+    model = km.LinearPredictor([[0, 1], [0, 0]], np.empty((2, 0)), np.eye(2), km.State(), 0.1, ("a", "b"), ())
     assert np.array_equal(model.eigenvalues, [0, 0])
-    with pytest.raises(DataError, match="A is defective: its eigenvectors do not span"):
+    with pytest.raises(km.errors.DataError, match="A is defective: its eigenvectors do not span"):
         model.eigenfunctions([[1, 2]])
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
     names = {"states": ("a", "b"), "inputs": ("u",), "dt": 0.1}
     with pytest.raises(
-        ShapeError,
+        km.errors.ShapeError,
         match=r"A has shape \(3, 3\), but the lifting returns 2 observables; pass the lifting used",
     ):
-        LinearPredictor(np.eye(3), np.ones((3, 1)), np.ones((2, 3)), State(), **names)
-    with pytest.raises(ShapeError, match=r"B has shape \(2, 2\), expected \(2, 1\)"):
-        LinearPredictor(np.eye(2), np.ones((2, 2)), np.eye(2), State(), **names)
-    with pytest.raises(ShapeError, match=r"C has shape \(1, 2\), expected \(2, 2\)"):
-        LinearPredictor(np.eye(2), np.ones((2, 1)), np.ones((1, 2)), State(), **names)
-    with pytest.raises(DataError, match="A holds 1 NaN or inf"):
-        LinearPredictor([[np.nan, 0], [0, 1]], np.ones((2, 1)), np.eye(2), State(), **names)
-    with pytest.raises(ShapeError, match=r"exact_modes has shape .* it needs a Projected lifting"):
-        LinearPredictor(
-            np.eye(2), np.ones((2, 1)), np.eye(2), State(), **names, exact_modes=np.eye(2).astype(complex)
+        km.LinearPredictor(np.eye(3), np.ones((3, 1)), np.ones((2, 3)), km.State(), **names)
+    with pytest.raises(km.errors.ShapeError, match=r"B has shape \(2, 2\), expected \(2, 1\)"):
+        km.LinearPredictor(np.eye(2), np.ones((2, 2)), np.eye(2), km.State(), **names)
+    with pytest.raises(km.errors.ShapeError, match=r"C has shape \(1, 2\), expected \(2, 2\)"):
+        km.LinearPredictor(np.eye(2), np.ones((2, 1)), np.ones((1, 2)), km.State(), **names)
+    with pytest.raises(km.errors.DataError, match="A holds 1 NaN or inf"):
+        km.LinearPredictor([[np.nan, 0], [0, 1]], np.ones((2, 1)), np.eye(2), km.State(), **names)
+    with pytest.raises(km.errors.ShapeError, match=r"exact_modes has shape .* it needs a Projected lifting"):
+        km.LinearPredictor(
+            np.eye(2), np.ones((2, 1)), np.eye(2), km.State(), **names, exact_modes=np.eye(2).astype(complex)
         )
-    projected = Projected(State(), np.ones((2, 1)))
-    with pytest.raises(ShapeError, match="exact_modes has shape"):
-        LinearPredictor(
-            [[1]], [[1]], [[1], [1]], projected, **names, exact_modes=np.ones((3, 1), dtype=complex)
-        )
+    projected = Projected(km.State(), np.ones((2, 1)))
+    with pytest.raises(km.errors.ShapeError, match="exact_modes has shape"):
+        km.LinearPredictor([[1]], [[1]], [[1], [1]], projected, **names, exact_modes=np.ones((3, 1), dtype=complex))
 
 
 def test_rollout_and_lift_refuse_wrong_shapes() -> None:
     model = random_predictor(0, 2, 1)
-    with pytest.raises(ShapeError, match=r"U has shape \(3, 2\), expected \(any, 1\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"U has shape \(3, 2\), expected \(any, 1\)"):
         model.rollout([0, 0], np.zeros((3, 2)))
-    with pytest.raises(ShapeError, match=r"x0 has shape \(3,\), expected \(2,\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"x0 has shape \(3,\), expected \(2,\)"):
         model.rollout([0, 0, 0], np.zeros((3, 1)))
-    with pytest.raises(DataError, match="x0 holds 1 NaN"):
+    with pytest.raises(km.errors.DataError, match="x0 holds 1 NaN"):
         model.rollout([0, np.nan], np.zeros((3, 1)))
-    with pytest.raises(ShapeError, match="has 3 states, the lifting was bound to 2"):
+    with pytest.raises(km.errors.ShapeError, match="has 3 states, the lifting was bound to 2"):
         model.lift([0, 0, 0])
 
 
 def test_the_model_keeps_no_hold_on_the_callers_arrays() -> None:
     A = np.eye(2)
-    model = LinearPredictor(A, np.ones((2, 1)), np.eye(2), State(), 0.1, ("a", "b"), ("u",))
+    model = km.LinearPredictor(A, np.ones((2, 1)), np.eye(2), km.State(), 0.1, ("a", "b"), ("u",))
     A[:] = 7
     assert np.array_equal(model.A, np.eye(2))

@@ -3,21 +3,18 @@
 import numpy as np
 import pytest
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 from koopmpc.predict.plane import eigenfunctions_on, plane_through
 
 NAMES = ("a [m]", "b [m/s]", "c [A]")
 
 
-def _model() -> LinearPredictor:
+def _model() -> km.LinearPredictor:
     """A turn of (a, b) by 0.3 rad a step, and c halved."""
     A = np.zeros((3, 3))
     A[:2, :2] = 0.9 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
     A[2, 2] = 0.5
-    return LinearPredictor(A, np.ones((3, 1)), np.eye(3), State(), 0.1, NAMES, ["u"])
+    return km.LinearPredictor(A, np.ones((3, 1)), np.eye(3), km.State(), 0.1, NAMES, ["u"])
 
 
 def test_the_grid_goes_through_the_point() -> None:
@@ -29,7 +26,7 @@ def test_the_grid_goes_through_the_point() -> None:
 
 def test_episodes_give_ranges_and_the_median() -> None:
     X = np.random.default_rng(0).normal(size=(51, 3))
-    plane = plane_through(NAMES, (0, 1), Episodes([Episode(X=X[:20]), Episode(X=X[20:])], 0.1))
+    plane = plane_through(NAMES, (0, 1), km.Episodes([km.Episode(X=X[:20]), km.Episode(X=X[20:])], 0.1))
     assert (plane.across[0], plane.across[-1]) == (X[:, 0].min(), X[:, 0].max())
     assert (plane.up[0], plane.up[-1]) == (X[:, 1].min(), X[:, 1].max())
     assert plane.at == pytest.approx(np.median(X, axis=0))
@@ -48,18 +45,18 @@ def test_the_eigenfunctions_of_a_turn_are_the_polar_coordinates() -> None:
 
 def test_messages() -> None:
     model, square = _model(), [(-1, 1), (-1, 1)]
-    with pytest.raises(DataError, match=r"the plane is asked for state 'd'; the states are a \[m\], b"):
+    with pytest.raises(km.errors.DataError, match=r"the plane is asked for state 'd'; the states are a \[m\], b"):
         plane_through(NAMES, ("a", "d"), square)
-    with pytest.raises(DataError, match=r"asked for b \[m/s\] twice; name two states"):
+    with pytest.raises(km.errors.DataError, match=r"asked for b \[m/s\] twice; name two states"):
         plane_through(NAMES, ("b", 1), square)
-    with pytest.raises(DataError, match=r"the range of a \[m\] is 1 to -1; pass \(low, high\)"):
+    with pytest.raises(km.errors.DataError, match=r"the range of a \[m\] is 1 to -1; pass \(low, high\)"):
         plane_through(NAMES, (0, 1), [(1, -1), (0, 1)])
-    with pytest.raises(ShapeError, match=r"at has shape \(2,\), expected \(3,\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"at has shape \(2,\), expected \(3,\)"):
         plane_through(NAMES, (0, 1), square, [0, 0])
     plane = plane_through(NAMES, (0, 1), square)
-    with pytest.raises(DataError, match=r"there is no eigenfunction 3; the predictor has 0 … 2"):
+    with pytest.raises(km.errors.DataError, match=r"there is no eigenfunction 3; the predictor has 0 … 2"):
         eigenfunctions_on(model, 3, plane)
-    with pytest.raises(DataError, match="which names no eigenfunction"):
+    with pytest.raises(km.errors.DataError, match="which names no eigenfunction"):
         eigenfunctions_on(model, [], plane)
-    with pytest.raises(DataError, match=r"eigenfunction 2 is 0 on all of the plane; hold the other states"):
+    with pytest.raises(km.errors.DataError, match=r"eigenfunction 2 is 0 on all of the plane; hold the other states"):
         eigenfunctions_on(model, [0, 2], plane)

@@ -6,43 +6,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.dmd import dmd
-from koopmpc.identify.edmd import edmd
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
-from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+import koopmpc as km
 from tests.identify.plants import one_step_pairs
 from tests.predict.models import random_predictor
 
 OSCILLATOR = np.array([[0.0, 1.0], [-4.0, -0.3]])  # ẍ = −4x − 0.3ẋ
 
 
-def sampled(dt: float) -> LinearPredictor:
-    return LinearPredictor(expm(OSCILLATOR * dt), np.empty((2, 0)), np.eye(2), State(), dt, ("x", "v"), ())
+def sampled(dt: float) -> km.LinearPredictor:
+    return km.LinearPredictor(expm(OSCILLATOR * dt), np.empty((2, 0)), np.eye(2), km.State(), dt, ("x", "v"), ())
 
 
 @given(st.floats(0.01, 0.5))
 def test_continuous_eigenvalues_are_those_of_the_differential_equation(dt: float) -> None:
-    found = np.sort_complex(continuous_eigenvalues(sampled(dt)))
+    found = np.sort_complex(km.spectrum.continuous_eigenvalues(sampled(dt)))
     assert np.allclose(found, np.sort_complex(np.linalg.eigvals(OSCILLATOR)), atol=1e-9)
 
 
 def test_an_eigenvalue_of_zero_decays_at_once() -> None:
-    model = LinearPredictor([[0, 0], [0, 0.5]], np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
-    assert continuous_eigenvalues(model)[1].real == -np.inf
-    assert np.allclose(reconstruct(model, [3, 4], [0, 0.1, 0.2]), [[3, 4], [0, 2], [0, 1]])
+    model = km.LinearPredictor([[0, 0], [0, 0.5]], np.empty((2, 0)), np.eye(2), km.State(), 0.1, ("a", "b"), ())
+    assert km.spectrum.continuous_eigenvalues(model)[1].real == -np.inf
+    assert np.allclose(km.spectrum.reconstruct(model, [3, 4], [0, 0.1, 0.2]), [[3, 4], [0, 2], [0, 1]])
 
 
 @given(st.floats(0.05, 0.5), st.integers(0, 99))
 def test_reconstruction_between_the_samples_is_the_flow(dt: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     x0, times = rng.standard_normal(2), rng.uniform(0, 3, 5)
-    X = reconstruct(sampled(dt), x0, times)
+    X = km.spectrum.reconstruct(sampled(dt), x0, times)
     assert np.allclose(X, [expm(OSCILLATOR * t) @ x0 for t in times], atol=1e-10)
 
 
@@ -52,23 +43,23 @@ def test_reconstruction_equals_the_rollout_of_a_diagonalisable_model(nx: int, se
     x0 = np.random.default_rng(seed).standard_normal(nx)
     X = model.rollout(x0, np.empty((15, 0)))
     scale = np.linalg.cond(model.eigenvectors) * max(1, np.abs(X).max())
-    assert np.allclose(reconstruct(model, x0, np.arange(16) * model.dt), X, atol=1e-11 * scale)
+    assert np.allclose(km.spectrum.reconstruct(model, x0, np.arange(16) * model.dt), X, atol=1e-11 * scale)
 
 
 def test_reconstruction_of_a_lifted_model_equals_its_rollout() -> None:
     data = quadratic_data()
-    lifting = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
+    lifting = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x0^2"])
     x0, times = [0.7, -0.4], np.arange(30) * data.dt
-    whole = edmd(data, lifting)
+    whole = km.edmd(data, lifting)
     expected = whole.rollout(x0, np.empty((29, 0)))
-    assert np.allclose(reconstruct(whole, x0, times), expected, atol=1e-10)
+    assert np.allclose(km.spectrum.reconstruct(whole, x0, times), expected, atol=1e-10)
     # at full rank the exact modes carry the same motion
-    reduced = edmd(data, lifting, rank=3)
+    reduced = km.edmd(data, lifting, rank=3)
     assert reduced.exact_modes is not None
-    assert np.allclose(reconstruct(reduced, x0, times), expected, atol=1e-8)
+    assert np.allclose(km.spectrum.reconstruct(reduced, x0, times), expected, atol=1e-8)
 
 
-def quadratic_data() -> Episodes:
+def quadratic_data() -> km.Episodes:
     """x₀⁺ = .9x₀, x₁⁺ = .5x₁ + .3x₀²: exact on [x₀, x₁, x₀²]."""
     return one_step_pairs(lambda x, u: np.array([0.9 * x[0], 0.5 * x[1] + 0.3 * x[0] ** 2]), 2, 0, 100)
 
@@ -80,15 +71,15 @@ def test_amplitudes_are_the_least_squares_share_of_each_exact_mode(seed: int) ->
     A = random_predictor(seed, 6, 0).A
     for _ in range(8):
         X.append(A @ X[-1])
-    data = Episodes([Episode(X=np.array(X))], 0.1)
-    model = dmd(data, rank=3)
-    b = amplitudes(model, X[0])
+    data = km.Episodes([km.Episode(X=np.array(X))], 0.1)
+    model = km.dmd(data, rank=3)
+    b = km.spectrum.amplitudes(model, X[0])
     assert np.allclose(b, np.linalg.pinv(model.modes) @ X[0], atol=1e-6 * max(1, np.abs(b).max()))
 
 
 def test_amplitudes_of_an_unreduced_model_are_its_eigenfunctions() -> None:
-    model = random_predictor(3, 2, 0, State() + Constant() + Monomials(2))
-    assert np.allclose(amplitudes(model, [0.3, 0.4]), model.eigenfunctions([[0.3, 0.4]])[0])
+    model = random_predictor(3, 2, 0, km.State() + km.Constant() + km.Monomials(2))
+    assert np.allclose(km.spectrum.amplitudes(model, [0.3, 0.4]), model.eigenfunctions([[0.3, 0.4]])[0])
 
 
 @given(st.integers(0, 99), st.sampled_from([None, 3]))
@@ -99,47 +90,45 @@ def test_amplitudes_of_a_run_are_the_best_over_all_its_snapshots(seed: int, rank
     for _ in range(12):
         X.append(A @ X[-1])
     X = np.array(X) + 0.05 * rng.standard_normal((13, 5))
-    model = dmd(Episodes([Episode(X=X)], 0.1), rank=rank)
+    model = km.dmd(km.Episodes([km.Episode(X=X)], 0.1), rank=rank)
     powers = model.eigenvalues ** np.arange(13)[:, None]
 
     def error(b: np.ndarray) -> float:
         return float(np.sum(np.abs(X - (powers * b) @ model.modes.T) ** 2))
 
-    best = amplitudes(model, X)
+    best = km.spectrum.amplitudes(model, X)
     least = error(best)
-    assert least <= error(amplitudes(model, X[0]))
+    assert least <= error(km.spectrum.amplitudes(model, X[0]))
     assert all(
-        error(best + 1e-3 * (rng.standard_normal(b) + 1j * rng.standard_normal(b))) >= least
-        for b in [len(best)] * 10
+        error(best + 1e-3 * (rng.standard_normal(b) + 1j * rng.standard_normal(b))) >= least for b in [len(best)] * 10
     )
-    ahead = reconstruct(model, X, 0.1 * np.arange(13))
+    ahead = km.spectrum.reconstruct(model, X, 0.1 * np.arange(13))
     assert np.sum((X - ahead) ** 2) == pytest.approx(least, rel=1e-6)
 
 
 def test_amplitudes_of_an_exact_run_are_those_of_its_start() -> None:
     model = random_predictor(1, 4, 0)
     X = model.rollout([1.0, -2, 0.5, 0.3], np.empty((10, 0)))
-    assert np.allclose(amplitudes(model, X), amplitudes(model, X[0]), atol=1e-10)
+    assert np.allclose(km.spectrum.amplitudes(model, X), km.spectrum.amplitudes(model, X[0]), atol=1e-10)
 
 
 def test_eigenfunctions_of_an_exact_model_evolve_linearly() -> None:
     data = quadratic_data()
-    lifting = State() + Expressions(lambda x: [x[0] ** 2], ["x0^2"])
-    error = linearity_error(edmd(data, lifting), data)
+    lifting = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x0^2"])
+    error = km.spectrum.linearity_error(km.edmd(data, lifting), data)
     assert error.shape == (3,)
     assert error.max() < 1e-10
 
 
 def test_eigenfunctions_of_a_wrong_lifting_do_not() -> None:
     data = quadratic_data()
-    model = edmd(data, State())
+    model = km.edmd(data, km.State())
     s = data.snapshots()
     phi, ahead = model.eigenfunctions(s.X), model.eigenfunctions(s.X_next)
     expected = [
-        np.linalg.norm(ahead[:, j] - model.eigenvalues[j] * phi[:, j]) / np.linalg.norm(phi[:, j])
-        for j in (0, 1)
+        np.linalg.norm(ahead[:, j] - model.eigenvalues[j] * phi[:, j]) / np.linalg.norm(phi[:, j]) for j in (0, 1)
     ]
-    error = linearity_error(model, data)
+    error = km.spectrum.linearity_error(model, data)
     assert np.allclose(error, expected, atol=1e-12)
     assert error.min() < 1e-10  # x₀ alone is an eigenfunction
     assert error.max() > 0.05
@@ -149,27 +138,27 @@ def test_inputs_are_accounted_for() -> None:
     model = random_predictor(0, 3, 2)
     rng = np.random.default_rng(0)
     U = rng.standard_normal((9000, 2))  # longer than one block
-    data = Episodes(
-        [Episode(X=model.rollout(rng.standard_normal(3), U), U=U)], model.dt, model.states, model.inputs
+    data = km.Episodes(
+        [km.Episode(X=model.rollout(rng.standard_normal(3), U), U=U)], model.dt, model.states, model.inputs
     )
-    assert linearity_error(model, data).max() < 1e-12
+    assert km.spectrum.linearity_error(model, data).max() < 1e-12
 
 
 def test_data_of_another_plant_are_refused() -> None:
     model = random_predictor(0, 2, 1)
     X, U = np.ones((4, 2)), np.ones((3, 1))
     with pytest.raises(
-        ShapeError, match=r"the episodes have states \(x0, x1\), the predictor has \(x0 \[m\]"
+        km.errors.ShapeError, match=r"the episodes have states \(x0, x1\), the predictor has \(x0 \[m\]"
     ):
-        linearity_error(model, Episodes([Episode(X=X, U=U)], 0.1))
-    with pytest.raises(ShapeError, match=r"the episodes have inputs \(\), the predictor has \(u0 \[N\]\)"):
-        linearity_error(model, Episodes([Episode(X=X)], 0.1, model.states))
-    with pytest.raises(DataError, match=r"the episodes have dt 0.2 s, the predictor 0.1 s"):
-        linearity_error(model, Episodes([Episode(X=X, U=U)], 0.2, model.states, model.inputs))
+        km.spectrum.linearity_error(model, km.Episodes([km.Episode(X=X, U=U)], 0.1))
+    with pytest.raises(km.errors.ShapeError, match=r"the episodes have inputs \(\), the predictor has \(u0 \[N\]\)"):
+        km.spectrum.linearity_error(model, km.Episodes([km.Episode(X=X)], 0.1, model.states))
+    with pytest.raises(km.errors.DataError, match=r"the episodes have dt 0.2 s, the predictor 0.1 s"):
+        km.spectrum.linearity_error(model, km.Episodes([km.Episode(X=X, U=U)], 0.2, model.states, model.inputs))
 
 
 def test_an_eigenfunction_that_is_zero_on_the_data_has_no_relative_error() -> None:
-    model = LinearPredictor(np.diag([0.9, 0.5]), np.empty((2, 0)), np.eye(2), State(), 0.1, ("a", "b"), ())
-    data = Episodes([Episode(X=[[1, 0], [0.9, 0]])], 0.1, ("a", "b"))
-    with pytest.raises(DataError, match="eigenfunction 1 is 0 in all snapshots"):
-        linearity_error(model, data)
+    model = km.LinearPredictor(np.diag([0.9, 0.5]), np.empty((2, 0)), np.eye(2), km.State(), 0.1, ("a", "b"), ())
+    data = km.Episodes([km.Episode(X=[[1, 0], [0.9, 0]])], 0.1, ("a", "b"))
+    with pytest.raises(km.errors.DataError, match="eigenfunction 1 is 0 in all snapshots"):
+        km.spectrum.linearity_error(model, data)

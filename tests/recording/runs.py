@@ -3,11 +3,9 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
-from koopmpc.control.move import Fallback, Move, Plan, Status
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.loop.run import Plans, Run
+import koopmpc as km
+from koopmpc.control.move import Fallback, Plan
+from koopmpc.loop.run import Plans
 from koopmpc.loop.simulate import Step
 
 metadata = st.dictionaries(
@@ -52,7 +50,7 @@ def make_run(
     held=True,
     metadata=None,
     seed=0,
-) -> Run:
+) -> km.Run:
     rng = np.random.default_rng(seed)
     ny = nx if ny is None else ny
 
@@ -66,17 +64,17 @@ def make_run(
     Y = X.copy() if ny == nx else numbers(T + 1, ny)
     if noisy:
         Y[rng.integers(0, T + 1)] += 1.0
-    return Run(
+    return km.Run(
         X=X,
         Y=Y,
         U=numbers(T, nu),
         reference=numbers(T + 1, nx if cost else 3),
-        status=tuple(rng.choice(list(Status), T)),
+        status=tuple(rng.choice(list(km.Status), T)),
         fallback=tuple(rng.choice(list(Fallback), T, p=[0.7, 0.1, 0.1, 0.1])),
         solve_time=rng.random(T) * 1e-3,
         iterations=rng.integers(0, 4000, T),
-        cost=Cost(Q=rng.random(nx), R=np.eye(nu) / 3) if cost else None,
-        limits=Limits(u_min=-np.inf, u_max=rng.random(nu), of=Fourier(2, [0]), y_max=1.0, slack=None)
+        cost=km.Cost(Q=rng.random(nx), R=np.eye(nu) / 3) if cost else None,
+        limits=km.Limits(u_min=-np.inf, u_max=rng.random(nu), of=km.Fourier(2, [0]), y_max=1.0, slack=None)
         if limits
         else None,
         dt=float(rng.random()) + 1e-3,
@@ -91,7 +89,7 @@ def make_run(
     )
 
 
-def steps_of(run: Run) -> list[Step]:
+def steps_of(run: km.Run) -> list[Step]:
     """Return what an observer of `run` sees."""
     return [
         Step(
@@ -99,7 +97,7 @@ def steps_of(run: Run) -> list[Step]:
             y=run.Y[k],
             u=run.U[k],
             reference=run.reference[k],
-            move=Move(
+            move=km.Move(
                 run.U[k],
                 run.status[k],
                 run.fallback[k],
@@ -118,7 +116,7 @@ def steps_of(run: Run) -> list[Step]:
     ]
 
 
-def about(run: Run) -> dict:
+def about(run: km.Run) -> dict:
     """Return what a Recorder is told about `run` beforehand."""
     names = ("dt", "states", "inputs", "outputs", "cost", "limits", "angles", "metadata")
     return {name: getattr(run, name) for name in names}

@@ -5,9 +5,8 @@ import time
 
 import pytest
 
-from koopmpc.recording import connect
-from koopmpc.recording.connect import find_viewer, has_display, is_up, start_viewer
-from koopmpc.recording.viewer import free_port
+from koopmpc.recording import viewer as connect
+from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer
 
 
 def test_a_viewer_is_found_once_it_is_up(monkeypatch: pytest.MonkeyPatch) -> None:

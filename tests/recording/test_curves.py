@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError, LogError, ShapeError
-from koopmpc.recording.curves import Curves, record_curves
+import koopmpc as km
+from koopmpc.recording.views.curves import Curves, record_curves
 
 
 def written(path):
@@ -37,12 +37,12 @@ def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
 
 def test_refusals(tmp_path):
     tab = Curves("one", 0.1, ("x",), {"truth": np.zeros((3, 1))})
-    with pytest.raises(DataError, match="there is no curve to record"):
+    with pytest.raises(km.errors.DataError, match="there is no curve to record"):
         record_curves([], tmp_path / "c.rrd", application="koopmpc-test", page="")
-    with pytest.raises(DataError, match="two tabs are called 'one'"):
+    with pytest.raises(km.errors.DataError, match="two tabs are called 'one'"):
         record_curves([tab, tab], tmp_path / "c.rrd", application="koopmpc-test", page="")
     wide = Curves("one", 0.1, ("x", "y"), {"truth": np.zeros((3, 1))})
-    with pytest.raises(ShapeError, match=r"truth has shape \(3, 1\), expected \(any, 2\)"):
+    with pytest.raises(km.errors.ShapeError, match=r"truth has shape \(3, 1\), expected \(any, 2\)"):
         record_curves([wide], tmp_path / "c.rrd", application="koopmpc-test", page="")
-    with pytest.raises(LogError, match="is a folder"):
+    with pytest.raises(km.errors.LogError, match="is a folder"):
         record_curves([tab], tmp_path, application="koopmpc-test", page="")

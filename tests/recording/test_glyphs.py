@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from koopmpc.recording.glyphs import drawable
+from koopmpc.recording.description import drawable
 
 
 def test_what_the_font_holds_stays_as_it_is() -> None:

@@ -5,35 +5,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, LogError
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.trust import TrustReport, trust
-from koopmpc.lifting.state import State
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.forecast import forecast
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 from koopmpc.predict.plane import eigenfunctions_on, plane_through
-from koopmpc.predict.score import score
-from koopmpc.recording.columns import Columns, read_columns
-from koopmpc.recording.connect import start_viewer
-from koopmpc.recording.model import record_model
-from koopmpc.recording.shades import circle, sequence
-from koopmpc.recording.viewer import free_port, screenshot
+from koopmpc.recording.format.columns import Columns, read_columns
+from koopmpc.recording.viewer import free_port, screenshot, start_viewer
+from koopmpc.recording.views.eigenvalues import circle, sequence
+from koopmpc.validate.forecast import forecast
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 
 DATA = episodes(24, noise=0.05)
 
 
 @pytest.fixture(scope="module")
-def report() -> TrustReport:
-    return trust(turning(0.9), DATA, 12)
+def report() -> km.validate.TrustReport:
+    return km.trust(turning(0.9), DATA, 12)
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory, report: TrustReport) -> Path:
+def log(tmp_path_factory: pytest.TempPathFactory, report: km.validate.TrustReport) -> Path:
     path = tmp_path_factory.mktemp("model") / "deep" / "model.rrd"
-    record_model(turning(0.9), path, DATA, report=report, which=[0], rollouts=2)
+    km.recording.record_model(turning(0.9), path, DATA, report=report, which=[0], rollouts=2)
     return path
 
 
@@ -41,7 +32,7 @@ def _read(path: Path, *entities: str) -> Columns:
     return read_columns(path, entities)
 
 
-def test_forecasts_are_read_back_to_the_bit(log: Path, report: TrustReport) -> None:
+def test_forecasts_are_read_back_to_the_bit(log: Path, report: km.validate.TrustReport) -> None:
     for r in range(2):
         ahead = forecast(turning(0.9), DATA[r], 12, bands=report.band)
         found = _read(log, f"/rollout/{r}/**")
@@ -53,7 +44,7 @@ def test_forecasts_are_read_back_to_the_bit(log: Path, report: TrustReport) -> N
     assert not len(_read(log, "/rollout/2/**").vectors("/rollout/2/state/0"))
 
 
-def test_the_error_is_the_score(log: Path, report: TrustReport) -> None:
+def test_the_error_is_the_score(log: Path, report: km.validate.TrustReport) -> None:
     for i in range(2):
         k, values = _read(log, f"/error/{i}").matrix(f"/error/{i}")
         assert np.array_equal(k, np.arange(1, 13))
@@ -70,14 +61,12 @@ def _points(path: Path, entity: str) -> np.ndarray:
     return np.array(_all(path, entity, "positions"), dtype=float)
 
 
-def test_eigenvalues_stand_upright_with_their_residuals(log: Path, report: TrustReport) -> None:
+def test_eigenvalues_stand_upright_with_their_residuals(log: Path, report: km.validate.TrustReport) -> None:
     at = _points(log, "/model/eigenvalues")
     found = report.residuals.eigenvalues
     assert at[:, 0] - 1j * at[:, 1] == pytest.approx(found, abs=1e-6)  # y is down
     labels = _all(log, "/model/eigenvalues", "labels")
-    assert all(
-        f"residual {r:.2g}" in text for r, text in zip(report.residuals.residuals, labels, strict=True)
-    )
+    assert all(f"residual {r:.2g}" in text for r, text in zip(report.residuals.residuals, labels, strict=True))
     spurious = report.residuals.spurious
     assert spurious.all()
     assert len(_points(log, "/model/spurious")) == spurious.sum()
@@ -97,7 +86,7 @@ def test_pictures_are_the_eigenfunctions_with_the_second_state_upwards(log: Path
         assert set(STATES) <= set(words)
 
 
-def test_the_report_is_a_page(log: Path, report: TrustReport) -> None:
+def test_the_report_is_a_page(log: Path, report: km.validate.TrustReport) -> None:
     page = _read(log, "/report").static("/report", "text")
     assert str(report) in page
     assert f"| observables | 2: {', '.join(STATES)} |" in page
@@ -105,8 +94,8 @@ def test_the_report_is_a_page(log: Path, report: TrustReport) -> None:
 
 def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None:
     data = episodes(3, noise=0.05)
-    record_model(turning(), tmp_path / "a.rrd", data)
-    errors = score(turning(), data, 30)
+    km.recording.record_model(turning(), tmp_path / "a.rrd", data)
+    errors = km.score(turning(), data, 30)
     ahead = forecast(turning(), data[2], 30, bands=errors)
     curves = _read(tmp_path / "a.rrd", "/rollout/2/**").vectors("/rollout/2/state/1")
     assert np.array_equal(curves[:, 2], ahead.low[:, 1])
@@ -115,33 +104,31 @@ def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None
 
 def test_what_has_no_eigenfunctions_says_so(tmp_path: Path) -> None:
     data = episodes(2)
-    bilinear = BilinearPredictor(
-        turning().A, turning().B, np.zeros((1, 2, 2)), np.eye(2), State(), DT, STATES, INPUTS
+    bilinear = km.BilinearPredictor(
+        turning().A, turning().B, np.zeros((1, 2, 2)), np.eye(2), km.State(), DT, STATES, INPUTS
     )
-    defective = LinearPredictor(
-        [[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), State(), DT, STATES, INPUTS
-    )
+    defective = km.LinearPredictor([[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
     for model, words in ((bilinear, "has no eigenfunctions"), (defective, "A is defective")):
-        record_model(model, tmp_path / "a.rrd", data, horizon=5)
+        km.recording.record_model(model, tmp_path / "a.rrd", data, horizon=5)
         assert words in _read(tmp_path / "a.rrd", "/report").static("/report", "text")
-    one = LinearPredictor([[0.9]], [[1.0]], [[1.0]], State(), DT, STATES[:1], INPUTS)
-    small = Episodes([type(e)(X=e.X[:, :1], U=e.U) for e in data], DT, STATES[:1], INPUTS)
-    record_model(one, tmp_path / "b.rrd", small, horizon=5)
+    one = km.LinearPredictor([[0.9]], [[1.0]], [[1.0]], km.State(), DT, STATES[:1], INPUTS)
+    small = km.Episodes([type(e)(X=e.X[:, :1], U=e.U) for e in data], DT, STATES[:1], INPUTS)
+    km.recording.record_model(one, tmp_path / "b.rrd", small, horizon=5)
     assert "has one state" in _read(tmp_path / "b.rrd", "/report").static("/report", "text")
-    with pytest.raises(DataError, match="a bilinear predictor has no eigenfunctions; leave `which` out"):
-        record_model(bilinear, tmp_path / "a.rrd", data, which=[0])
-    with pytest.raises(DataError, match="A is defective"):
-        record_model(defective, tmp_path / "a.rrd", data, which=[0])
+    with pytest.raises(km.errors.DataError, match="a bilinear predictor has no eigenfunctions; leave `which` out"):
+        km.recording.record_model(bilinear, tmp_path / "a.rrd", data, which=[0])
+    with pytest.raises(km.errors.DataError, match="A is defective"):
+        km.recording.record_model(defective, tmp_path / "a.rrd", data, which=[0])
 
 
 def test_messages(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="episode 0 has 30 steps, the horizon is 31"):
-        record_model(turning(), tmp_path / "a.rrd", DATA, horizon=31)
-    with pytest.raises(DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
-        record_model(turning(), tmp_path / "a.rrd", DATA, which=[2])
+    with pytest.raises(km.errors.DataError, match="episode 0 has 30 steps, the horizon is 31"):
+        km.recording.record_model(turning(), tmp_path / "a.rrd", DATA, horizon=31)
+    with pytest.raises(km.errors.DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
+        km.recording.record_model(turning(), tmp_path / "a.rrd", DATA, which=[2])
     (tmp_path / "file").write_text("")
-    with pytest.raises(LogError, match="cannot be written"):
-        record_model(turning(), tmp_path / "file" / "a.rrd", DATA)
+    with pytest.raises(km.errors.LogError, match="cannot be written"):
+        km.recording.record_model(turning(), tmp_path / "file" / "a.rrd", DATA)
 
 
 @pytest.mark.slow
@@ -168,8 +155,8 @@ def test_the_viewer_draws_every_view(log: Path, tmp_path: Path) -> None:
 
 def test_names_that_markdown_would_change_stand_as_they_are(tmp_path: Path) -> None:
     data = episodes(2)
-    model = edmd(data, State() + State() * State())
-    record_model(model, tmp_path / "a.rrd", data, horizon=5)
+    model = km.edmd(data, km.State() + km.State() * km.State())
+    km.recording.record_model(model, tmp_path / "a.rrd", data, horizon=5)
     page = _read(tmp_path / "a.rrd", "/report").static("/report", "text")
     assert r"angle^2, angle\*rate, rate^2" in page
 
@@ -177,7 +164,7 @@ def test_names_that_markdown_would_change_stand_as_they_are(tmp_path: Path) -> N
 def test_a_model_that_runs_away_is_recorded_too(tmp_path: Path) -> None:
     data = episodes(3)
     wild = turning(1e12)
-    record_model(wild, tmp_path / "a.rrd", data, rollouts=1)
+    km.recording.record_model(wild, tmp_path / "a.rrd", data, rollouts=1)
     curves = _read(tmp_path / "a.rrd", "/rollout/0/**").vectors("/rollout/0/state/0")
     assert np.array_equal(curves[:, :2], _two(forecast(wild, data[0], 30)), equal_nan=True)
     assert np.isnan(curves[-1, 1])

@@ -12,49 +12,44 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.errors import DataError, LogError
-from koopmpc.loop.run import Run
+import koopmpc as km
 from koopmpc.loop.simulate import Step
-from koopmpc.recording import connect
-from koopmpc.recording.connect import start_viewer
-from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder, record
-from koopmpc.recording.scene import Disk
-from koopmpc.recording.viewer import free_port
+from koopmpc.recording import viewer as connect
+from koopmpc.recording.viewer import free_port, start_viewer
 from tests.recording.runs import about, make_run, steps_of
 
 
 def test_a_recorder_and_record_write_the_same_run(tmp_path: Path) -> None:
     for i, run in enumerate((make_run(nu=2, odd=1.0), make_run(N=None, ny=1, cost=False), make_run(T=1))):
         path = tmp_path / f"{i}.rrd"
-        with Recorder(
-            path, **about(run), scene=lambda x, u: [Disk("d", (float(x[0]), 0.0), 1.0)]
+        with km.Recorder(
+            path, **about(run), scene=lambda x, u: [km.scene.Disk("d", (float(x[0]), 0.0), 1.0)]
         ) as recorder:
             for step in steps_of(run):
                 recorder(step)
                 time.sleep(0.02)  # so that there are several batches
-        record(run, tmp_path / "once.rrd")
-        assert load_run(path) == run
-        assert load_run(tmp_path / "once.rrd") == run
+        km.record(run, tmp_path / "once.rrd")
+        assert km.load_run(path) == run
+        assert km.load_run(tmp_path / "once.rrd") == run
 
 
 def test_steps_without_a_plan_leave_a_gap_in_the_plans(tmp_path: Path) -> None:
     run = make_run(T=6, N=2)
     run.plans.X[[0, 3]], run.plans.U[[0, 3]] = np.nan, np.nan
-    with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+    with km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
         for step in steps_of(run):
             recorder(replace(step, plan=None) if step.k in (0, 3) else step)
-    assert load_run(tmp_path / "run.rrd") == run
+    assert km.load_run(tmp_path / "run.rrd") == run
 
 
 def test_a_loop_of_ones_own_needs_only_y_u_and_the_reference(tmp_path: Path) -> None:
     run = make_run()
     y, u = np.zeros(2), np.zeros(1)
-    with Recorder(tmp_path / "run.rrd", dt=0.1, states=run.states, inputs=run.inputs) as recorder:
+    with km.Recorder(tmp_path / "run.rrd", dt=0.1, states=run.states, inputs=run.inputs) as recorder:
         for k in range(run.steps):
             y[:], u[:] = run.Y[k], run.U[k]  # the same arrays again: the Recorder keeps copies
             recorder(Step(k, y, u, run.reference[k], y_next=run.Y[-1] if k == run.steps - 1 else None))
-    read = load_run(tmp_path / "run.rrd")
+    read = km.load_run(tmp_path / "run.rrd")
     assert np.array_equal(read.Y, run.Y)
     assert np.array_equal(read.U, run.U)
     assert np.isnan(read.X).all()
@@ -63,13 +58,13 @@ def test_a_loop_of_ones_own_needs_only_y_u_and_the_reference(tmp_path: Path) -> 
 
 def test_without_the_last_measurement_the_run_ends_a_step_before(tmp_path: Path) -> None:
     run = make_run()
-    with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+    with km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
         for step in steps_of(run):
             recorder(replace(step, x_next=None, y_next=None))
-    assert load_run(tmp_path / "run.rrd").steps == run.steps - 1
+    assert km.load_run(tmp_path / "run.rrd").steps == run.steps - 1
 
 
-def feed(recorder: Recorder, run: Run) -> None:
+def feed(recorder: km.Recorder, run: km.Run) -> None:
     for step in steps_of(run):
         recorder(step)
 
@@ -80,41 +75,39 @@ def test_no_viewer_costs_one_warning_and_no_step(tmp_path: Path, monkeypatch: py
     start = time.monotonic()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        with Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
             feed(recorder, run)
-        with Recorder(live=True, port=port, **about(run)) as recorder:
+        with km.Recorder(live=True, port=port, **about(run)) as recorder:
             feed(recorder, run)
     assert time.monotonic() - start < 4.0  # Rerun would wait five seconds for a viewer, twice
     assert [w.category for w in caught] == [UserWarning, UserWarning]
     listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and there is no display to open one on"
     assert str(caught[0].message) == f"{listens}; the log is written all the same"
     assert str(caught[1].message) == f"{listens}; nothing is recorded"
-    assert load_run(tmp_path / "run.rrd") == run
+    assert km.load_run(tmp_path / "run.rrd") == run
 
 
 def test_a_viewer_that_fails_to_start_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connect, "has_display", lambda: True)
     monkeypatch.setattr(connect, "open_viewer", lambda logs, port: False)
     run = make_run()
-    told = (
-        r"and the one that was opened did not start; run `.*rerun.*` to see what it says; the log is written"
-    )
+    told = r"and the one that was opened did not start; run `.*rerun.*` to see what it says; the log is written"
     with pytest.warns(UserWarning, match=told):  # noqa: SIM117
-        with Recorder(tmp_path / "run.rrd", live=True, port=free_port(), **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", live=True, port=free_port(), **about(run)) as recorder:
             feed(recorder, run)
-    assert load_run(tmp_path / "run.rrd") == run
+    assert km.load_run(tmp_path / "run.rrd") == run
 
 
 def test_a_path_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
     run = make_run()
     (tmp_path / "file").touch()
-    with pytest.raises(LogError, match=rf"{tmp_path} is a folder; pass the path of a file in it"):
-        record(run, tmp_path)
-    with pytest.raises(LogError, match=r"file/run\.rrd cannot be written: .+; pass another path"):
-        record(run, tmp_path / "file" / "run.rrd")
+    with pytest.raises(km.errors.LogError, match=rf"{tmp_path} is a folder; pass the path of a file in it"):
+        km.record(run, tmp_path)
+    with pytest.raises(km.errors.LogError, match=r"file/run\.rrd cannot be written: .+; pass another path"):
+        km.record(run, tmp_path / "file" / "run.rrd")
     with (
-        pytest.raises(LogError, match=rf"{tmp_path} is a folder"),
-        Recorder(tmp_path, **about(run)) as recorder,
+        pytest.raises(km.errors.LogError, match=rf"{tmp_path} is a folder"),
+        km.Recorder(tmp_path, **about(run)) as recorder,
     ):
         feed(recorder, run)
 
@@ -123,20 +116,20 @@ def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
     run, port = make_run(), free_port()
     viewer = start_viewer("--save", str(tmp_path / "seen.rrd"), port=port)
     try:
-        with Recorder(live=True, port=port, **about(run)) as recorder:
+        with km.Recorder(live=True, port=port, **about(run)) as recorder:
             feed(recorder, run)
     finally:
         time.sleep(0.5)
         viewer.send_signal(signal.SIGINT)
         viewer.wait(10)
-    assert load_run(tmp_path / "seen.rrd") == run
+    assert km.load_run(tmp_path / "seen.rrd") == run
 
 
 _DYING = """
 import sys, time, warnings
 sys.path.insert(0, {root!r})
 from tests.recording.runs import about, make_run, steps_of
-from koopmpc.recording.connect import start_viewer
+from koopmpc.recording.viewer import start_viewer
 from koopmpc.recording.recorder import Recorder
 run = make_run(T=40)
 viewer = start_viewer("--serve-grpc", port={port})
@@ -160,19 +153,17 @@ def test_a_viewer_that_dies_costs_one_warning_and_no_step(tmp_path: Path) -> Non
     code = _DYING.format(root=root, path=str(path), port=port)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     (said,) = done.stdout.splitlines()
-    assert said.startswith(
-        f"UserWarning the recording to rerun+http://127.0.0.1:{port}/proxy is not complete"
-    )
-    assert load_run(path) == make_run(T=40)
+    assert said.startswith(f"UserWarning the recording to rerun+http://127.0.0.1:{port}/proxy is not complete")
+    assert km.load_run(path) == make_run(T=40)
 
 
 def test_a_scene_that_raises_is_told_and_does_not_reach_the_loop(tmp_path: Path) -> None:
-    def scene(x: np.ndarray, u: np.ndarray) -> list[Disk]:
+    def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Disk]:
         raise ZeroDivisionError("no such place")
 
     run = make_run()
     with pytest.warns(UserWarning, match=r"run\.rrd is not complete: no such place"):  # noqa: SIM117
-        with Recorder(tmp_path / "run.rrd", scene=scene, **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", scene=scene, **about(run)) as recorder:
             feed(recorder, run)
 
 
@@ -180,14 +171,14 @@ def test_an_exception_in_the_loop_still_closes_the_log(tmp_path: Path) -> None:
     run = make_run()
 
     def loop() -> None:
-        with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
             for step in steps_of(run)[:9]:
                 recorder(step)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         loop()
-    read = load_run(tmp_path / "run.rrd")
+    read = km.load_run(tmp_path / "run.rrd")
     assert read.steps == 9
     assert np.array_equal(read.X, run.X[:10])
 
@@ -220,10 +211,8 @@ def test_a_killed_writer_keeps_what_was_flushed(tmp_path: Path) -> None:
     writer.kill()
     writer.wait()
     writer.stdout.close()
-    with pytest.warns(
-        UserWarning, match=r"run\.rrd ends after step \d+: the file was cut short or its writer"
-    ):
-        read = load_run(path)
+    with pytest.warns(UserWarning, match=r"run\.rrd ends after step \d+: the file was cut short or its writer"):
+        read = km.load_run(path)
     run = make_run(T=200)
     assert read.steps >= 98  # the hundredth was held back for what follows it
     assert np.array_equal(read.X, run.X[: read.steps + 1])
@@ -234,10 +223,10 @@ def test_a_killed_writer_keeps_what_was_flushed(tmp_path: Path) -> None:
 def test_a_recorder_needs_a_place_and_a_with_block(tmp_path: Path) -> None:
     run = make_run()
     with pytest.raises(
-        DataError, match="a Recorder needs somewhere to write: pass a path, live=True, or both"
+        km.errors.DataError, match="a Recorder needs somewhere to write: pass a path, live=True, or both"
     ):
-        Recorder(**about(run))
-    with pytest.raises(DataError, match=r"dt is 0 s; it must be above zero"):
-        Recorder(tmp_path / "run.rrd", **about(run) | {"dt": 0.0})
-    with pytest.raises(DataError, match=r"the Recorder is not open; call it inside `with Recorder"):
-        Recorder(tmp_path / "run.rrd", **about(run))(steps_of(run)[0])
+        km.Recorder(**about(run))
+    with pytest.raises(km.errors.DataError, match=r"dt is 0 s; it must be above zero"):
+        km.Recorder(tmp_path / "run.rrd", **about(run) | {"dt": 0.0})
+    with pytest.raises(km.errors.DataError, match=r"the Recorder is not open; call it inside `with Recorder"):
+        km.Recorder(tmp_path / "run.rrd", **about(run))(steps_of(run)[0])

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.errors import DataError
-from koopmpc.recording.scene import Box, Disk, Line, Shape
-from koopmpc.recording.scenes import Bounds, Names, draw, draw_ahead, stages
+import koopmpc as km
+from koopmpc.recording.views.scenes import Bounds, Names, draw, draw_ahead, stages
 
 coordinate = st.floats(-10, 10)
 
@@ -20,7 +19,7 @@ def strips(columns: object) -> list[list[list[tuple[float, float]]]]:
 
 @given(x=coordinate, y=coordinate, angle=st.floats(-4, 4), width=st.floats(0.1, 3), height=st.floats(0.1, 3))
 def test_a_box_is_covered_and_no_more(x: float, y: float, angle: float, width: float, height: float) -> None:
-    box = Box("box", (x, y), (width, height), angle)
+    box = km.scene.Box("box", (x, y), (width, height), angle)
     drawing = draw(["box"], [[box]], Bounds())["box"]
     path = np.array(strips(drawing.columns)[0][0]) * (1, -1) - (x, y)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -39,19 +38,19 @@ def distance(point: np.ndarray, path: np.ndarray) -> float:
 
 
 def test_up_in_the_scene_is_up_in_the_viewer() -> None:
-    columns = draw(["rod"], [[Line("rod", [(0.0, 0.0), (1.0, 2.0)])]], Bounds())["rod"].columns
+    columns = draw(["rod"], [[km.scene.Line("rod", [(0.0, 0.0), (1.0, 2.0)])]], Bounds())["rod"].columns
     assert np.array(strips(columns)).tolist() == [[[[0.0, 0.0], [1.0, -2.0]]]]
 
 
 @pytest.mark.parametrize(
     ("shape", "low", "high"),
     [
-        (Line("s", [(-1.0, 0.0), (3.0, 1.0)], width=0.2), (-1.1, -0.1), (3.1, 1.1)),
-        (Disk("s", (1.0, 2.0), 0.5), (0.5, 1.5), (1.5, 2.5)),
-        (Box("s", (0.0, 0.0), (2.0, 4.0), np.pi / 2), (-2.0, -1.0), (2.0, 1.0)),
+        (km.scene.Line("s", [(-1.0, 0.0), (3.0, 1.0)], width=0.2), (-1.1, -0.1), (3.1, 1.1)),
+        (km.scene.Disk("s", (1.0, 2.0), 0.5), (0.5, 1.5), (1.5, 2.5)),
+        (km.scene.Box("s", (0.0, 0.0), (2.0, 4.0), np.pi / 2), (-2.0, -1.0), (2.0, 1.0)),
     ],
 )
-def test_bounds_hold_every_shape_whole(shape: Shape, low: tuple, high: tuple) -> None:
+def test_bounds_hold_every_shape_whole(shape: km.scene.Shape, low: tuple, high: tuple) -> None:
     bounds = Bounds()
     draw(["s"], [[shape], []], bounds)
     np.testing.assert_allclose(bounds.drawn.low, low, atol=1e-3)
@@ -63,13 +62,16 @@ def test_bounds_hold_every_shape_whole(shape: Shape, low: tuple, high: tuple) ->
 
 def test_nothing_drawn_has_no_bounds() -> None:
     bounds = Bounds()
-    draw(["nowhere"], [[Line("nowhere", [(np.nan, 0.0), (0.0, 0.0)])]], bounds)
+    draw(["nowhere"], [[km.scene.Line("nowhere", [(np.nan, 0.0), (0.0, 0.0)])]], bounds)
     assert bounds.ranges() is None
 
 
 def test_only_what_moves_is_drawn_ahead_and_fades() -> None:
-    rail, cart = Line("rail", [(0.0, 0.0), (1.0, 0.0)]), Disk("cart", (0.0, 0.0), 0.1, color=(0, 0, 0))
-    ahead = [[rail, Disk("cart", (float(i), 0.0), 0.1, color=(0, 0, 0))] for i in (1, 2)]
+    rail, cart = (
+        km.scene.Line("rail", [(0.0, 0.0), (1.0, 0.0)]),
+        km.scene.Disk("cart", (0.0, 0.0), 0.1, color=(0, 0, 0)),
+    )
+    ahead = [[rail, km.scene.Disk("cart", (float(i), 0.0), 0.1, color=(0, 0, 0))] for i in (1, 2)]
     drawings = draw_ahead(["rail", "cart"], [[rail, cart], [rail, cart]], [ahead, []], bounds := Bounds())
     assert [len(row) for row in strips(drawings["rail"].columns)] == [0, 0]
     assert [len(row) for row in strips(drawings["cart"].columns)] == [2, 0]
@@ -91,9 +93,9 @@ def test_the_last_stage_is_always_among_those_drawn(horizon: int) -> None:
 def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight() -> None:
     bounds, now, near, far = (
         Bounds(),
-        [[Disk("d", (0.0, 0.0), 1.0)]],
-        Disk("d", (0.2, 0.0), 1.0),
-        Disk("d", (1e6, 0.0), 1.0),
+        [[km.scene.Disk("d", (0.0, 0.0), 1.0)]],
+        km.scene.Disk("d", (0.2, 0.0), 1.0),
+        km.scene.Disk("d", (1e6, 0.0), 1.0),
     )
     draw("d", now, bounds)
     alone = bounds.ranges()
@@ -105,16 +107,16 @@ def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight() -> No
 
 
 def test_a_shape_that_comes_or_goes_is_named() -> None:
-    rail, cart = Line("rail", [(0.0, 0.0)]), Disk("cart", (0.0, 0.0), 0.1)
+    rail, cart = km.scene.Line("rail", [(0.0, 0.0)]), km.scene.Disk("cart", (0.0, 0.0), 0.1)
     names = Names()
     assert names.checked((rail, cart, rail), 0) == [rail, cart, rail]
     assert names.checked([cart, rail], 1) == [cart, rail]
     assert list(names) == ["rail", "cart"]
     with pytest.raises(
-        DataError, match="the scene of step 2 lacks the shape 'cart'; a scene returns the same"
+        km.errors.DataError, match="the scene of step 2 lacks the shape 'cart'; a scene returns the same"
     ):
         names.checked([rail], 2)
     with pytest.raises(
-        DataError, match="the scene of step 3 has a new shape 'wall'; a scene returns the same"
+        km.errors.DataError, match="the scene of step 3 has a new shape 'wall'; a scene returns the same"
     ):
-        names.checked([rail, cart, Line("wall", [])], 3)
+        names.checked([rail, cart, km.scene.Line("wall", [])], 3)

@@ -5,14 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.errors import LogError
-from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+import koopmpc as km
 from koopmpc.recording import viewer
-from koopmpc.recording.connect import start_viewer
-from koopmpc.recording.recorder import record
-from koopmpc.recording.scene import Box, Disk, Line
-from koopmpc.recording.viewer import free_port, screenshot, view
+from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from tests.recording.runs import make_run
 
 
@@ -20,14 +15,14 @@ from tests.recording.runs import make_run
 def log(tmp_path: Path) -> Path:
     run = make_run(nx=2, T=40)
     A = np.array([[0.9, 0.3], [-0.3, 1.1]])
-    model = LinearPredictor(A, np.ones((2, 1)), np.eye(2), State(), run.dt, run.states, run.inputs)
-    record(
+    model = km.LinearPredictor(A, np.ones((2, 1)), np.eye(2), km.State(), run.dt, run.states, run.inputs)
+    km.record(
         run,
         tmp_path / "run.rrd",
         scene=lambda x, u: [
-            Line("rod", [(0.0, 0.0), (1.0, 1.0)]),
-            Box("cart", (float(np.sin(x[0])), 0.0), (1.0, 0.5), 0.3),
-            Disk("bob", (0.0, 1.0), 0.2),
+            km.scene.Line("rod", [(0.0, 0.0), (1.0, 1.0)]),
+            km.scene.Box("cart", (float(np.sin(x[0])), 0.0), (1.0, 0.5), 0.3),
+            km.scene.Disk("bob", (0.0, 1.0), 0.2),
         ],
         model=model,
     )
@@ -38,35 +33,35 @@ def test_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPatch) -> 
     opened = []
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: opened.append(logs) or True)
-    view([log, str(log)])
-    view(log)
+    km.view([log, str(log)])
+    km.view(log)
     assert opened == [[str(log), str(log)], [str(log)]]
 
 
 def test_messages(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     with pytest.raises(
-        LogError,
+        km.errors.LogError,
         match=r"there is no display to open .*run\.rrd on; copy it to a machine with .* run `koopmpc view run\.rrd`",
     ):
-        view(log)
-    with pytest.raises(LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
-        view([log, "nowhere.rrd"])
+        km.view(log)
+    with pytest.raises(km.errors.LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
+        km.view([log, "nowhere.rrd"])
     notes = log.with_name("notes.rrd")
     notes.write_text("these are notes")
-    with pytest.raises(LogError, match=r"notes\.rrd is no log of koopmpc: it does not start as"):
-        view([log, notes])
-    with pytest.raises(LogError, match=r"is a folder; pass the \.rrd of a run"):
+    with pytest.raises(km.errors.LogError, match=r"notes\.rrd is no log of koopmpc: it does not start as"):
+        km.view([log, notes])
+    with pytest.raises(km.errors.LogError, match=r"is a folder; pass the \.rrd of a run"):
         screenshot(log.parent, "picture.png", time=0.0)
-    with pytest.raises(LogError, match=r"no log to open; pass the \.rrd of a run"):
-        view([])
+    with pytest.raises(km.errors.LogError, match=r"no log to open; pass the \.rrd of a run"):
+        km.view([])
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: False)
-    with pytest.raises(LogError, match=r"the viewer did not start; run `/.*rerun.* .*run\.rrd` to see"):
-        view(log)
+    with pytest.raises(km.errors.LogError, match=r"the viewer did not start; run `/.*rerun.* .*run\.rrd` to see"):
+        km.view(log)
     monkeypatch.setattr(viewer, "start_viewer", lambda *arguments, port: None)
     with pytest.raises(
-        LogError, match=r"no picture of .*: the viewer did not start; is a Vulkan driver installed\?"
+        km.errors.LogError, match=r"no picture of .*: the viewer did not start; is a Vulkan driver installed\?"
     ):
         screenshot(log, "picture.png", time=0.0)
 

@@ -7,8 +7,8 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def without_the_type_hook():
-    if not os.environ.get("KOOPMPC_NO_TYPE_HOOK"):
-        pytest.fail("the type hook is on and would be what is measured; run `make speed`")
+    if os.environ.get("KOOPMPC_TESTS") != "bare":
+        pytest.fail("checks are on and would be measured; run `make speed`")
 
 
 def pytest_terminal_summary(terminalreporter, config):

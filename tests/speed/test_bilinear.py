@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.prepare import Prepared
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.identify.bilinear import bilinear_edmd
+import koopmpc as km
+from koopmpc.bench.controllers import Prepared
 
 pytestmark = pytest.mark.speed
 N = 50
@@ -17,9 +15,9 @@ N = 50
 
 @pytest.fixture(scope="module")
 def parts():
-    problem = load_problem("cart_pole_swing")
+    problem = km.load_problem("cart_pole_swing")
     prepared = Prepared(problem)
-    return prepared, bilinear_edmd(prepared.data, problem.lifting, difference=True)
+    return prepared, km.bilinear_edmd(prepared.data, problem.lifting, difference=True)
 
 
 def report(benchmark, **figures):
@@ -36,7 +34,7 @@ def test_swing_up_steps(benchmark, parts, rated):
     cost, limits = problem.cost, problem.limits
     if rated:
         cost, limits = replace(cost, R_delta=0.01), replace(limits, du_max=3.0)
-    mpc = BilinearMPC(model, cost, limits, N)
+    mpc = km.BilinearMPC(model, cost, limits, N)
     x = np.array([0.0, 0.0, np.pi, 0.1])
     mpc(x, [0, 0, 0, 1, 0])
     moves = []

@@ -12,7 +12,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.solvers.osqp import DEFAULTS
-from koopmpc.plant.buffered import Slot
+from koopmpc.plants.buffered import Slot
 
 pytestmark = pytest.mark.speed
 
@@ -44,9 +44,7 @@ def products(x):
 @pytest.fixture(scope="module")
 def model():
     data = km.collect(pendulum(), km.Uniform([-3.2, -4], [3.2, 4]), km.Noise(-10, 10), episodes=200, steps=40)
-    lifting = (
-        km.State() + km.Fourier(2, states="theta") + km.Expressions(products, list("abcde")) + km.Constant()
-    )
+    lifting = km.State() + km.Fourier(2, states="theta") + km.Expressions(products, list("abcde")) + km.Constant()
     found = km.edmd(data, lifting)
     assert found.nz == 12
     return found

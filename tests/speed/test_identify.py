@@ -10,29 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.folder import Files
-from koopmpc.data.stream import Stream
-from koopmpc.identify.chunks import ROWS
-from koopmpc.identify.edmd import edmd
-from koopmpc.identify.gather import moments
-from koopmpc.lifting.gaussian import Gaussian
-from koopmpc.lifting.state import State
+import koopmpc as km
+from koopmpc.identify.moments.rows import ROWS
 
 pytestmark = pytest.mark.speed
 
 NX = 100  # on State() these are 100 observables
 
 
-def data(snapshots: int, steps: int = 5000) -> Episodes:
+def data(snapshots: int, steps: int = 5000) -> km.Episodes:
     """Episodes of `steps` steps each, together `snapshots` pairs: copies of at most 20, which fill no cache."""
     rng = np.random.default_rng(0)
     count = snapshots // steps
     some = [
-        Episode(X=rng.standard_normal((steps + 1, NX)), U=rng.standard_normal((steps, 1)))
+        km.Episode(X=rng.standard_normal((steps + 1, NX)), U=rng.standard_normal((steps, 1)))
         for _ in range(min(count, 20))
     ]
-    return Episodes([some[i % len(some)] for i in range(count)], 0.1)
+    return km.Episodes([some[i % len(some)] for i in range(count)], 0.1)
 
 
 def bare(chunks: list[np.ndarray], snapshots: int) -> float:
@@ -60,9 +54,9 @@ def test_moments_of_a_million_snapshots(benchmark, route: str, limit: float) -> 
     def both() -> None:
         start = time.process_time()
         if route == "gram":
-            edmd(episodes, State())  # which chooses Gram here
+            km.edmd(episodes, km.State())  # which chooses Gram here
         else:
-            moments(episodes, State(), route="qr")
+            km.moments.second_moments(episodes, km.State(), route="qr")
         pairs.append((time.process_time() - start, bare(chunks, snapshots)))
 
     benchmark.pedantic(both, rounds=5, warmup_rounds=1)
@@ -83,7 +77,7 @@ def test_memory_does_not_grow_with_the_snapshots(benchmark, route: str) -> None:
         for snapshots in (20_000, 1_000_000):
             episodes = data(snapshots)
             tracemalloc.start()
-            moments(episodes, State(), route=route)
+            km.moments.second_moments(episodes, km.State(), route=route)
             peaks[f"extra at {snapshots} [MB]"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 2)
             tracemalloc.stop()
 
@@ -98,14 +92,14 @@ def test_memory_does_not_grow_with_the_snapshots(benchmark, route: str) -> None:
 @pytest.mark.parametrize("route", ["gram", "qr"])
 def test_a_stream_of_ten_million_rows_needs_no_memory_of_its_own(benchmark, route: str) -> None:
     rng = np.random.default_rng(0)
-    one = Episodes([Episode(X=rng.standard_normal((20_001, 3))) for _ in range(5)], 0.1)
+    one = km.Episodes([km.Episode(X=rng.standard_normal((20_001, 3))) for _ in range(5)], 0.1)
     peaks: dict[str, float] = {}
 
     def measure() -> None:
         for sets in (10, 100):
             gc.collect()
             tracemalloc.start()
-            moments(Stream(one for _ in range(sets)), State(), route=route)
+            km.moments.second_moments(km.Stream(one for _ in range(sets)), km.State(), route=route)
             peaks[f"extra at {sets * 100_000} [MB]"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 2)
             tracemalloc.stop()
 
@@ -120,9 +114,9 @@ def test_a_stream_of_ten_million_rows_needs_no_memory_of_its_own(benchmark, rout
 def test_five_thousand_episodes_cost_what_a_hundred_do(benchmark) -> None:
     rng = np.random.default_rng(0)
     sets = {
-        count: Episodes(
+        count: km.Episodes(
             [
-                Episode(
+                km.Episode(
                     X=rng.standard_normal((100_000 // count + 1, NX)),
                     U=rng.standard_normal((100_000 // count, 1)),
                 )
@@ -137,7 +131,7 @@ def test_five_thousand_episodes_cost_what_a_hundred_do(benchmark) -> None:
     def every() -> None:
         for count, episodes in sets.items():
             start = time.process_time()
-            edmd(episodes, State())
+            km.edmd(episodes, km.State())
             seconds[count].append(time.process_time() - start)
 
     benchmark.pedantic(every, rounds=7, warmup_rounds=1)
@@ -159,10 +153,10 @@ def cluster(workers: int) -> Iterator[str]:
 def test_two_dask_workers_against_one(benchmark, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for i in range(12):
-        episode = Episode(X=rng.standard_normal((240_001, 8)), U=rng.standard_normal((240_000, 1)))
-        Episodes([episode], 0.1).save(tmp_path / f"{i:02}.npz")
-    lifting = State() + Gaussian(rng.standard_normal((92, 8)), 2.0)
-    source, pairs = Files(tmp_path), []
+        episode = km.Episode(X=rng.standard_normal((240_001, 8)), U=rng.standard_normal((240_000, 1)))
+        km.Episodes([episode], 0.1).save(tmp_path / f"{i:02}.npz")
+    lifting = km.State() + km.Gaussian(rng.standard_normal((92, 8)), 2.0)
+    source, pairs = km.Files(tmp_path), []
 
     with cluster(1) as one, cluster(2) as two:
         where = ({"scheduler": one}, {"scheduler": two})
@@ -171,7 +165,7 @@ def test_two_dask_workers_against_one(benchmark, tmp_path: Path) -> None:
             seconds: list[float] = []
             for how in where:
                 start = time.perf_counter()
-                moments(source, lifting, route="gram", **how)
+                km.moments.second_moments(source, lifting, route="gram", **how)
                 seconds.append(time.perf_counter() - start)
             pairs.append(seconds)
 

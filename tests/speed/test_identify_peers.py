@@ -26,9 +26,7 @@ def cart_pole(episodes: int, pairs: int = PAIRS, seed: int = 0) -> km.Episodes:
     step_map = km.discretize(plant.dynamics, dt=0.02)
     size = np.array([1.0, 2.0, 1.0, 3.0])
     start = km.Uniform(-size, size)
-    data = km.collect(
-        step_map, start, km.Noise(-5, 5, hold=5), episodes=episodes, steps=pairs // episodes, rng=seed
-    )
+    data = km.collect(step_map, start, km.Noise(-5, 5, hold=5), episodes=episodes, steps=pairs // episodes, rng=seed)
     return km.Episodes([km.Episode(X=np.clip(e.X / (3 * size), -3, 3), U=e.U / 5) for e in data], data.dt)
 
 
@@ -60,10 +58,7 @@ class Pykoop:
 
     def prepare(self, data: km.Episodes) -> np.ndarray:
         return np.vstack(
-            [
-                np.hstack([np.full((len(e.X), 1), i), e.X, np.vstack([e.U, e.U[-1:]])])
-                for i, e in enumerate(data)
-            ]
+            [np.hstack([np.full((len(e.X), 1), i), e.X, np.vstack([e.U, e.U[-1:]])]) for i, e in enumerate(data)]
         )
 
     def fit(self, table: np.ndarray) -> None:
@@ -224,7 +219,7 @@ def test_dmd_of_1000_by_1000_beside_pydmd(benchmark, rank: int | None) -> None:
     def ours() -> None:
         model = km.dmd(data, rank=rank)
         assert model.modes.shape[0] == 1000
-        km.amplitudes(model, X[0])  # PyDMD computes modes and amplitudes too
+        km.spectrum.amplitudes(model, X[0])  # PyDMD computes modes and amplitudes too
 
     benchmark.pedantic(lambda: pairs.append((timed(ours), timed(theirs))), rounds=3, warmup_rounds=1)
     a, b = np.median(pairs, axis=0)

@@ -5,21 +5,18 @@ import time
 import numpy as np
 import pytest
 
-from koopmpc.identify.online import OnlineEDMD
-from koopmpc.lifting.constant import Constant
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import State
+import koopmpc as km
 
 pytestmark = pytest.mark.speed
 
-SIZES = {14: (State() + Monomials(2) + Constant(), 3, 4), 104: (State() + Constant(), 100, 3)}  # nz + nu
+SIZES = {14: (km.State() + km.Monomials(2) + km.Constant(), 3, 4), 104: (km.State() + km.Constant(), 100, 3)}  # nz + nu
 
 
-def learner(width: int, **options: float) -> tuple[OnlineEDMD, np.ndarray, np.ndarray]:
+def learner(width: int, **options: float) -> tuple[km.OnlineEDMD, np.ndarray, np.ndarray]:
     """Return one that has learned from some data, and these data."""
     lifting, nx, nu = SIZES[width]
     states, inputs = [f"x{i}" for i in range(nx)], [f"u{i}" for i in range(nu)]
-    online = OnlineEDMD(lifting, dt=0.1, states=states, inputs=inputs, **options)
+    online = km.OnlineEDMD(lifting, dt=0.1, states=states, inputs=inputs, **options)
     rng = np.random.default_rng(0)
     X, U = rng.standard_normal((4001, nx)), rng.standard_normal((4000, nu))
     online.update(X[:-1], U, X[1:])

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.prepare import Prepared
+from koopmpc.bench.controllers import Prepared
 
 pytestmark = pytest.mark.speed
 
 LIMITS = {
     "inputs": km.Limits(-12, 12),
-    "inputs and soft states": km.Limits(
-        -12, 12, x_min=[-np.inf, -0.25], x_max=[np.inf, 0.25], slack=(100, 100)
-    ),
+    "inputs and soft states": km.Limits(-12, 12, x_min=[-np.inf, -0.25], x_max=[np.inf, 0.25], slack=(100, 100)),
 }
 
 
@@ -168,7 +166,7 @@ class DoMPC:
         self.ipopt.append(self.mpc.solver_stats["t_wall_total"])
         good = self.mpc.solver_stats["success"]
         status = km.Status.OPTIMAL if good else km.Status.FAILED
-        return km.Move(u.ravel().copy(), status, km.Fallback.NONE, taken, 0)
+        return km.Move(u.ravel().copy(), status, km.control.Fallback.NONE, taken, 0)
 
 
 @pytest.mark.filterwarnings("ignore")  # what do-mpc's own imports warn of

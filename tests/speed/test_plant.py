@@ -6,10 +6,10 @@ import time
 import numpy as np
 import pytest
 
-from koopmpc.plant import batch, compiled
-from koopmpc.plant.graph import Graph
-from koopmpc.plant.step_map import discretize
-from tests.plant.models import CartPole
+import koopmpc as km
+from koopmpc.plants import batch, compiled
+from koopmpc.plants.graph import Graph
+from tests.plants.models import CartPole
 
 pytestmark = pytest.mark.speed
 EPISODES, STEPS = 5000, 200
@@ -17,7 +17,7 @@ EPISODES, STEPS = 5000, 200
 
 @pytest.fixture(scope="module")
 def plant():
-    return discretize(CartPole(), 0.02)
+    return km.discretize(CartPole(), 0.02)
 
 
 @pytest.fixture(scope="module")

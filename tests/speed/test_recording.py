@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder, record
+import koopmpc as km
 from tests.recording.runs import about, make_run, steps_of
 
 pytestmark = pytest.mark.speed
@@ -15,7 +14,7 @@ pytestmark = pytest.mark.speed
 def test_record(benchmark: Any, tmp_path: Path) -> None:
     run = make_run(nx=20, T=10_000, N=None, noisy=False)
     path = tmp_path / "run.rrd"
-    benchmark.pedantic(record, args=(run, path), rounds=7, warmup_rounds=1)
+    benchmark.pedantic(km.record, args=(run, path), rounds=7, warmup_rounds=1)
     scalars = run.X.size + run.reference.size + run.U.size + run.solve_time.size + run.iterations.size
     rate, size = scalars / benchmark.stats["median"] / 1e6, path.stat().st_size / scalars
     benchmark.extra_info |= {"million scalars/s": rate, "bytes a scalar": size}
@@ -24,13 +23,13 @@ def test_record(benchmark: Any, tmp_path: Path) -> None:
 
 def test_load_run(benchmark: Any, tmp_path: Path) -> None:
     run = make_run(nx=20, T=10_000, N=None, noisy=False)
-    record(run, tmp_path / "run.rrd")
-    assert benchmark.pedantic(load_run, args=(tmp_path / "run.rrd",), rounds=5, warmup_rounds=1) == run
+    km.record(run, tmp_path / "run.rrd")
+    assert benchmark.pedantic(km.load_run, args=(tmp_path / "run.rrd",), rounds=5, warmup_rounds=1) == run
 
 
 def test_recorder_call(benchmark: Any, tmp_path: Path) -> None:
     run = make_run(nx=4, T=2000, N=40)
     steps = iter(steps_of(run))
-    with Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+    with km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
         benchmark.pedantic(recorder, setup=lambda: ((next(steps),), {}), rounds=2000)
     print(f"\nRecorder: {1e6 * benchmark.stats['median']:.1f} µs a call")  # noqa: T201

@@ -121,9 +121,7 @@ def test_against_the_bare_solver(benchmark, name, bare, N, outputs):
     loop = Loop(N, outputs)
     sides = ours(name, loop), bare(loop)
     pairs = []
-    benchmark.pedantic(
-        lambda: pairs.append([loop.replay(*side) for side in sides]), rounds=9, warmup_rounds=1
-    )
+    benchmark.pedantic(lambda: pairs.append([loop.replay(*side) for side in sides]), rounds=9, warmup_rounds=1)
     a, b = (np.concatenate(times) for times in zip(*pairs[1:], strict=True))
     ratio = np.median([np.median(one) / np.median(other) for one, other in pairs[1:]])
     half, high = ([np.quantile(t, q) * 1e6 for t in (a, b)] for q in (0.5, 0.99))
@@ -173,9 +171,7 @@ def test_whole_steps_of_a_millisecond(benchmark, name, states):
     unstable, push = np.array([[1.1, 0.1], [0.0, 1.05]]), np.array([[0.0], [0.1]])
     model = km.LinearPredictor(unstable, push, np.eye(2), km.State(), 0.1, ("x", "v"), ("u",))
     ends = {} if states == "free" else {"x_min": [-0.15, -0.3], "x_max": [0.15, 0.3]}
-    mpc = km.KoopmanMPC(
-        model, km.Cost([1, 1], 1e-3), km.Limits(-1, 1, **ends), 100, solver=name, time_limit=1e-3
-    )
+    mpc = km.KoopmanMPC(model, km.Cost([1, 1], 1e-3), km.Limits(-1, 1, **ends), 100, solver=name, time_limit=1e-3)
     rng, moves = np.random.default_rng(0), []
 
     def step():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.predict.score import forecast_errors
+from koopmpc.validate.scoring import forecast_errors
 
 pytestmark = pytest.mark.speed
 
@@ -63,6 +63,6 @@ def test_the_bands_of_a_score_beside_its_forecasts(benchmark) -> None:
 
 def test_asking_whether_a_state_was_seen(benchmark) -> None:
     model, held_out = model_and_data(20, 200)
-    seen, x, u = km.coverage(held_out).seen, held_out[0].X[0], held_out[0].U[0]
+    seen, x, u = km.validate.coverage(held_out).seen, held_out[0].X[0], held_out[0].U[0]
     assert benchmark(seen, x, u)
     assert model.nx == len(x)

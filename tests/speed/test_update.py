@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.bilinear_mpc import BilinearMPC
-from koopmpc.control.koopman_mpc import KoopmanMPC
 
 pytestmark = pytest.mark.speed
 NX, N, PAIRS = 11, 40, 30
@@ -25,7 +23,7 @@ def model(seed: int) -> km.LinearPredictor:
     return km.LinearPredictor(whole, B, np.eye(NX, NX + 1), km.State() + km.Constant(), 0.02, states, ("u",))
 
 
-@pytest.mark.parametrize("kind", [KoopmanMPC, BilinearMPC])
+@pytest.mark.parametrize("kind", [km.KoopmanMPC, km.BilinearMPC])
 def test_update(benchmark, kind):
     models, cost, limits = (model(0), model(1)), km.Cost(Q=1, R=0.1), km.Limits(-1, 1)
     mpc, x, r = kind(models[0], cost, limits, N), np.full(NX, 0.1), np.zeros(NX)

@@ -129,9 +129,7 @@ class Bounds:
             They hold NaN or cross.
         """
         if low.shape != self.low.shape or high.shape != self.low.shape:
-            raise ShapeError(
-                f"the limits have shapes {low.shape} and {high.shape}, the QP has {len(self.low)} rows"
-            )
+            raise ShapeError(f"the limits have shapes {low.shape} and {high.shape}, the QP has {len(self.low)} rows")
         new_low, new_high = self._spare
         np.maximum(low, self._ends[0], out=new_low)
         np.minimum(high, self._ends[1], out=new_high)
@@ -145,6 +143,4 @@ class Bounds:
 def check_start(qp: QP, v: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]) -> None:
     """Raise where a warm start does not fit the QP."""
     if v.shape != qp.q.shape or y.shape != qp.low.shape:
-        raise ShapeError(
-            f"the warm start has shapes {v.shape} and {y.shape}, the QP is {qp.q.shape}, {qp.low.shape}"
-        )
+        raise ShapeError(f"the warm start has shapes {v.shape} and {y.shape}, the QP is {qp.q.shape}, {qp.low.shape}")

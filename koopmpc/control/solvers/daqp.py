@@ -212,9 +212,7 @@ def _model(settings: Mapping[str, Any]) -> Any:
     try:
         import daqp
     except ImportError as error:
-        raise DataError(
-            'daqp is not installed: pip install "koopmpc[daqp]", or pass solver="osqp"'
-        ) from error
+        raise DataError('daqp is not installed: pip install "koopmpc[daqp]", or pass solver="osqp"') from error
     model = daqp.Model()
     known = model.settings
     for name, value in settings.items():

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from koopmpc.control.move import Status
+import koopmpc as km
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.choose import SOLVERS
 
@@ -30,7 +30,7 @@ def test_adopting_a_qp_is_setting_it_up(name):
         solver.solve(*cold)
         solver.adopt(other)
         found, fresh = solver.solve(*cold), make(other, TIGHT[name]).solve(*cold)
-        assert found.status is fresh.status is Status.OPTIMAL
+        assert found.status is fresh.status is km.Status.OPTIMAL
         np.testing.assert_allclose(found.v, fresh.v, atol=1e-7)
 
 

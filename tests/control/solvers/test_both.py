@@ -199,15 +199,13 @@ def test_two_in_two_threads_do_not_disturb_each_other(name):
 def test_what_the_solvers_would_swallow_is_refused(name):
     three = np.ones(3)
     made = solver(name)(QP(np.eye(3), 2 * three, np.eye(3), -three, three), TIGHT[name])
-    with pytest.raises(km.ShapeError, match=r"the limits have shapes \(2,\) and \(2,\), the QP has 3 rows"):
+    with pytest.raises(km.errors.ShapeError, match=r"the limits have shapes \(2,\) and \(2,\), the QP has 3 rows"):
         made.update(-np.ones(2), np.ones(2))
-    with pytest.raises(
-        km.ShapeError, match=r"the warm start has shapes \(3,\) and \(2,\), the QP is \(3,\), "
-    ):
+    with pytest.raises(km.errors.ShapeError, match=r"the warm start has shapes \(3,\) and \(2,\), the QP is \(3,\), "):
         made.solve(three, np.ones(2))
     nan, wide = np.full(3, np.nan), np.full(3, np.inf)
     for low, high in ((three, -three), (nan, three), (-three, nan), (wide, wide), (-wide, -wide)):
-        with pytest.raises(km.DataError, match=r"the limits of the QP cross, hold NaN, or are beyond 1e30"):
+        with pytest.raises(km.errors.DataError, match=r"the limits of the QP cross, hold NaN, or are beyond 1e30"):
             made.update(low, high)
         solution = made.solve(0 * three, 0 * three)  # the old limits stand
         np.testing.assert_allclose(solution.v, -three, atol=1e-8)
@@ -217,5 +215,5 @@ def test_what_the_solvers_would_swallow_is_refused(name):
 
 
 def test_unknown_solvers():
-    with pytest.raises(km.DataError, match=r"solver is 'gurobi'; there are 'osqp', 'daqp'"):
+    with pytest.raises(km.errors.DataError, match=r"solver is 'gurobi'; there are 'osqp', 'daqp'"):
         solver("gurobi")

@@ -104,9 +104,7 @@ def test_every_end_has_a_status():
     assert solved(DAQP(qp, {"time_limit": 1e-9}), 60, 120).status is km.Status.TIME_LIMIT
     unbounded = QP(np.diag([1.0, 0.0]), -ONE, EYE[:1], -ONE[:1], ONE[:1])
     assert solved(DAQP(unbounded), 2, 1).status is km.Status.FAILED
-    with pytest.raises(
-        km.DataError, match=r"DAQP refuses the problem, exit flag -5; pass a convex QP, P ⪰ 0"
-    ):
+    with pytest.raises(km.errors.DataError, match=r"DAQP refuses the problem, exit flag -5; pass a convex QP, P ⪰ 0"):
         DAQP(QP(-EYE, ONE, EYE, -ONE, ONE))
 
 
@@ -124,13 +122,13 @@ def test_an_answer_that_misses_its_conditions_is_a_failure():
 
 
 def test_settings_that_daqp_would_swallow():
-    with pytest.raises(km.DataError, match=r"DAQP has no setting 'eps_abs'; it has primal_tol, dual_tol,"):
+    with pytest.raises(km.errors.DataError, match=r"DAQP has no setting 'eps_abs'; it has primal_tol, dual_tol,"):
         box(eps_abs=1e-9)
-    with pytest.raises(km.DataError, match=r"DAQP's primal_tol is -1; it must be above zero"):
+    with pytest.raises(km.errors.DataError, match=r"DAQP's primal_tol is -1; it must be above zero"):
         box(primal_tol=-1.0)
-    with pytest.raises(km.DataError, match=r"DAQP's iter_limit is 0; it must be at least 1"):
+    with pytest.raises(km.errors.DataError, match=r"DAQP's iter_limit is 0; it must be at least 1"):
         box(iter_limit=0)
-    with pytest.raises(km.DataError, match=r"DAQP's time_limit holds 1 NaN or inf"):
+    with pytest.raises(km.errors.DataError, match=r"DAQP's time_limit holds 1 NaN or inf"):
         box(time_limit=np.nan)
     (line,) = shown(
         """
@@ -153,7 +151,7 @@ from koopmpc.control.solvers.choose import solver
 one = np.ones(1)
 try:
     solver("daqp")(QP(np.eye(1), one, np.eye(1), -one, one), None)
-except km.DataError as error:
+except km.errors.DataError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -55,10 +55,10 @@ def test_strided_vectors_are_read_as_they_are():
 
 def test_what_osqp_would_swallow_is_refused():
     solver, three = box(), np.ones(3)
-    with pytest.raises(km.ShapeError, match=r"the limits have shapes \(2,\) and \(2,\), the QP has 3 rows"):
+    with pytest.raises(km.errors.ShapeError, match=r"the limits have shapes \(2,\) and \(2,\), the QP has 3 rows"):
         solver.update(-np.ones(2), np.ones(2))
     with pytest.raises(
-        km.ShapeError, match=r"the warm start has shapes \(3,\) and \(2,\), the QP is \(3,\), \(3,\)"
+        km.errors.ShapeError, match=r"the warm start has shapes \(3,\) and \(2,\), the QP is \(3,\), \(3,\)"
     ):
         solver.solve(three, np.ones(2))
     for low, high in (
@@ -67,9 +67,9 @@ def test_what_osqp_would_swallow_is_refused():
         (-three, np.full(3, np.nan)),
         (three, -three * np.inf),
     ):
-        with pytest.raises(km.DataError, match=r"the limits of the QP cross, hold NaN, or are beyond 1e30"):
+        with pytest.raises(km.errors.DataError, match=r"the limits of the QP cross, hold NaN, or are beyond 1e30"):
             solver.update(low, high)
-    with pytest.raises(km.DataError, match=r"beyond 1e30"):
+    with pytest.raises(km.errors.DataError, match=r"beyond 1e30"):
         solver.update(-5e30 * three, -4e30 * three)
     solver.update(-0.25 * three, three)  # and the solver is as good as before
     np.testing.assert_allclose(solver.solve(0 * three, 0 * three).v, -0.25 * three, atol=1e-3)
@@ -77,11 +77,11 @@ def test_what_osqp_would_swallow_is_refused():
 
 def test_a_qp_that_does_not_fit_is_refused():
     eye, one = np.eye(2), np.ones(2)
-    with pytest.raises(km.DataError, match=r"the QP's q holds 1 NaN or inf, the first at \(1,\)"):
+    with pytest.raises(km.errors.DataError, match=r"the QP's q holds 1 NaN or inf, the first at \(1,\)"):
         QP(eye, np.array([0, np.nan]), eye, -one, one)
-    with pytest.raises(km.DataError, match=r"the QP's low holds NaN; use ±inf"):
+    with pytest.raises(km.errors.DataError, match=r"the QP's low holds NaN; use ±inf"):
         QP(eye, one, eye, np.array([0, np.nan]), one)
-    with pytest.raises(km.DataError, match=r"the QP's limits cross at index 0: lower 1 is above upper -1"):
+    with pytest.raises(km.errors.DataError, match=r"the QP's limits cross at index 0: lower 1 is above upper -1"):
         QP(eye, one, eye, one, -one)
     lines = shown(
         """
@@ -103,9 +103,9 @@ show(lambda: QP(eye, one, eye, -one, np.ones(3)))
 
 def test_settings_that_osqp_refuses():
     for settings in ({"eps": 1e-3}, {"rho": -1.0}, {"max_iter": 0}, {"max_iter": "many"}):
-        with pytest.raises(km.DataError, match=r"OSQP refuses the problem or its settings \{'"):
+        with pytest.raises(km.errors.DataError, match=r"OSQP refuses the problem or its settings \{'"):
             box(**settings)
-    with pytest.raises(km.DataError, match=r"OSQP refuses the problem"):
+    with pytest.raises(km.errors.DataError, match=r"OSQP refuses the problem"):
         OSQP(QP(-np.eye(2), np.ones(2), np.eye(2), -np.ones(2), np.ones(2)))
 
 

@@ -1,0 +1,3 @@
+"""The command line."""
+
+from koopmpc.cli.app import app as app

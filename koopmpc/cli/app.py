@@ -1,0 +1,313 @@
+"""The command line: each command parses, calls one function, and prints."""
+
+import os
+import shlex
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from koopmpc.errors import FitWarning, KoopmpcError, LogError
+
+if TYPE_CHECKING:
+    from koopmpc.bench.problem import Problem
+
+app = typer.Typer(
+    name="koopmpc",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
+Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
+Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
+Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
+Controllers = Annotated[
+    list[str] | None,
+    typer.Option("--controller", "-c", help="One of the seven; may be repeated. Default: all."),
+]
+
+
+def _version(asked: bool) -> bool:
+    if asked:
+        from importlib.metadata import version
+
+        _console().print(f"koopmpc {version('koopmpc')}", highlight=False)
+        raise typer.Exit
+    return asked
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """From a CasADi model or from data to a constrained controller with a lifted linear predictor."""
+
+
+@app.command("list")
+def list_() -> None:
+    """Show the problems that there are, and their cases."""
+    from koopmpc.bench.library import list_problems, load_problem
+
+    out = _console()
+    for entry in list_problems():
+        out.print(Text.assemble((entry.name, "bold"), "  ", entry.title))
+        try:
+            out.print(Text(f"  cases: {', '.join(load_problem(entry.path).cases)}"))
+        except KoopmpcError as error:
+            out.print(Text(f"  {error}", style="red"))
+
+
+@app.command()
+def run(
+    problem: Annotated[str, typer.Argument(help=_PROBLEM)],
+    controller: Controllers = None,
+    faults: Faults = False,
+    live: Live = False,
+    logs: Logs = Path("logs"),
+) -> None:
+    """Run controllers in closed loop on one problem; one log a run, and a table."""
+    from koopmpc.bench.library import load_problem
+
+    with _friendly():
+        loaded = load_problem(problem)
+        _sweep([loaded], controller, faults, live, logs, loaded.name)
+
+
+@app.command()
+def bench(
+    problems: Annotated[list[str] | None, typer.Argument(help=_PROBLEM + " Default: all shipped problems.")] = None,
+    controller: Controllers = None,
+    faults: Faults = False,
+    live: Live = False,
+    logs: Logs = Path("logs"),
+) -> None:
+    """Compare the seven controllers on several problems."""
+    from koopmpc.bench.library import load_problem, shipped
+
+    with _friendly():
+        _sweep([load_problem(p) for p in problems or shipped()], controller, faults, live, logs, "bench")
+
+
+@app.command()
+def fit(
+    data: Annotated[list[Path], typer.Argument(help="A folder of .npz, .parquet, .csv and .rrd files, or files.")],
+    states: Annotated[str | None, typer.Option("--states", help="Columns of a table that are states: a,b,…")] = None,
+    inputs: Annotated[str | None, typer.Option("--inputs", help="Columns that are inputs: u,v,…")] = None,
+    dt: Annotated[float | None, typer.Option("--dt", help="Sample time in s, where no column tells it.")] = None,
+    resample: Annotated[
+        float | None, typer.Option("--resample", help="Sample time in s to bring unequal steps to.")
+    ] = None,
+    horizon: Annotated[
+        int | None, typer.Option("--horizon", help="Steps ahead that the model is chosen and judged by.")
+    ] = None,
+    linear: Annotated[bool, typer.Option("--linear", help="Try linear models only.")] = False,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Local processes, or those of --scheduler local.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help='tcp://host:port of a Dask cluster, or "local".')
+    ] = None,
+    logs: Logs = Path("logs"),
+    name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "fit",
+) -> None:
+    """Choose a model for logged data, fit it, and say whether to trust it; no option is needed."""
+    from koopmpc.fitting.fit import fit_data
+
+    out, err = _console(), Console(stderr=True)
+    with _friendly():
+        folder = _new_folder(logs, name)
+        try:
+            with _bar("reading") as progress:
+                done = fit_data(
+                    data[0] if len(data) == 1 else data,
+                    folder,
+                    dt=dt,
+                    states=None if states is None else _split(states),
+                    inputs=None if inputs is None else _split(inputs),
+                    resample=resample,
+                    horizon=horizon,
+                    bilinear=not linear,
+                    workers=workers,
+                    scheduler=scheduler,
+                    say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
+                    progress=progress,
+                )
+        except KoopmpcError:
+            if not any(folder.iterdir()):
+                folder.rmdir()
+            raise
+    for failure in done.failures:
+        err.print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
+    out.print(Text(f"model, report and pictures: {folder}"), soft_wrap=True)
+    if done.recording is not None:
+        out.print(Text(f"look at it: {shlex.join([*_program(), 'view', str(done.recording)])}"), soft_wrap=True)
+    out.print(Text(f"use it:\n{done.usage}"), soft_wrap=True)
+
+
+@app.command()
+def inspect(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
+    """Recompute the metrics of runs from their logs alone."""
+    from koopmpc.loop.metrics import metrics
+    from koopmpc.recording.format.reader import load_run
+
+    out = _console()
+    with _friendly():
+        for log in logs:
+            loaded = load_run(log)
+            keys = ("problem", "case", "controller", "fault")
+            title = " ".join(str(loaded.metadata[key]) for key in keys if key in loaded.metadata)
+            out.print(Text.assemble((title or str(log), "bold"), f"\n{metrics(loaded)}"), soft_wrap=True)
+
+
+@app.command()
+def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
+    """Open logs in one Rerun viewer."""
+    from koopmpc.recording.viewer import view as open_viewer
+
+    with _friendly():
+        open_viewer(logs)
+
+
+@app.command()
+def reproduce(
+    paper: Annotated[str, typer.Argument(help="The paper: snyder.")],
+    logs: Logs = Path("logs"),
+) -> None:
+    """Do a paper again: its figures, its numbers, and a verdict on each of its claims."""
+    from time import perf_counter
+
+    from koopmpc.papers.registry import find_paper, verdict_table
+
+    out, err = _console(), Console(stderr=True)
+    with _friendly():
+        found = find_paper(paper)
+        folder = _new_folder(logs, paper)
+        start = perf_counter()
+        with err.status("") as status:
+            outcome = found.reproduce(folder, False, status.update)
+        out.print(verdict_table(found.title, outcome.claims))
+        for path in (outcome.report, outcome.recording):
+            out.print(Text(str(path)), soft_wrap=True)
+        out.print(Text(f"done in {perf_counter() - start:.0f} s"))
+
+
+def _sweep(
+    problems: Sequence["Problem"],
+    controllers: list[str] | None,
+    faults: bool,
+    live: bool,
+    logs: Path,
+    what: str,
+) -> None:
+    """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
+    from koopmpc.bench.controllers import chosen
+    from koopmpc.bench.results import telling
+    from koopmpc.bench.sweep import sweep
+    from koopmpc.bench.table import table
+
+    chosen(controllers)
+    folder = _new_folder(logs, what)
+    with _bar("") as progress:
+        rows = sweep(
+            problems,
+            controllers,
+            folder=folder,
+            faults=faults,
+            live=live,
+            progress=progress,
+        )
+    out = _console()
+    out.print(table(rows))
+    out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
+    shown = telling(rows)
+    if shown is not None:
+        out.print(Text(f"look at a run: {shlex.join([*_program(), 'view', str(shown.log)])}"), soft_wrap=True)
+    if any(row.failure is not None for row in rows):
+        raise typer.Exit(1)
+
+
+def _split(names: str) -> list[str]:
+    """Return the names of ``"a, b"``; none of an empty text."""
+    return [name.strip() for name in names.split(",") if name.strip()]
+
+
+def _program() -> list[str]:
+    """Return how this program is called from the current folder, where the shell may not find it by its name."""
+    beside = shutil.which("koopmpc", path=str(Path(sys.executable).parent))
+    if beside is None:
+        return [_near(sys.executable), "-m", "koopmpc"]
+    known = shutil.which("koopmpc")
+    return ["koopmpc" if known is not None and Path(known).samefile(beside) else _near(beside)]
+
+
+def _near(path: str) -> str:
+    """Return the path from the current folder where that is shorter."""
+    try:
+        return min(os.path.relpath(path), path, key=len)
+    except ValueError:  # on another drive
+        return path
+
+
+@contextmanager
+def _bar(first: str) -> Generator[Callable[[str, int, int | None], None]]:
+    """Show a progress bar on stderr, and hand out what moves it: (what, done, total)."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda what, done, total: bar.update(task, description=what[:40], completed=done, total=total)
+
+
+def _console() -> Console:
+    """Return the console of stdout, 100 columns wide where it is no terminal."""
+    out = Console()
+    return out if out.is_terminal else Console(width=100)
+
+
+def _new_folder(logs: Path, what: str) -> Path:
+    """Make and return logs/<time>-<what>, with a number behind it where two calls share a second."""
+    stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}-{what}"
+    tries = 0
+    while True:
+        folder = logs / (stem if tries == 0 else f"{stem}-{tries}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            tries += 1
+        except OSError as error:
+            raise LogError(
+                f"--logs {logs}: no folder can be made there, {error.strerror}; pass a folder that you may write to"
+            ) from error
+        else:
+            return folder
+
+
+@contextmanager
+def _friendly() -> Generator[None]:
+    """Show errors of koopmpc and warnings as one message each on stderr; exit code 2 for an error."""
+    err = Console(stderr=True)
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        err.print(Text.assemble((f"{category.__name__}: ", "yellow"), str(message)), soft_wrap=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", FitWarning)
+        warnings.showwarning = show
+        try:
+            yield
+        except KoopmpcError as error:
+            err.print(Text.assemble((f"{type(error).__name__}: ", "red"), str(error)), soft_wrap=True)
+            raise typer.Exit(2) from error

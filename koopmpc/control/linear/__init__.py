@@ -1,0 +1,1 @@
+"""Predictive control on lifted linear models."""

@@ -1,0 +1,217 @@
+"""Horizon: a cost over N steps of a lifted model as stages of linear–quadratic control, one a block of held inputs.
+
+The stages are written in f = [w_0 … w_{N−1}; d; 1], the preview of measured disturbances and a constant disturbance of
+z: what moves the state. What is only tracked, references and the coordinates of targets, comes in when the horizon is
+condensed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.control.riccati import Stage
+from koopmpc.control.target import Targets
+from koopmpc.errors import DataError
+
+
+class Signals(NamedTuple):
+    """Where the entries of f stand, for N steps and the sizes of w and d."""
+
+    N: int
+    nw: int
+    nd: int
+
+    @property
+    def size(self) -> int:
+        """Entries of f."""
+        return self.N * self.nw + self.nd + 1
+
+    def w(self, k: int) -> slice:
+        """w_k."""
+        return slice(k * self.nw, (k + 1) * self.nw)
+
+    @property
+    def d(self) -> slice:
+        """All of d."""
+        return slice(self.N * self.nw, self.N * self.nw + self.nd)
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """z⁺ = A z + B u + E w + d over blocks of held inputs; tracked outputs C z, limited outputs G z, the weights.
+
+    `rated` puts the last input beside z, ξ = [z; u_{k−1}], as a weight or a limit of u_k − u_{k−1} needs it; `bounded`
+    says that there is such a limit. P_N weighs ξ_N − ξ_r, or x_N − r_N where CQ_N = CᵀQ_N is given.
+    """
+
+    A: Float[np.ndarray, "nz nz"]
+    B: Float[np.ndarray, "nz nu"]
+    E: Float[np.ndarray, "nz nw"]
+    C: Float[np.ndarray, "nr nz"]
+    G: Float[np.ndarray, "ng nz"]
+    Q: Float[np.ndarray, "nr nr"]
+    R: Float[np.ndarray, "nu nu"]
+    R_delta: Float[np.ndarray, "nu nu"] | None
+    P_N: Float[np.ndarray, "nx nx"]
+    CQ_N: Float[np.ndarray, "nz nr"] | None
+    blocks: tuple[int, ...]
+    rated: bool
+    bounded: bool
+    disturbed: bool
+
+    @property
+    def N(self) -> int:
+        """Steps."""
+        return sum(self.blocks)
+
+    @property
+    def size(self) -> int:
+        """Entries of ξ."""
+        return len(self.A) + self.B.shape[1] * self.rated
+
+    @property
+    def signals(self) -> Signals:
+        """The places in f."""
+        return Signals(self.N, self.E.shape[1], len(self.A) if self.disturbed else 0)
+
+    def push(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
+        """Return E w_k + d as a matrix on f; None where there is neither."""
+        if not self.disturbed and not self.E.shape[1]:
+            return None
+        signals = self.signals
+        e = np.zeros((len(self.A), signals.size))
+        e[:, signals.w(k)] = self.E
+        e[:, signals.d] = np.eye(len(self.A), signals.nd)
+        return e
+
+
+def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:
+    """Return the lengths of the blocks: N ones, M moves of which the last is held, or `moves` itself.
+
+    Raises
+    ------
+    DataError
+        There are more moves than steps, or the lengths do not sum to N.
+    """
+    if moves is None:
+        return (1,) * N
+    if isinstance(moves, Sequence):
+        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
+        if sum(lengths) != N:
+            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
+        return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
+    M = checks.count(moves, "moves")
+    if M > N:
+        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
+    return (1,) * (M - 1) + (N - M + 1,)
+
+
+def one_step(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    R_delta: Float[np.ndarray, "nu nu"] | None,
+) -> Stage:
+    """Return one step with the cost ‖z‖²_Q + ‖u‖²_R, on [z; u_{k−1}] with ‖u − u_{k−1}‖²_{R_delta} where given."""
+    nz, nu = B.shape
+    if R_delta is None:
+        return Stage(A, B, Q, None, R)
+    M = np.vstack([np.zeros((nz, nu)), -R_delta])
+    return Stage(_stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)]), _stacked(Q, R_delta), M, R + R_delta)
+
+
+def stages(horizon: Horizon, targets: Targets) -> list[Stage]:
+    """Return a stage for every block of b steps: A = Aᵇ, B = Σ AⁱB, and the cost of its steps summed."""
+    nz, nu = horizon.B.shape
+    powers = [(np.eye(nz), np.zeros((nz, nu))), (horizon.A, horizon.B)]
+    while len(powers) <= max(horizon.blocks):
+        powers.append((horizon.A @ powers[-1][0], horizon.A @ powers[-1][1] + horizon.B))
+    weighed = horizon.R @ _input(horizon, targets)
+    known: dict[tuple[int, int], Stage] = {}
+    result: list[Stage] = []
+    k = 0
+    for b in horizon.blocks:
+        key = b, k if horizon.signals.nw else 0  # without a preview all blocks of a length are the same
+        if key not in known:
+            known[key] = _stage(horizon, powers[: b + 1], k, -b * weighed)
+        result.append(known[key])
+        k += b
+    return result
+
+
+def _stage(
+    h: Horizon,
+    powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]],
+    k: int,
+    r: Float[np.ndarray, "nu nf"],
+) -> Stage:
+    """Return the stage of a block from step k on, r what is known of its linear term in u."""
+    nz, nu = h.B.shape
+    (A, B), q, e = powers[-1], None, h.push(k)
+    for i, (Ai, Bi) in enumerate(powers[1:-1], 1):
+        push = h.push(k + i)
+        if e is not None and push is not None:
+            missed = h.C.T @ (h.Q @ (h.C @ e))
+            q = np.zeros((h.size, h.signals.size)) if q is None else q
+            q[:nz] += Ai.T @ missed
+            r = r + Bi.T @ missed
+            e = h.A @ e + push
+    if h.rated:
+        A, B = _stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
+        e = None if e is None else np.vstack([e, np.zeros((nu, h.signals.size))])
+    return Stage(A, B, *_weights(h, powers[:-1]), e, q, r)
+
+
+def end(horizon: Horizon, targets: Targets) -> Float[np.ndarray, "nx nf"]:
+    """Return the linear term p_N of the terminal weight, as a matrix on f."""
+    h, nz = horizon, len(horizon.A)
+    p = np.zeros((h.size, h.signals.size))
+    if h.CQ_N is not None:
+        return p
+    z_r = np.zeros((nz, h.signals.size))
+    z_r[:, -1] = targets.z0
+    push = h.push(h.N - 1)
+    if push is not None:
+        z_r += targets.z_push @ push
+    p -= h.P_N[:, :nz] @ z_r
+    if h.rated:
+        p -= h.P_N[:, nz:] @ _input(h, targets)
+    return p
+
+
+def _input(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
+    """Return u_r less what the coordinates of the target add; the last disturbance of the preview stays."""
+    u_r = np.zeros((len(targets.u0), h.signals.size))
+    u_r[:, -1] = targets.u0
+    push = h.push(h.N - 1)
+    return u_r if push is None else u_r + targets.u_push @ push
+
+
+def _weights(
+    h: Horizon, powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]]
+) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"] | None, Float[np.ndarray, "nu nu"]]:
+    """Return Q, M and R of a block on ξ and its input; M is None where it is zero."""
+    nz, nu = h.B.shape
+    CQC = h.C.T @ h.Q @ h.C
+    Q, M, R = CQC.copy(), np.zeros((nz, nu)), len(powers) * h.R
+    for Ai, Bi in powers[1:]:
+        Q, M, R = Q + Ai.T @ CQC @ Ai, M + Ai.T @ CQC @ Bi, R + Bi.T @ CQC @ Bi
+    if not h.rated:
+        return Q, M if len(powers) > 1 else None, R
+    R_delta = np.zeros((nu, nu)) if h.R_delta is None else h.R_delta
+    return _stacked(Q, R_delta), np.vstack([M, -R_delta]), R + R_delta
+
+
+def _stacked(X: Float[np.ndarray, "nz nz"], Y: Float[np.ndarray, "nu nu"]) -> Float[np.ndarray, "nx nx"]:
+    """Return the block diagonal of X and Y."""
+    nz, nx = len(X), len(X) + len(Y)
+    whole = np.zeros((nx, nx))
+    whole[:nz, :nz], whole[nz:, nz:] = X, Y
+    return whole

@@ -1,0 +1,314 @@
+"""KoopmanMPC: the Riccati solution first, a QP only where a limit is active."""
+
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any, Literal, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.base import PlanMemory, Receding, admitted, hard
+from koopmpc.control.cost import Cost
+from koopmpc.control.initial_condition import Lifted, Origin, Sizes, numbers
+from koopmpc.control.limits import Box, Limits
+from koopmpc.control.linear.condense import Coordinates
+from koopmpc.control.linear.horizon import blocked
+from koopmpc.control.linear.plan_map import PlanMap
+from koopmpc.control.linear.qp import Constrained
+from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.tracking import reference_rows
+from koopmpc.errors import DataError
+from koopmpc.estimate.measured import Measured
+from koopmpc.estimate.observer import Estimator
+from koopmpc.lifting.buffered import HUGE
+from koopmpc.predict.linear import LinearPredictor
+
+_VIEWS = ("_met", "_met_low", "_met_high")
+
+
+class KoopmanMPC(Receding):
+    """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
+
+    The backward Riccati recursion gives the unconstrained plan as one matrix–vector product of [z, 1], or of
+    [z, u_{−1}, w, d, 1] where those matter; where that plan meets every limit it is the optimum (status
+    UNCONSTRAINED). Otherwise the condensed QP is solved for the deviation from it, warm-started with the last
+    solution moved on by one step (OPTIMAL, or SOFTENED where a limit had to give way). A failed step falls back on
+    the last plan, then on the clipped unconstrained input, then on the last input. Inputs never leave their limits,
+    nor their rates where these are hard and within reach of the limits.
+
+    Parameters
+    ----------
+    predictor
+        The lifted model.
+    cost, limits
+        What to minimise, within what.
+    horizon
+        N steps of the predictor's dt.
+    moves
+        How many inputs the plan has: M of them, the last held to the end of the horizon, or the lengths of the
+        blocks of steps in which each is held. By default one a step.
+    estimator
+        Estimates z and a disturbance d of every lifted coordinate, so that no offset is left: `LiftedDisturbance`
+        where y is the state, `LiftedKalman` where y is some of it. Without one y is the state, and d zero.
+    latency
+        Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts
+        from the state predicted for then, under the inputs that are still to act; zero moved inside the limits
+        acts before the first. `horizon` grows by it: more of the reference is read.
+    coordinates
+        Variables of the QP: "plain", the inputs; "riccati", those in which the Hessian is the identity however
+        unstable the plant; "auto" takes the plain ones where their Hessian is well conditioned.
+    solver
+        "osqp", or "daqp", an active-set method that the extra ``koopmpc[daqp]`` installs.
+    settings
+        The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}``.
+    time_limit
+        Wall-clock time a step may take [s]. A QP that is not solved by then is given up for the fallback; what is
+        late although it was solved is used. Either way the status is TIME_LIMIT.
+
+    Raises
+    ------
+    ObservableError
+        The cost or a limit is on an observable that the lifting lacks.
+    DefinitenessError
+        A weight, or R + BᵀPB, is not positive definite.
+    DataError, ShapeError
+        A horizon below 1, crossed limits, sizes that do not fit.
+
+    References
+    ----------
+    Korda & Mezić, "Linear predictors for nonlinear dynamical systems: Koopman operator meets model predictive
+    control", Automatica 93, 2018.
+    """
+
+    def __init__(
+        self,
+        predictor: LinearPredictor,
+        cost: Cost,
+        limits: Limits | None = None,
+        horizon: int = 20,
+        *,
+        estimator: Estimator | None = None,
+        latency: int = 0,
+        moves: int | Sequence[int] | None = None,
+        coordinates: Coordinates = "auto",
+        solver: Literal["osqp", "daqp"] = "osqp",
+        settings: Mapping[str, Any] | None = None,
+        time_limit: float | None = None,
+    ) -> None:
+        if coordinates not in ("auto", "riccati", "plain"):
+            raise DataError(f'coordinates is {coordinates!r}; pass "auto", "riccati" or "plain"')
+        checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
+        if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator | None):
+            raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
+        super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, time_limit)
+        self._blocks = blocked(moves, self._N)
+        self.predictor = predictor
+        self._disturbed = estimator is not None
+        self._map = PlanMap(
+            predictor,
+            self.cost,
+            self.limits,
+            self._blocks,
+            disturbed=self._disturbed,
+            coordinates="riccati" if (coordinates, solver) == ("auto", "daqp") else coordinates,
+        )
+        track = self._map.track
+        self._constrained = Constrained(self._map.hard, self._map.soft, solver, settings)
+        self._rated = self._map.horizon.rated
+        self._hard_rates = hard(track.rates, track.rate_softness.linear)
+        self._move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
+        self._memory = PlanMemory(track.inputs, self._N, track.rates, self._move_of)
+
+        observer = Measured(predictor) if estimator is None else estimator.start(predictor)
+        self._origin = Origin(
+            Lifted(predictor),
+            observer,
+            Sizes(predictor.nz, self._nu, predictor.nw, self._N),
+            self._latency,
+            rated=self._rated,
+            estimated=self._disturbed,
+            remembers=predictor.embedding is not None,
+        )
+        rows = len(self._map.matrix)
+        self._plan, self._spare = np.zeros(rows), np.zeros(rows)
+        self._reference = np.zeros((self._N + 1, len(track.C)))
+        self._reference_key: bytes | None = None
+        self._see()
+        self.reset()
+
+    def _see(self) -> None:
+        """Make the views of the bytes that say which limits are met; a copy makes its own."""
+        rows = len(self._plan)
+        self._met = bytearray(2 * rows)
+        met = np.frombuffer(self._met, dtype=np.bool_)
+        self._met_low, self._met_high = met[:rows], met[rows:]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
+
+    @property
+    def coordinates(self) -> str:
+        """The coordinates of the QP: "riccati" or "plain"."""
+        return self._map.maps.coordinates
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Forget all earlier steps, so that a run repeats to the bit.
+
+        `u_prev`, zero moved inside the limits by default, is where rates count from, and is held if the first step
+        fails. A filter starts at x0, by default at zero.
+        """
+        self._memory.reset(u_prev)
+        self._constrained.reset()
+        self._planned = False
+        self._origin.reset(x0, self._memory.last())
+
+    def update(self, predictor: LinearPredictor) -> None:
+        """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
+
+        Raises
+        ------
+        DataError
+            The predictor has another lifting, dt, other states, inputs or disturbances than the last one.
+        """
+        checks.kind(predictor, "predictor", LinearPredictor, "it replaces another LinearPredictor")
+        old = self.predictor
+        for name in ("lifting", "dt", "states", "inputs", "disturbances"):
+            if getattr(predictor, name) != getattr(old, name):
+                raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
+        self._map = PlanMap(
+            predictor,
+            self.cost,
+            self.limits,
+            self._blocks,
+            disturbed=self._disturbed,
+            coordinates="plain" if self.coordinates == "plain" else "riccati",
+        )
+        self.predictor = predictor
+        self._constrained.adopt(self._map.hard, self._map.soft)
+        self._reference_key = None
+        self._origin.adopt(Lifted(predictor))
+        self.observer.adopt(predictor)
+
+    def __call__(
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+    ) -> Move:
+        """Return the first input of the plan for measurement y.
+
+        Parameters
+        ----------
+        y
+            (nx,) measured state, or the (ny,) measurements of the estimator; there NaN is a missed one.
+        reference
+            (nr,) held over the horizon, or rows r_k … r_{k+N}, the last repeated; r_{k+N+latency} with latency.
+        applied
+            (nu,) what the plant really got last; by default the last u returned.
+        w
+            (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N−1}, the last repeated,
+            w_{k+N+latency−1} with latency; by default zero.
+        """
+        start = perf_counter()
+        origin = self._origin
+        origin.take(y, self._memory.last(), applied, w)
+        target = numbers(reference, "reference")
+        key = target.tobytes()
+        if key != self._reference_key:
+            self._aim(target)
+            self._reference_key = key
+
+        t = self._spare
+        self._map.matrix.dot(origin.known, t)
+        np.greater_equal(t, self._map.low, out=self._met_low)
+        np.less_equal(t, self._map.high, out=self._met_high)
+        if 0 not in self._met:  # every limit is met, and nothing is NaN
+            return self._unconstrained(t, start)
+        return self._limited(t, applied, start)
+
+    def plan(self) -> Plan | None:
+        """Return the plan of the last call; None where it had none."""
+        if not self._planned:
+            return None
+        A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
+        moves = self._plan[: len(self._blocks) * self._nu].reshape(-1, self._nu)
+        U = moves[self._move_of]
+        push = self._origin.W @ E.T
+        if self._disturbed:
+            push = push + self._origin.d
+        Z = np.empty((self._N + 1, self.predictor.nz))
+        Z[0] = self._origin.z
+        for k in range(self._N):
+            Z[k + 1] = A @ Z[k] + B @ U[k] + push[k]
+        return Plan(Z @ C.T, U)
+
+    def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
+        """Write the reference's part of the plan into the last column."""
+        self._reference = reference_rows(self._previewed(reference), self._N, self._reference.shape[1])
+        self._map.aim(self._reference)
+
+    def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
+        self._constrained.cool()
+        self._keep(t)
+        return self._move(t[: self._nu].copy(), Status.UNCONSTRAINED, 0, start)
+
+    def _keep(self, t: Float[np.ndarray, " nt"]) -> None:
+        """Make t the plan; the array of the plan before it is free for the next step."""
+        self._plan, self._spare = t, self._plan
+        self._memory.keep(t)
+        self._planned = True
+
+    def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
+        """Go on where the plan breaks a limit, its target does, or something is not finite."""
+        plan, origin = self._map, self._origin
+        u_prev = origin.u_prev
+        changed = self._rated and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
+        if changed:
+            u_prev[:] = self._memory.last()
+            np.dot(plan.matrix, origin.known, out=t)
+        if not t.dot(t) < HUGE * HUGE:
+            return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
+        n = plan.planned
+        v = t[:n]
+        if n < len(t) and not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
+            v += plan.correction(self._reference, origin.drive)
+            changed = True
+        if changed and (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
+            return self._unconstrained(t, start)
+        inputs, room = plan.track.inputs, None
+        if self._hard_rates is not None:
+            room = Box(inputs.low - u_prev, inputs.high - u_prev)
+        deadline = None if np.isinf(self._allowed) else start + self._allowed
+        found, gave_way = self._constrained.solve(v, room, deadline)
+        status = Status.FAILED if self.solver_fails else found.status
+        if status is not Status.OPTIMAL:
+            return self._fail(v[: self._nu], applied, status, found.iterations, start)
+        U, (low, high) = t[: plan.moves], plan.box
+        U += plan.deviation.dot(found.v)
+        np.maximum(U, low, out=U)
+        np.minimum(U, high, out=U)
+        u = U[: self._nu]
+        if self._hard_rates is not None:
+            u[:] = admitted(u, inputs, self._hard_rates, u_prev)
+        self._keep(t)
+        status = Status.SOFTENED if gave_way else Status.OPTIMAL
+        return self._move(u.copy(), status, found.iterations, start, gave_way)
+
+    def _fail(
+        self,
+        free: Float[np.ndarray, " nu"] | None,
+        applied: ArrayLike | None,
+        status: Status,
+        iterations: int,
+        start: float,
+    ) -> Move:
+        """Return what stands in for a failed step, with the status that says why; the next one starts cold."""
+        self._constrained.cool()
+        return super()._fail(free, applied, status, iterations, start)

@@ -1,0 +1,239 @@
+"""One pass of a real-time iteration: linearise along the plan, solve the quadratic program of its stages.
+
+Diehl, Bock & Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", SIAM
+J. Control Optim. 43, 2005.
+"""
+
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.control.limits import Box
+from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.stages import Aim, Problem
+from koopmpc.control.nonlinear.stagewise import (
+    Passes,
+    Sides,
+    interior_step,
+    linearisation,
+    simulation,
+    unconstrained,
+    weights,
+)
+from koopmpc.plants.compiled import Routine
+
+MOST = 60  # interior-point steps
+# Of spans for distances, of the curvature along an input's span for μ and what is left of residuals: what is aimed
+# at, and what is good enough where large weights of slacks leave no digits for more.
+PRECISE, ENOUGH = 1e-11, 1e-9
+NEAR = 0.2  # of a change: how far F may be from its linearisation
+SHORTEST = 0.02  # of a step
+STUCK = 1e-9  # a step this short leads nowhere
+
+
+class Pass(NamedTuple):
+    """The step (δX, δU) of a pass, how far each soft output gave way, how it ended, and after how many iterations."""
+
+    X: Float[np.ndarray, "N nx"]
+    U: Float[np.ndarray, "N nu"]
+    slacks: Float[np.ndarray, "N nsoft"]
+    status: Status
+    iterations: int
+
+
+class RealTimeIteration:
+    """The quadratic program along a plan X (N+1, nx), U (N, nu): δx_0 = x − X_0, c_k = F(X_k, U_k) + e_k − X_{k+1}.
+
+    `theta` and `e` are read in each pass, `low` and `high`, the limits of [U_k; g(X_{k+1})], too.
+
+    Parameters
+    ----------
+    problem
+        F, what is tracked and limited, and the stages.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        N, nx, nu = len(problem.free), problem.nx, problem.F.size1_in(1)
+        nr, ng = len(problem.Q), len(problem.box.low)
+        self._shape = N, nx, nu, ng
+        self._sides = sides(problem)
+        self._limits = Box(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
+        self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)
+        self._free_stages = problem.free
+        ns, nsoft = len(self._sides.row), self._sides.soft
+        zeros = np.zeros
+        self.slack = 0.0  # of the soft limit that the plan breaks most
+        self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
+        self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
+        self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
+        self._goal = zeros((nr, nx + nr)), zeros((nx, nx + nr)), zeros(nx + nr)  # columns as rows
+        A, B, F = zeros((N, nx, nx)), zeros((N, nu, nx)), zeros((N, nx))
+        Q, q, r = zeros((N, nx, nx)), zeros((N, nx)), zeros((N, nu))
+        self._g, self._G = zeros((N, ng)), zeros((N, nx, ng))
+        self._F, self._c, self._x0 = F, zeros((N, nx)), zeros(nx)
+        plan = [self.X, self.U, self._R, self._U_r, *self._goal, self.theta]
+        self._A = A
+        self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
+        self._simulate = Routine(simulation(problem), [*self._ahead, self.theta], [self._trial])
+        self._linearise = Routine(linearisation(problem), plan, [A, B, F, Q, q, r, self._g, self._G])
+        passes, curvature, R = Passes(nx, nu, N), zeros((N, nu)), weights(problem)
+        stages = [A, B, self._c, Q, q, r, self._x0]
+        self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
+        self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
+        self._next, after = _views([each.shape for each in state])
+        self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
+        self._free = Routine(unconstrained(passes, R), stages, [self._dX, self._dU, curvature])
+        self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
+        interior = interior_step(passes, R, self._sides, ng) if ns else None
+        self._interior = interior and Routine(interior, [*stages, self._G, self._d, *state], [*after, self._measures])
+
+    @property
+    def soft_box(self) -> Box:
+        """The limit of each soft side, below and above."""
+        rows = self._sides.row[len(self._sides.row) - self._sides.soft :]
+        return Box(*(end[rows] for end in self._limits))
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the passes run as machine code."""
+        return self._linearise.compiled and self._free.compiled
+
+    def aim(self, aim: Aim) -> None:
+        """Set what is tracked."""
+        self._R[:], self._U_r[:] = aim.R, aim.U
+        for place, value in zip(self._goal, (aim.M.T, aim.L.T, aim.m), strict=True):
+            place[:] = value
+
+    def step(self, x: Float[np.ndarray, " nx"], deadline: float) -> Pass:
+        """Return the solution of the quadratic program for the measured state x along the plan."""
+        self._linearise.call()
+        np.subtract(self._F, self.X[1:], out=self._c)
+        self._c += self.e
+        np.subtract(x, self.X[0], out=self._x0)
+        self._free.call()
+        self.without_limits = self.U[0] + self._dU[0]
+        y = self._quantities()
+        free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._moved()], axis=1)
+        nothing = np.zeros_like(self._eps)
+        if ((free >= self.low) & (free <= self.high)).all() and np.isfinite(self._dX).all():
+            return Pass(self._dX, self._dU, nothing, Status.UNCONSTRAINED, 0)
+        if self._interior is None or not np.isfinite(free).all():
+            return Pass(self._dX, self._dU, nothing, Status.FAILED, 0)
+        return self._limited(y, free, deadline)
+
+    def take(self, x: Float[np.ndarray, " nx"], found: Pass) -> float:
+        """Add the step to the plan, all of it or the half, quarter, … along which F is near its linearisation.
+
+        Over the length α the defects should become (1 − α) c; a difference of more than half of the largest change of
+        that state in the plan is too much. Far from a solution full steps lead to plans that no plant follows.
+        """
+        X, U = self.X[1:], self.U
+        left = self._c.copy()
+        left[0] += self._x0 @ self._A[0]  # δx_0 is taken whole
+        reach = NEAR * np.abs(found.X).max(axis=0) + 1e-9 * (1 + np.abs(X).max(axis=0))
+        length = 1.0
+        while True:
+            X_new, U_new = X + length * found.X, U + length * found.U
+            self._ahead[0][0], self._ahead[0][1:], self._ahead[1][:] = x, X_new[:-1], U_new
+            self._simulate.call()
+            error = np.abs(self._trial + self.e - X_new - (1 - length) * left).max(axis=0)
+            if (error <= length * reach).all() or length < SHORTEST:
+                break
+            length /= 2
+        self.X[0], X[:], U[:] = x, X_new, U_new
+        return length
+
+    def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> Pass:
+        """Follow the central path from the unconstrained solution."""
+        s = self._sides
+        rows = s.row
+        bound = np.where(s.sign > 0, self.low[:, rows], self.high[:, rows])
+        self._d[:] = s.sign * (y[:, rows] - bound) / s.span
+        distance = s.sign * (free[:, rows] - bound) / s.span
+        hard = self._d.shape[1] - s.soft
+        unit = self._unit()
+        worst = max(-float(distance.min()), 1e-3)
+        start = min(worst, 1.0)
+        np.maximum(distance, start, out=self._t)
+        level = unit * start * worst
+        np.divide(level, self._t, out=self._lam)
+        if s.soft:
+            self._eps[:] = np.maximum(-distance[:, hard:], start)
+            self._lam[:, hard:] = np.minimum(self._lam[:, hard:], 0.5 * (s.linear + s.quadratic * self._eps))
+            self._nu[:] = s.linear + s.quadratic * self._eps - self._lam[:, hard:]
+        left, initial = 1.0, max(worst, float(self._lam.max()) / unit)
+        iterations, status, mu = 0, Status.MAX_ITERATIONS, np.inf
+        assert self._interior is not None, "there are limits"
+        while iterations < MOST:
+            if perf_counter() > deadline:
+                return Pass(self._dX, self._dU, self._eps, Status.TIME_LIMIT, iterations)
+            self._interior.call()
+            iterations += 1
+            self._now[:] = self._next
+            mu, length = self._measures
+            if not np.isfinite(mu) or not np.isfinite(length):
+                return Pass(self._dX, self._dU, self._eps, Status.FAILED, iterations)
+            left *= 1 - length
+            if length < STUCK:
+                break
+            mu = float(np.vdot(self._t, self._lam) + np.vdot(self._eps, self._nu)) / (self._t.size + self._eps.size)
+            if mu <= PRECISE * unit and left * initial <= PRECISE:
+                status = Status.OPTIMAL
+                break
+        if mu <= ENOUGH * unit and left * initial <= ENOUGH:
+            status = Status.OPTIMAL
+        elif left * worst > 1e-6:
+            status = Status.INFEASIBLE
+        return Pass(self._dX, self._dU, self._eps * s.span[hard:], status, iterations)
+
+    def _quantities(self) -> Float[np.ndarray, "N nq"]:
+        return np.concatenate([self.U, self._g], axis=1)
+
+    def _moved(self) -> Float[np.ndarray, "N ng"]:
+        return np.matmul(self._dX[:, None, :], self._G)[:, 0]
+
+    def _unit(self) -> float:
+        """Return the mean curvature of the cost along the span of an input."""
+        s, nu = self._sides, self._shape[2]
+        span = np.ones(nu)
+        mine = s.row < nu
+        span[s.row[mine]] = s.span[mine]
+        return max(float(np.mean(self._curvature[self._free_stages] * span**2)), 1e-300)
+
+
+def sides(problem: Problem) -> Sides:
+    """Return the finite ends of all limits, those that are hard first."""
+    nu, inputs, box = len(problem.R), problem.inputs, problem.box
+    low, high = np.concatenate([inputs.low, box.low]), np.concatenate([inputs.high, box.high])
+    linear = np.concatenate([np.full(nu, np.inf), problem.softness.linear])
+    quadratic = np.concatenate([np.zeros(nu), problem.softness.quadratic])
+    finite = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high, 0.0))
+    with np.errstate(invalid="ignore"):
+        span = np.where(np.isfinite(high - low) & (high > low), high - low, 1 + np.abs(finite))
+    ends = [
+        (i, sign)
+        for soft in (False, True)
+        for sign, end in ((1.0, low), (-1.0, high))
+        for i in range(len(low))
+        if np.isfinite(end[i]) and np.isfinite(linear[i]) == soft
+    ]
+    row = np.array([i for i, _ in ends], dtype=np.intp)
+    sign = np.array([s for _, s in ends], dtype=np.float64)
+    given = row[np.isfinite(linear[row])]
+    return Sides(
+        row=row,
+        sign=sign,
+        span=span[row],
+        soft=len(given),
+        linear=0.5 * linear[given] * span[given],
+        quadratic=quadratic[given] * span[given] ** 2,
+    )
+
+
+def _views(shapes: list[tuple[int, ...]]) -> tuple[Float[np.ndarray, " n"], list[Float[np.ndarray, "..."]]]:
+    """Return one array of zeros, and views of these shapes that fill it."""
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    whole = np.zeros(int(ends[-1]))
+    return whole, [part.reshape(shape) for part, shape in zip(np.split(whole, ends[:-1]), shapes, strict=True)]

@@ -1,0 +1,247 @@
+"""A quadratic program of N stages with their own dynamics, as CasADi functions: Riccati passes, interior points.
+
+    min Σ ½ δx_{k+1}ᵀQ_{k+1}δx_{k+1} + q_{k+1}ᵀδx_{k+1} + ½ δu_kᵀRδu_k + r_kᵀδu_k,  δx_{k+1} = A_k δx_k + B_k δu_k + c_k
+
+A barrier term adds a diagonal to R and GᵀwG to Q, so that every Newton step is one backward and one forward pass:
+its work grows with N, not with N³, and an unstable plant spoils no digits.
+
+Rao, Wright & Rawlings, "Application of interior-point methods to model predictive control", J. Optim. Theory
+Appl. 99, 1998; Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2, 1992.
+"""
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc.control.nonlinear.stages import Problem
+
+_SHORT = 0.995  # share of the way to the nearest bound
+
+
+class Sides(NamedTuple):
+    """The finite ends of limits, hard ones first: distance d = sign (y − end) / span ≥ 0, y = [u_k; g(x_{k+1})].
+
+    A soft side has d + ε ≥ 0, ε ≥ 0, at the price linear ε + ½ quadratic ε².
+    """
+
+    row: Int[np.ndarray, " ns"]
+    sign: Float[np.ndarray, " ns"]
+    span: Float[np.ndarray, " ns"]
+    soft: int
+    linear: Float[np.ndarray, " nsoft"]
+    quadratic: Float[np.ndarray, " nsoft"]
+
+
+def linearisation(problem: Problem) -> ca.Function:
+    """Return (X, U, R, U_r, M, L, m, θ) → (A, B, F, Q, q, r, g, G), stage beside stage.
+
+    A, B, F at (X_k, U_k), k = 0 … N−1, B zero where a stage has no input; the rest at X_{k+1}: Q = JᵀQJ and
+    q = JᵀQ(of(x) − r) with J = ∂of/∂x (Gauss–Newton), at the end those of ‖M of(x) + L x − m‖²; r = R (u − u_r);
+    g the limited outputs, G = ∂g/∂x.
+    """
+    nx, nu, nr = problem.nx, problem.F.size1_in(1), len(problem.Q)
+    ng, N = len(problem.box.low), len(problem.free)
+    x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", problem.F.size1_in(2))
+    x_next = problem.F(x, u, t)
+    derivatives = [ca.densify(ca.jacobian(x_next, x)), ca.densify(ca.jacobian(x_next, u)), x_next]
+    dynamics = ca.Function("dynamics", [x, u, t], derivatives)
+    if problem.F.is_a("SXFunction"):
+        dynamics = dynamics.expand("dynamics", {"cse": True})
+    s, r = ca.SX.sym("x", nx), ca.SX.sym("r", nr)
+    of, g = problem.tracked(s), problem.limited(s)
+    J = ca.jacobian(of, s)
+    weighted = J.T @ ca.DM(problem.Q)
+    stage = ca.Function("stage", [s, r], [ca.densify(weighted @ J), ca.densify(weighted @ (of - r))], {"cse": True})
+    limited = ca.Function("limits", [s], [ca.densify(g), ca.densify(ca.jacobian(g, s))], {"cse": True})
+    M, L, m = (ca.SX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1))
+    E = M @ J + L
+    end = ca.Function("end", [s, M, L, m], [ca.densify(E.T @ E), ca.densify(E.T @ (M @ of + L @ s - m))], {"cse": True})
+
+    X, U = ca.MX.sym("X", nx, N + 1), ca.MX.sym("U", nu, N)
+    R, U_r = ca.MX.sym("R", nr, N), ca.MX.sym("U_r", nu, N)
+    goal = [ca.MX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1)]
+    # called stage by stage, for a map would copy θ for each of them
+    stages = [dynamics(X[:, k], U[:, k], t) for k in range(N)]
+    A = ca.horzcat(*(stage[0] for stage in stages))
+    B = ca.horzcat(
+        *(each[1] if free else ca.MX(ca.DM(nx, nu)) for each, free in zip(stages, problem.free, strict=True))
+    )
+    F = ca.horzcat(*(stage[2] for stage in stages))
+    Q, q = end(X[:, N], *goal)
+    if N > 1:
+        Q_k, q_k = stage.map(N - 1)(X[:, 1:N], R[:, : N - 1])
+        Q, q = ca.horzcat(Q_k, Q), ca.horzcat(q_k, q)
+    g_k, G = limited.map(N)(X[:, 1:]) if ng else (ca.MX(0, N), ca.MX(0, N * nx))
+    found = [A, ca.densify(B), F, Q, q, ca.DM(problem.R) @ (U - U_r), g_k, G]
+    return ca.Function("linearisation", [X, U, R, U_r, *goal, t], found)
+
+
+def simulation(problem: Problem) -> ca.Function:
+    """Return (X, U, θ) → F(X_k, U_k), stage beside stage."""
+    nx, nu, N = problem.nx, problem.F.size1_in(1), len(problem.free)
+    X, U, t = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N), ca.MX.sym("t", problem.F.size1_in(2))
+    found = ca.horzcat(*(problem.F(X[:, k], U[:, k], t) for k in range(N)))
+    return ca.Function("simulation", [X, U, t], [found])
+
+
+def weights(problem: Problem) -> Float[np.ndarray, "nu m"]:
+    """Return R stage beside stage; a stage without an input has a weight of its own, so that it rests at zero."""
+    nu = len(problem.R)
+    held = max(float(np.trace(problem.R)), float(np.trace(problem.Q))) / nu * np.eye(nu)
+    return np.hstack([problem.R if free else held for free in problem.free])
+
+
+class Passes:
+    """The Riccati passes as functions of matrices, stage beside stage."""
+
+    def __init__(self, nx: int, nu: int, N: int) -> None:
+        self.nx, self.nu, self.N = nx, nu, N
+        P, A, B, c = (ca.SX.sym(name, nx, n) for name, n in zip("PABc", (nx, nx, nu, 1), strict=True))
+        Q, R = ca.SX.sym("Q", nx, nx), ca.SX.sym("R", nu, nu)
+        whole = P + Q
+        BP = B.T @ whole
+        S = R + BP @ B
+        half = ca.chol(0.5 * (S + S.T))  # halfᵀ half = S
+        K = ca.solve(half, ca.solve(half.T, BP @ A))
+        closed = A - B @ K
+        P_next = A.T @ (whole @ closed)
+        self._factor = ca.Function(
+            "factor",
+            [P, A, B, c, Q, R],
+            [ca.densify(v) for v in (0.5 * (P_next + P_next.T), K, half, closed, whole @ c)],
+            {"cse": True},
+        ).mapaccum("factors", N)
+        p, Pc, q, r = (ca.SX.sym(name, n) for name, n in zip("pcqr", (nx, nx, nx, nu), strict=True))
+        K_, half_, closed_ = ca.SX.sym("K", nu, nx), ca.SX.sym("h", nu, nu), ca.SX.sym("C", nx, nx)
+        upper = ca.triu(half_)
+        h = Pc + p + q
+        k = -ca.solve(upper, ca.solve(upper.T, B.T @ h + r))
+        p_next = closed_.T @ h - K_.T @ r
+        self._costate = ca.Function(
+            "costate",
+            [p, B, K_, half_, closed_, Pc, q, r],
+            [ca.densify(p_next), ca.densify(k)],
+            {"cse": True},
+        ).mapaccum("costates", N)
+        x, k_ = ca.SX.sym("x", nx), ca.SX.sym("k", nu)
+        step = [ca.densify(closed_ @ x + B @ k_ + c), ca.densify(k_ - K_ @ x)]
+        self._forward = ca.Function("forward", [x, closed_, B, c, K_, k_], step, {"cse": True}).mapaccum("forwards", N)
+
+    def turned(self, M: ca.MX, columns: int) -> ca.MX:
+        """Return the stages of M, `columns` wide, in the opposite order."""
+        order = np.arange(self.N * columns).reshape(self.N, columns)[::-1].ravel()
+        return M[:, order.tolist()]
+
+    def factors(self, A: ca.MX, B: ca.MX, c: ca.MX, Q: ca.MX, R: ca.MX) -> list[ca.MX]:
+        """Return what the passes of this matrix need, last stage first: B, K, L, A − B K, P c; LᵀL = R + BᵀPB."""
+        nx, nu = self.nx, self.nu
+        turned = [self.turned(M, n) for M, n in ((A, nx), (B, nu), (c, 1), (Q, nx), (R, nu))]
+        _, K, half, closed, Pc = self._factor(ca.DM(nx, nx), *turned)
+        return [turned[1], K, half, closed, Pc]
+
+    def solve(self, factors: list[ca.MX], B: ca.MX, c: ca.MX, q: ca.MX, r: ca.MX, x0: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Return (δX, δU) for gradients q and r."""
+        _, K, _, closed, _ = factors
+        _, k = self._costate(ca.DM(self.nx, 1), *factors, self.turned(q, 1), self.turned(r, 1))
+        nx = self.nx
+        X, U = self._forward(x0, self.turned(closed, nx), B, c, self.turned(K, nx), self.turned(k, 1))
+        return X, U
+
+
+def unconstrained(passes: Passes, R: Float[np.ndarray, "nu m"]) -> ca.Function:
+    """Return (A, B, c, Q, q, r, δx_0) → (δX, δU, diag S): the solution without limits, and the inputs' curvatures."""
+    nx, nu, N = passes.nx, passes.nu, passes.N
+    A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
+    factors = passes.factors(A, B, c, Q, ca.MX(ca.DM(R)))
+    X, U = passes.solve(factors, B, c, q, r, x0)
+    curvature = ca.sum1(factors[2] ** 2)  # column by column the diagonal of S
+    return ca.Function("unconstrained", [A, B, c, Q, q, r, x0], [X, U, curvature])
+
+
+def interior_step(passes: Passes, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
+    """Return one predictor–corrector step of the interior-point method.
+
+    (A, B, c, Q, q, r, δx_0, G, d; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the distances of the plan
+    (ns, N), t ≥ 0 the distances, λ their multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean complementarity
+    before the step, α the step's length.
+    """
+    nx, nu, N = passes.nx, passes.nu, passes.N
+    ns, nsoft = len(sides.row), sides.soft
+    A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
+    G, d = ca.MX.sym("G", ng, N * nx), ca.MX.sym("d", ns, N)
+    X, U = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N)
+    t, lam = ca.MX.sym("t", ns, N), ca.MX.sym("lam", ns, N)
+    eps, nu_ = ca.MX.sym("eps", nsoft, N), ca.MX.sym("nu", nsoft, N)
+    S = np.zeros((ns, nu + ng))
+    S[np.arange(ns), sides.row] = sides.sign / sides.span
+    S = ca.DM(S)
+    l1 = ca.repmat(ca.MX(ca.DM(sides.linear)), 1, N)
+    l2 = ca.repmat(ca.MX(ca.DM(sides.quadratic)), 1, N)
+
+    def padded(soft: ca.MX) -> ca.MX:
+        return ca.vertcat(ca.MX(ns - nsoft, N), soft) if ns > nsoft else soft
+
+    row, g = ca.SX.sym("G", ng, nx), ca.SX.sym("w", ng)
+    gram = ca.Function("gram", [row, g], [ca.densify(row.T @ ca.diag(g) @ row)]).map(N)
+    pulled = ca.Function("pulled", [row, g], [ca.densify(row.T @ g)]).map(N)
+    x = ca.SX.sym("x", nx)
+    seen = ca.Function("seen", [row, x], [ca.densify(row @ x)]).map(N)
+    diagonal = ca.Function("diagonal", [v := ca.SX.sym("w", nu)], [ca.densify(ca.diag(v))]).map(N)
+
+    def distances(X: ca.MX, U: ca.MX) -> ca.MX:
+        return S @ (ca.vertcat(U, seen(G, X)) if ng else U)
+
+    moved = distances(X, U)
+    w = lam / t
+    kappa = 1 / (l2 + nu_ / eps)
+    K = padded(kappa)
+    eased = w / (1 + w * K)
+    gap = d + moved + padded(eps) - t
+    weights = (S.T**2) @ eased
+    R_k = ca.MX(ca.DM(R)) + diagonal(weights[:nu, :])
+    Q_k = Q + gram(G, weights[nu:, :]) if ng else Q
+    factors = passes.factors(A, B, c, Q_k, R_k)
+
+    def solve(c1: ca.MX | float, c2: ca.MX | float) -> tuple[ca.MX, ...]:
+        rho = lam[ns - nsoft :, :] - l1 - l2 * eps + c2 / eps
+        base = lam + (-w * (K * padded(rho) + gap) - lam + c1 / t) / (1 + w * K)
+        gradient = -S.T @ (base + eased * moved)
+        q_k = q + pulled(G, gradient[nu:, :]) if ng else q
+        X_new, U_new = passes.solve(factors, B, c, q_k, r + gradient[:nu, :], x0)
+        reached = distances(X_new, U_new) - moved
+        d_lam = base - eased * reached - lam
+        d_eps = kappa * (rho + d_lam[ns - nsoft :, :])
+        d_t = reached + padded(d_eps) + gap
+        d_nu = -(nu_ / eps) * d_eps - nu_ + c2 / eps
+        return X_new - X, U_new - U, d_t, d_lam, d_eps, d_nu
+
+    def longest(d_t: ca.MX, d_lam: ca.MX, d_eps: ca.MX, d_nu: ca.MX) -> ca.MX:
+        pairs = [(d_t, t), (d_lam, lam)] + ([(d_eps, eps), (d_nu, nu_)] if nsoft else [])
+        return ca.mmax(ca.vertcat(*(ca.vec(-step / at) for step, at in pairs)))
+
+    count = (ns + nsoft) * N
+    mu = (ca.dot(t, lam) + ca.dot(eps, nu_)) / count
+    _, _, *affine = solve(0.0, 0.0)
+    a = 1 / ca.fmax(longest(*affine), 1)
+    a_t, a_lam, a_eps, a_nu = affine
+    ahead = (ca.dot(t + a * a_t, lam + a * a_lam) + ca.dot(eps + a * a_eps, nu_ + a * a_nu)) / count
+    centre = mu * (ahead / mu) ** 3
+    step = solve(centre - a * a * a_t * a_lam, centre - a * a * a_eps * a_nu)
+    length = 1 / ca.fmax(longest(*step[2:]) / _SHORT, 1)
+    variables = [X, U, t, lam, eps, nu_]
+    after = [v + length * dv for v, dv in zip(variables, step, strict=True)]
+    return ca.Function("interior_step", [A, B, c, Q, q, r, x0, G, d, *variables], [*after, ca.vertcat(mu, length)])
+
+
+def _problem(nx: int, nu: int, N: int) -> list[ca.MX]:
+    shapes = {
+        "A": (nx, N * nx),
+        "B": (nx, N * nu),
+        "c": (nx, N),
+        "Q": (nx, N * nx),
+        "q": (nx, N),
+        "r": (nu, N),
+    }
+    return [ca.MX.sym(name, *shape) for name, shape in shapes.items()] + [ca.MX.sym("x0", nx)]

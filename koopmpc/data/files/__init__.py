@@ -1,0 +1,1 @@
+"""Episodes on disk: tables, .csv, .parquet, .npz, folders."""

@@ -1,0 +1,184 @@
+# pyright: basic
+"""The door to CSV: columns of a text table by name, and episodes as one such table, to the bit."""
+
+import json
+import zlib
+from decimal import Decimal
+from io import BytesIO
+from numbers import Real
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from koopmpc.data.files.parquet import positions
+from koopmpc.errors import DataError, LogError
+
+_MARK = "# koopmpc.episodes "
+_TEXT = ("utf-8-sig", "latin-1")
+
+
+def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str) -> None:
+    """Write the stacked rows under a line that says what they are; the inputs of an episode's last row stay empty."""
+    episode, step = positions(steps)
+    last = step == steps[episode]
+    lines = [",".join(_quoted(name) for name in ("episode", "step", *names))]
+    inputs = iter(U)
+    for e, k, x, end in zip(episode, step, X, last, strict=True):
+        u = [""] * U.shape[1] if end else [repr(float(v)) for v in next(inputs)]
+        lines.append(",".join([str(e), str(k), *(repr(float(v)) for v in x), *u]))
+    body = ("\n".join(lines) + "\n").encode()
+    file.write(f"{_MARK}{zlib.crc32(body):08x} {about}\n".encode())
+    file.write(body)
+
+
+def described(path: Path) -> str | None:
+    """Return what the first line says of the table where `write` wrote it, else None."""
+    with path.open("rb") as file:
+        line = file.readline(1_000_000)
+    text = line.decode(_TEXT[0], errors="replace")
+    return text[len(_MARK) :].strip() if text.startswith(_MARK) else None
+
+
+def columns(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Return the names of all columns, and the columns: numbers, NaN where a cell is empty; others as objects.
+
+    Comma, semicolon or tab is found from the header; with semicolons a decimal comma is understood. Lines above the
+    header that begin with # are skipped.
+
+    Raises
+    ------
+    LogError
+        The file is empty, has no header, or a row has another number of cells.
+    """
+    import pyarrow as pa
+    from pyarrow import csv
+
+    raw = path.read_bytes()
+    try:
+        raw.decode(_TEXT[0])
+        encoding = "utf8"
+    except UnicodeDecodeError:
+        encoding = _TEXT[1]
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    while raw.startswith(b"#"):
+        raw = raw.partition(b"\n")[2]
+    head, _, rest = raw.partition(b"\n")
+    if not head.strip():
+        raise LogError(
+            f"{path} holds no episodes that can be read: it is no .csv file, or was cut; pass a file that "
+            "Episodes.save wrote, or a table: a line of names, then a row a time step"
+        )
+    separator = max((b",", b";", b"\t"), key=head.count)
+    comma = separator == b";" and b"," in rest.partition(b"\n")[0]
+    try:
+        table = csv.read_csv(
+            BytesIO(raw),
+            read_options=csv.ReadOptions(encoding=encoding),
+            parse_options=csv.ParseOptions(delimiter=separator.decode()),
+            convert_options=csv.ConvertOptions(
+                decimal_point="," if comma else ".",
+                null_values=["", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "#N/A"],
+                strings_can_be_null=True,
+            ),
+        )
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise LogError(f"{path} holds no episodes that can be read: {str(error).splitlines()[0]}") from error
+    names = [name.strip() for name in table.column_names]
+    if any(_number(name) for name in names):
+        raise LogError(f"{path} has no line of names: its first row is {', '.join(names[:4])}; write one above it")
+    return names, {name: _values(table.column(i)) for i, name in enumerate(names)}
+
+
+def read(path: Path, about: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Return X, U, the steps of each episode, and the text beside them, of a table that `write` wrote.
+
+    Raises
+    ------
+    LogError, ValueError
+        It is damaged, or its rows were changed.
+    """
+    check, _, about = about.partition(" ")
+    named = json.loads(about)
+    body = path.read_bytes().partition(b"\n")[2].replace(b"\r\n", b"\n")
+    if f"{zlib.crc32(body):08x}" != check:
+        raise ValueError("its rows are not those that were written; without its first line it is a plain table")
+    found = columns(path)[1]
+    episode, step = (np.asarray(found[name], dtype=np.intp) for name in ("episode", "step"))
+    steps = np.bincount(episode) - 1
+    last = step == steps[episode]
+    rows = len(episode)
+    X = np.array([found[name] for name in named["states"]], dtype=np.float64).reshape(-1, rows).T
+    driven = named["inputs"] + named.get("disturbances", [])
+    U = np.array([found[name] for name in driven], dtype=np.float64).reshape(len(driven), rows).T[~last]
+    return np.ascontiguousarray(X), np.ascontiguousarray(U), steps, about
+
+
+def _values(column) -> np.ndarray:
+    import pyarrow as pa
+
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        return column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy() * 1e-9
+    if pa.types.is_null(kind):
+        return np.full(len(column), np.nan)
+    return column.to_numpy()
+
+
+def _number(name: str) -> bool:
+    try:
+        float(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"\n') else name
+
+
+def numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
+    """Return a column of objects as floats, None as NaN; a column of text as it is, if it is no spoilt one.
+
+    Parameters
+    ----------
+    column
+        (rows,) of any kind.
+    name, where
+        For messages: the column, and its file.
+
+    Raises
+    ------
+    DataError
+        Half of the cells or more are numbers, written with a decimal comma or as complex ones perhaps, and
+        another is none: the column would be lost for one cell.
+    """
+    if column.dtype.kind != "O":
+        return column
+    present = [cell for cell in column if cell is not None]
+    if present and all(isinstance(cell, Real | Decimal) for cell in present):
+        return np.array([np.nan if cell is None else float(cell) for cell in column])
+    like = sum(map(_like_a_number, present))
+    if like == 0 or 2 * like < len(present):
+        return column
+    row, cell = next((i, cell) for i, cell in enumerate(column) if cell is not None and not _is_a_number(cell))
+    raise DataError(
+        f"{where}: {name!r} holds {str(cell)!r} in row {row + 1}, which is no real number; repair the cell, leave it "
+        "empty where the value is missing, or name the columns to use: pass states= and inputs="
+    )
+
+
+def _is_a_number(cell: object) -> bool:
+    try:
+        float(str(cell))
+    except ValueError:
+        return False
+    return True
+
+
+def _like_a_number(cell: object) -> bool:
+    try:
+        complex(str(cell).strip().replace(",", "."))
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,142 @@
+"""Episodes in files, to the bit: .npz, .parquet and .csv; and plain tables, as users have them."""
+
+import json
+from collections.abc import Callable, Sequence
+from functools import reduce
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.files import csv, parquet
+from koopmpc.data.files.npz import read_arrays
+from koopmpc.data.files.tables import Told, read_table
+from koopmpc.errors import DataError, LogError
+
+ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
+_WRITERS = {".parquet": parquet.write, ".csv": csv.write}
+_READERS: dict[str, Callable[[Path], Episodes]] = {}  # of kinds of file that another room opens
+
+
+def reads(suffix: str) -> Callable[[Callable[[Path], Episodes]], Callable[[Path], Episodes]]:
+    """Return a decorator: `load_episodes` opens files of this suffix with the function."""
+
+    def register(reader: Callable[[Path], Episodes]) -> Callable[[Path], Episodes]:
+        _READERS[suffix] = reader
+        return reader
+
+    return register
+
+
+def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
+    """Write the episodes to a .npz, .parquet or .csv file; `Episodes.save` is this."""
+    file = Path(path)
+    suffix = _suffix(file, (".npz", *_WRITERS))
+    X = np.concatenate([episode.X for episode in episodes])
+    driven = episodes.driven()  # U with W behind it
+    U = np.concatenate([episode.U for episode in driven])
+    steps = np.array([len(episode) for episode in episodes])
+    # Python writes a float so that it reads back to the bit.
+    names = {"states": episodes.states, "inputs": episodes.inputs, "disturbances": episodes.disturbances}
+    about = json.dumps({"dt": episodes.dt, **names})
+    if suffix in _WRITERS:
+        parquet.check_names(driven.states + driven.inputs, suffix)
+    with checks.writing(file) as stream:
+        if suffix in _WRITERS:
+            _WRITERS[suffix](stream, X, U, steps, driven.states + driven.inputs, about)
+        else:
+            np.savez(stream, X=X, U=U, steps=steps, about=np.array(about))
+
+
+def load_episodes(
+    path: str | PathLike[str],
+    *more: str | PathLike[str],
+    dt: float | None = None,
+    states: Sequence[str] | None = None,
+    inputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+    resample: float | None = None,
+) -> Episodes:
+    """Read the episodes of one file, or of several as one set.
+
+    Files that `Episodes.save` wrote, and logs of runs, say themselves what they hold. Any other .csv or .parquet is
+    a table with a row a time step and a column each state and input. A column ``t``, ``time [s]``, ``time [ms]`` or
+    ``timestamp`` tells the sample time; where it goes back an episode ends. ``episode``, ``run`` or ``trial`` tells
+    episodes apart, by numbers or names; ``step`` puts rows in order where there is no time. Columns named ``u``,
+    ``u0``, ``u_left``, ``force``, ``torque``, ``cmd``, ``input`` and the like are inputs, ``w`` and ``disturbance``
+    measured disturbances, all others of numbers states; what is told counts before what is guessed. The inputs of
+    an episode's last row are not read. Missing values and gaps in time cut episodes, and a warning counts them.
+
+    Parameters
+    ----------
+    path, more
+        .npz, .parquet, .csv or .rrd.
+    dt
+        Sample time of a table without a column of time [s].
+    states, inputs, disturbances
+        The names of a table's columns; ``inputs=[]`` where there are none.
+    resample
+        Sample time [s] to interpolate to, for a table whose steps are unequal: states linearly, inputs held.
+
+    Raises
+    ------
+    LogError
+        A file is missing, is cut, or holds no episodes.
+    DataError
+        The suffix is another, the files have unequal dt or names, a table lacks a column or a step, a column
+        of numbers holds a cell that is none, or its sampling is unequal.
+
+    Warns
+    -----
+    FitWarning
+        Gaps, columns that are constant or repeat another, or no column that is named as an input.
+    """
+    told = Told(dt, states, inputs, disturbances, resample)
+    return reduce(Episodes.__add__, [_read(Path(file), told) for file in (path, *more)])
+
+
+def _read(file: Path, told: Told) -> Episodes:
+    suffix = _suffix(file, (".npz", *_WRITERS, *_READERS))
+    checks.existing(file, ADVICE)
+    about = csv.described(file) if suffix == ".csv" else None
+    if suffix == ".csv" and about is None:
+        names, held = csv.columns(file)
+        return read_table(file, names, held, told)
+    if suffix == ".parquet" and not parquet.described(file):
+        names = parquet.names(file)
+        distinct = [name for name in names if names.count(name) == 1]
+        return read_table(file, names, parquet.columns(file, distinct), told)
+    if not told.nothing:
+        raise DataError(f"{file} says itself what it holds; leave out dt, states and inputs")
+    if suffix in _READERS:
+        return _READERS[suffix](file)
+    try:
+        X, U, steps, text = _own(file, suffix, about)
+        named = json.loads(text)
+        disturbances = named.get("disturbances", [])
+        nu = U.shape[1] - len(disturbances)
+        parts_X = np.split(X, np.cumsum(steps + 1)[:-1])
+        parts_U = np.split(U, np.cumsum(steps)[:-1])
+        parts = zip(parts_X, parts_U, strict=True)
+        episodes = [Episode(X=one, U=other[:, :nu], W=other[:, nu:]) for one, other in parts]
+        return Episodes(episodes, named["dt"], named["states"], named["inputs"], disturbances)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogError(f"{file} holds no episodes that can be read: {error}; {ADVICE}") from error
+
+
+def _own(file: Path, suffix: str, about: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Return X, U, steps and the text beside them, of a file that `save_episodes` wrote."""
+    if about is not None:
+        return csv.read(file, about)
+    if suffix == ".parquet":
+        return parquet.read(file)
+    held = read_arrays(file, ("X", "U", "steps", "about"))
+    return held["X"], held["U"], held["steps"], str(held["about"])
+
+
+def _suffix(file: Path, known: Sequence[str]) -> str:
+    if file.suffix not in known:
+        raise DataError(f"episodes are kept in {', '.join(known)} files, not in {file.name!r}; rename it")
+    return file.suffix

@@ -1,0 +1,274 @@
+"""A user's own table as episodes: a row a time step, a column a state or an input."""
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.csv import numbers
+from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError
+
+_TIME = re.compile(r"t|time|timestamp|sim_time|elapsed|seconds")
+_EPISODE = re.compile(r"episode|run|trial|trajectory")
+_INPUT = re.compile(
+    r"u\d*|u_.*|(input|inputs|control|command|cmd|action|force|torque|thrust|voltage|steering|throttle|duty)"
+    r"([\W_\d].*)?|.*_(cmd|command|input|ref_input)"
+)
+_DISTURBANCE = re.compile(r"w\d*|w_.*|disturbance([\W_\d].*)?")
+_PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The columns of a table by what they are; `scale` is the time's unit in seconds."""
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    time: str | None
+    scale: float
+    episode: str | None
+    step: str | None
+    guessed: bool
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of states, inputs and disturbances."""
+        return self.states + self.inputs + self.disturbances
+
+
+def roles(
+    names: Sequence[str],
+    where: str,
+    *,
+    states: Sequence[str] | None,
+    inputs: Sequence[str] | None,
+    disturbances: Sequence[str] | None,
+    numeric: Sequence[str],
+) -> Roles:
+    """Return what each column is.
+
+    What is not told is read from the names: ``t``, ``time [s]`` and ``timestamp`` are time; ``episode``, ``run``,
+    ``trial`` and ``trajectory`` number the episodes; ``u``, ``u0``, ``u_left``, and what begins with input, control,
+    command, cmd, action, force, torque, thrust, voltage, steering, throttle or duty, are inputs; ``w``, ``w0`` and
+    ``disturbance`` are measured disturbances; every other column of numbers is a state.
+
+    Parameters
+    ----------
+    names, numeric
+        All columns, and those of numbers.
+    where
+        The file, for messages.
+    states, inputs, disturbances
+        What is told.
+
+    Raises
+    ------
+    DataError
+        A told column is missing or there twice, or no column is left for a state.
+    """
+    for what, given in (("states", states), ("inputs", inputs), ("disturbances", disturbances)):
+        if isinstance(given, str):
+            raise DataError(f"{what} is {given!r}; pass a tuple of names")
+        for name in given or ():
+            if names.count(name) != 1:
+                has = "has two columns" if name in names else "has no column"
+                raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
+    told = {name for given in (states, inputs, disturbances) for name in given or ()}
+    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in told]
+    time = next((name for name in rest if _TIME.fullmatch(_stem(name))), None)
+    episode = next((name for name in rest if _EPISODE.fullmatch(_stem(name))), None)
+    step = next((name for name in rest if name == "step"), None)
+    free = [name for name in rest if name not in (time, episode, step) and name in numeric]
+    if any(names.count(name) > 1 for name in numeric) and (states is None or inputs is None):
+        twice = next(name for name in numeric if names.count(name) > 1)
+        raise DataError(f"{where} has two columns {twice!r}; rename one")
+    found_inputs = [n for n in free if _INPUT.fullmatch(_stem(n))] if inputs is None else list(inputs)
+    pushes = [n for n in free if _DISTURBANCE.fullmatch(_stem(n)) and n not in found_inputs]
+    found_pushes = (pushes if states is None else []) if disturbances is None else list(disturbances)
+    if states is None:
+        taken = {*found_inputs, *found_pushes}
+        found_states = [name for name in free if name not in taken]
+    else:
+        found_states = list(states)
+    if not found_states:
+        raise DataError(
+            f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
+        )
+    unit = "s" if time is None else _unit(time)
+    if unit not in _PER_SECOND:
+        raise DataError(f"{where}: the unit of {time!r} is not one of {', '.join(_PER_SECOND)}; rename it, or pass dt=")
+    return Roles(
+        tuple(found_states),
+        tuple(found_inputs),
+        tuple(found_pushes),
+        time,
+        _PER_SECOND[unit],
+        episode,
+        step,
+        guessed=states is None or inputs is None,
+    )
+
+
+def label(name: str) -> bool:
+    """Return whether a column of this name tells rows or episodes apart, and so need not hold numbers."""
+    return _TIME.fullmatch(_stem(name)) is not None or _EPISODE.fullmatch(_stem(name)) is not None
+
+
+def _stem(name: str) -> str:
+    """Return the name without its unit, in lower case."""
+    return re.split(r"\s*[\[(]", name)[0].strip().lower()
+
+
+def _unit(name: str) -> str:
+    found = re.search(r"[\[(]([^\])]*)[\])]", name)
+    return found.group(1).strip() if found else "s"
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the caller says of a table; None is found out."""
+
+    dt: float | None = None
+    states: Sequence[str] | None = None
+    inputs: Sequence[str] | None = None
+    disturbances: Sequence[str] | None = None
+    resample: float | None = None
+
+    @property
+    def nothing(self) -> bool:
+        """Whether all is to be found out."""
+        return all(value is None for value in vars(self).values())
+
+
+def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], told: Told) -> Episodes:
+    """Return the episodes of a plain table; `load_episodes` says what its columns mean.
+
+    Parameters
+    ----------
+    file
+        For messages.
+    names
+        All columns, in their order.
+    columns
+        Those whose names are there once.
+    told
+        What need not be found out.
+
+    Raises
+    ------
+    DataError
+        Something is not told and cannot be found out, a column is missing or holds a cell that is no number, or its
+        rows are no whole episodes.
+    """
+    where = str(file)
+    rows = len(next(iter(columns.values()))) if columns else 0
+    if rows == 0:
+        raise DataError(f"{where} has columns and no row in them; leave the file out")
+    sought = {*(told.states or ()), *(told.inputs or ()), *(told.disturbances or ())}
+    every = told.states is None or told.inputs is None
+    columns = {
+        name: numbers(column, name, where) if name in sought or (every and not label(name)) else column
+        for name, column in columns.items()
+    }
+    numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
+    found = roles(
+        names,
+        where,
+        states=told.states,
+        inputs=told.inputs,
+        disturbances=told.disturbances,
+        numeric=numeric,
+    )
+    table = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
+    time = None if found.time is None else _time(columns[found.time], found)
+    if time is None and told.resample is not None:
+        raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
+    episode = np.zeros(rows, dtype=np.intp)
+    if found.episode is not None:
+        episode = _numbered(columns[found.episode], file)
+    step = None
+    if found.step is not None and time is None:
+        step = checks.array(columns[found.step], f"{where}: step", (None,))
+    X, U, W = (_stacked([table[n] for n in some], rows) for some in (found.states, found.inputs, found.disturbances))
+    parts: list[Signals] = []
+    for e in range(int(episode.max(initial=-1)) + 1):
+        here = np.flatnonzero(episode == e)
+        if step is not None:
+            here = here[np.argsort(step[here], kind="stable")]
+            if (np.diff(step[here]) != 1).any():
+                raise DataError(f"{where}, episode {e}: steps are missing or come twice; split it there")
+        of = None if time is None else time[here]
+        parts += restarts(Signals(of, X[here], U[here], W[here], here + 1))
+    dt = told.resample if told.resample is not None else told.dt
+    if dt is None:
+        if time is None:
+            raise DataError(
+                f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'; its columns are "
+                f"{', '.join(names)}"
+            )
+        dt = sample_time([part.time for part in parts if part.time is not None], where)
+    dt = checks.positive(dt, "dt", "s")
+    if told.resample is not None:
+        parts = [piece for part in parts for piece in resampled(part, dt)]
+    if found.guessed:
+        _doubt(found, table, where, alone=told.inputs is None and not found.inputs)
+    try:
+        episodes = episodes_from(parts, dt, where)
+        return Episodes(episodes, dt, found.states, found.inputs, found.disturbances)
+    except KoopmpcError as error:
+        if str(error).startswith(where):
+            raise
+        raise DataError(f"{where}: {error}") from error
+
+
+def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
+    """Warn of what a guess may have taken for something else, and of columns that say nothing."""
+    if alone:
+        warnings.warn(
+            f"{where}: no column is named as an input, so the plant is taken to run by itself; its states are "
+            f"{', '.join(found.states)}; pass inputs= if some of them are inputs",
+            FitWarning,
+            stacklevel=3,
+        )
+    for i, name in enumerate(found.values):
+        column = table[name][np.isfinite(table[name])]
+        if len(column) and np.ptp(column) == 0:
+            warnings.warn(
+                f"{where}: {name!r} is {column[0]:g} throughout; leave it out: pass states= and inputs=",
+                ColumnWarning,
+                stacklevel=3,
+            )
+            continue
+        for other in found.values[:i]:
+            if np.array_equal(table[name], table[other], equal_nan=True):
+                warnings.warn(
+                    f"{where}: {name!r} repeats {other!r}; leave one out: pass states= and inputs=",
+                    ColumnWarning,
+                    stacklevel=3,
+                )
+
+
+def _time(column: np.ndarray, found: Roles) -> Float[np.ndarray, " M"]:
+    return checks.array(column, str(found.time), (None,), finite=False) * found.scale
+
+
+def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:
+    """Return 0, 1, … for the labels in the order in which they first come."""
+    if any(label is None or label != label for label in labels):
+        raise DataError(f"{file} has rows whose episode is null; give each row the name of its episode")
+    _, first, number = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.intp)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[number]
+
+
+def _stacked(columns: list[np.ndarray], rows: int) -> Float[np.ndarray, "rows n"]:
+    return np.stack(columns, axis=1) if columns else np.empty((rows, 0))

@@ -1,0 +1,124 @@
+"""The filter of a `LiftedKalman` at work: predict, correct with what has come, predict through a delay."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.lifting.buffered import HUGE
+from koopmpc.predict.linear import LinearPredictor
+
+
+class Augmented:
+    """s⁺ = F s + G [u; w] + f, y = M s + h for s = [z; d] without the Constant's coordinate.
+
+    What a controller of z⁺ = A z + B u + d needs is linear in s: z + H⁺C_d d and B_d d + (I − A) H⁺C_d d. An offset
+    of y is so a shift of the coordinates, in which H z is y itself.
+    """
+
+    def __init__(
+        self,
+        predictor: LinearPredictor,
+        kept: Int[np.ndarray, " n"],
+        H: Float[np.ndarray, "ny nz"],
+        Bd: Float[np.ndarray, "nz nd"],
+        Cd: Float[np.ndarray, "ny nd"],
+    ) -> None:
+        nz, nd, n = predictor.nz, Cd.shape[1], len(kept)
+        self.predictor, self.kept = predictor, kept
+        A, known = predictor.A[np.ix_(kept, kept)], np.delete(np.arange(nz), kept)
+        self.F = np.block([[A, Bd[kept]], [np.zeros((nd, n)), np.eye(nd)]])
+        driven = np.hstack([predictor.B, predictor.E])[kept]
+        self.G = np.vstack([driven, np.zeros((nd, driven.shape[1]))])
+        self.f = np.append(predictor.A[np.ix_(kept, known)].sum(axis=1), np.zeros(nd))
+        self.M = np.hstack([H[:, kept], Cd])
+        self.h = H[:, known].sum(axis=1)
+        shift = np.linalg.pinv(H[:, kept]) @ Cd
+        self.to_z = np.zeros((nz, n + nd))
+        self.to_z[kept, np.arange(n)], self.to_z[kept, n:] = 1.0, shift
+        self.one = np.zeros(nz)
+        self.one[known] = 1.0
+        self.to_d = np.zeros((nz, n + nd))
+        self.to_d[kept, n:] = Bd[kept] + shift - A @ shift
+
+
+class Model(NamedTuple):
+    """What a filter runs on: the augmented system, the covariance P before a measurement, and that of y."""
+
+    system: Augmented
+    P: Float[np.ndarray, "n n"]
+    R: Float[np.ndarray, "ny ny"]
+
+
+class Kalman:
+    """The observer of a `LiftedKalman`: s ← s + K (y − M s − h), the gain K from the stationary covariance P.
+
+    Where some of y is NaN the gain is that of the rest; where all is, s is predicted.
+    """
+
+    def __init__(
+        self, model: Callable[[LinearPredictor], Model], predictor: LinearPredictor, delay: int, patience: int
+    ) -> None:
+        self._model, self._delay, self._patience = model, delay, patience
+        self._inputs: deque[Float[np.ndarray, " nuw"]] = deque()
+        self.adopt(predictor)
+        system = self._system
+        self.ny = len(system.M)
+        self.z: Float[np.ndarray, " nz"] = np.zeros(len(system.one))
+        self.d: Float[np.ndarray, " nz"] = np.zeros(len(system.one))
+        self.reset()
+
+    def adopt(self, predictor: LinearPredictor) -> None:
+        """Go on with another model, from the same state."""
+        self._system, self._P, self._R = self._model(predictor)
+        self._gains: dict[bytes, Float[np.ndarray, "n m"]] = {}
+
+    def reset(self, x0: ArrayLike | None = None) -> None:
+        """Start at z = ψ(x0), by default ψ(0), and d = 0."""
+        system = self._system
+        nx = system.predictor.nx
+        start = np.zeros(nx) if x0 is None else checks.array(x0, "x0", (nx,))
+        self._s = np.zeros(len(system.F))
+        self._s[: len(system.kept)] = system.predictor.lift(system.predictor.held(start))[system.kept]
+        self._inputs.clear()
+        self._started = False
+        self._missed = 0
+
+    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+        """Correct the state of `delay` steps ago with y, and predict it to now through the inputs since."""
+        if self._started:
+            self._inputs.append(np.concatenate([u, w]))
+        if len(self._inputs) > self._delay:
+            self._s = self._next(self._s, self._inputs.popleft())
+        came = np.abs(y) < HUGE  # False for NaN
+        first = len(self._inputs) < self._delay  # y is older than the start
+        if not first and came.any():
+            self._s = self._corrected(self._s, y, came)
+        self._missed = 0 if came.any() else self._missed + 1
+        self._started = True
+        s = self._s
+        for v in self._inputs:
+            s = self._next(s, v)
+        np.add(self._system.to_z @ s, self._system.one, out=self.z)
+        np.dot(self._system.to_d, s, out=self.d)
+        return self._missed <= self._patience and bool(np.abs(s).max() < HUGE)
+
+    def _next(self, s: Float[np.ndarray, " n"], v: Float[np.ndarray, " nuw"]) -> Float[np.ndarray, " n"]:
+        system = self._system
+        return system.F @ s + system.G @ v + system.f
+
+    def _corrected(
+        self, s: Float[np.ndarray, " n"], y: Float[np.ndarray, " ny"], came: Bool[np.ndarray, " ny"]
+    ) -> Float[np.ndarray, " n"]:
+        system = self._system
+        key = came.tobytes()
+        if key not in self._gains:
+            M, R = system.M[came], self._R[np.ix_(came, came)]
+            PM = self._P @ M.T
+            self._gains[key] = np.asarray(scipy.linalg.solve(M @ PM + R, PM.T, assume_a="pos")).T
+        return s + self._gains[key] @ (y[came] - system.M[came] @ s - system.h[came])

@@ -1,0 +1,144 @@
+"""Data on disk as a part to fit to and episodes to judge by, in memory where they have room there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.files.folder import Files
+from koopmpc.data.source import Held, Source, Subset
+from koopmpc.errors import DataError
+from koopmpc.fitting.repair import needed
+from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
+
+IN_MEMORY = 150_000_000  # bytes of files that are read as a whole
+PAST = 2  # steps that a model may look back
+_SHARE = 0.2  # of the episodes that are held out
+_ENOUGH = 12  # held-out episodes from which on bands are finite
+_JUDGED = 10_000  # steps that a report is made of
+
+
+@dataclass(frozen=True, eq=False)
+class Divided:
+    """What a model is fitted to, and what it is judged by.
+
+    Attributes
+    ----------
+    fitted
+        A source, larger than memory if need be.
+    seen
+        Episodes of it, for what a report says of training data.
+    held_out
+        Episodes that no fit sees.
+    horizon
+        Steps ahead.
+    size
+        What there is, in words.
+    notes
+        What was done to the data, in sentences.
+    """
+
+    fitted: Source | Episodes
+    seen: Episodes
+    held_out: Episodes
+    horizon: int
+    size: str
+    notes: tuple[str, ...]
+
+
+def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory: int) -> Divided:
+    """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
+
+    Raises
+    ------
+    DataError
+        Too few episodes are as long as the horizon.
+    """
+    parts = files.parts()
+    size = sum(file.stat().st_size for file in files.files)
+    told = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_bytes(size)}"
+    if size <= memory or len(parts) < 2:
+        episodes = joined([part.load() for part in parts])
+        repair = needed(episodes)
+        return _in_memory(repair(episodes), horizon, rng, told, repair.notes)
+    repair = needed(sampled(files, _JUDGED)[0])
+    source = repair.source(files)
+    count = max(len(parts) // 10, 1)
+    out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
+    rest = Subset(source, [i for i in range(len(parts)) if i not in out])
+    judged, _ = sampled(Subset(source, sorted(out)), _JUDGED)
+    ahead = usual_horizon(judged) if horizon is None else horizon
+    held_out = _long(list(judged), ahead + PAST)
+    if len(held_out) < 2:
+        held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + PAST))], ahead + PAST)
+    if len(held_out) < 2:
+        raise DataError(_too_short(len(judged), ahead))
+    seen, _ = sampled(rest, _JUDGED)
+    note = (
+        f"larger than {_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
+        f"{'is' if len(out) == 1 else 'are'} held out, and the fit reads the others one by one"
+    )
+    return Divided(
+        rest,
+        _like(judged, _long(list(seen), ahead + PAST)),
+        _like(judged, held_out),
+        ahead,
+        told,
+        (*repair.notes, note),
+    )
+
+
+def _in_memory(
+    episodes: Episodes, horizon: int | None, rng: np.random.Generator, files: str, repaired: tuple[str, ...]
+) -> Divided:
+    lengths = [len(episode) for episode in episodes]
+    same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
+    number = len(episodes)
+    told = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
+    ahead = usual_horizon(episodes) if horizon is None else horizon
+    needed = ahead + PAST
+    whole = list(episodes)
+    notes: tuple[str, ...] = ()
+    if len(_long(whole, needed)) < _ENOUGH:
+        block = max(2 * needed, sum(lengths) // (4 * _ENOUGH))
+        whole = [piece for episode in episodes for piece in blocks(episode, block)]
+        if len(whole) > number:
+            notes = (
+                f"too few episodes to hold some out: cut into {len(whole)} blocks of about {block} steps; a held-out "
+                "block lies between those of the fit, so its errors may flatter",
+            )
+    long = [i for i, episode in enumerate(whole) if len(episode) >= needed]
+    if len(long) < 4:
+        raise DataError(_too_short(len(episodes), ahead))
+    count = max(round(_SHARE * len(long)), min(_ENOUGH, len(long) // 3), 2)
+    # blocks in order are held out evenly spread, episodes at random
+    order = [int((i + 0.5) * len(long) / count) for i in range(count)]
+    drawn = order if notes else [int(i) for i in rng.permutation(len(long))[:count]]
+    out = {long[i] for i in drawn}
+    train = _like(episodes, [episode for i, episode in enumerate(whole) if i not in out])
+    seen, _ = sampled(Held(_like(episodes, _long(list(train), needed))), _JUDGED)
+    held_out, _ = sampled(Held(_like(episodes, [whole[i] for i in sorted(out)])), _JUDGED)
+    return Divided(train, _like(episodes, _long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes))
+
+
+def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:
+    return [episode for episode in episodes if len(episode) >= needed]
+
+
+def _like(given: Episodes, episodes: Sequence[Episode]) -> Episodes:
+    return Episodes(episodes, given.dt, given.states, given.inputs, given.disturbances)
+
+
+def _too_short(episodes: int, horizon: int) -> str:
+    return (
+        f"{episodes} episode{'s' * (episodes > 1)} of these lengths give too few of {horizon + PAST} steps, horizon "
+        "and delays, to fit to some and judge by others; pass a shorter --horizon, or more data"
+    )
+
+
+def _bytes(size: int) -> str:
+    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= one:
+            return f"{size / one:.3g} {unit}"
+    return f"{size} B"

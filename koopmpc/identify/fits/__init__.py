@@ -1,0 +1,1 @@
+"""One regression a file."""

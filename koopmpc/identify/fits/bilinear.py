@@ -1,0 +1,169 @@
+"""Bilinear extended dynamic mode decomposition: z⁺ = A z + B u + Σ uᵢ Nᵢ z on z = ψ(x)."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Unpack
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError, ObservableError
+from koopmpc.identify.fits.edmd import rule
+from koopmpc.identify.moments.moments import Moments, product_names
+from koopmpc.identify.moments.read import How, second_moments
+from koopmpc.identify.rank import Rank, doubts, leading, lost
+from koopmpc.identify.regression import Found, regression, report, warned
+from koopmpc.identify.solve import Ridge, Rows, ridge_of, solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.reduced import Projected
+from koopmpc.predict.bilinear import BilinearPredictor
+
+
+def bilinear_edmd(
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    ridge: Ridge = 0.0,
+    rank: Rank = None,
+    products: Sequence[str] | None = None,
+    difference: bool = False,
+    **how: Unpack[How],
+) -> BilinearPredictor:
+    """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
+
+    Nothing is added to the lifting. Where it holds a Constant, its columns of Nᵢ are zero: uᵢ · 1 is what B is for.
+
+    Parameters
+    ----------
+    episodes
+        With inputs, or a Source of such; no pair spans two of them.
+    lifting
+        ψ: R^nx → R^nz. C picks the states where it holds them, by name, else it is fitted.
+    embedding
+        ψ acts on the state and its past, as in `edmd`.
+    ridge
+        Tikhonov weight on unit-norm columns of [ψ(x) u u⊗ψ(x)]. With 0, singular values below eps · max(M, n) of
+        the largest are cut. "gcv" chooses it by generalised cross-validation.
+    rank
+        As in `edmd`: z = U_rᵀ ψ(x) on unscaled columns, and u⊗z for the products.
+    products
+        Names of the observables that inputs multiply, for an input-affine model ψ(x⁺) = A ψ(x) + G(x) u whose G
+        is spanned by 1 and these; all by default.
+    difference
+        Regress ψ(x⁺) − ψ(x), and A = I + what is found. Without a ridge and on independent columns it is the same
+        model; a ridge, or a cut, then draws z⁺ towards z ("nothing changes") instead of towards zero, which is
+        nearer the truth for a short dt.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
+
+    Raises
+    ------
+    DataError
+        The data have no inputs, ridge is negative, products and a rank are both given, or an observable is not
+        finite on the data.
+    ObservableError
+        The lifting does not hold one of the products.
+
+    Warns
+    -----
+    FitWarning
+        Rank-deficient, ill-conditioned, or inputs that are functions of ψ(x); each is also in the report.
+
+    References
+    ----------
+    Bruder, Fu & Vasudevan, "Advantages of bilinear Koopman realizations for the modeling and control of systems
+    with unknown dynamics", IEEE Robot. Autom. Lett. 6, 2021.
+    """
+    source = source_of(episodes)
+    if source.nu == 0:
+        raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
+    if source.nw:
+        raise DataError("the episodes hold measured disturbances, which a bilinear fit leaves out; use edmd")
+    ridge = ridge_of(ridge)
+    if rank is not None and products is not None:
+        raise DataError("a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two")
+    total = second_moments(source, lifting, bilinear=True, embedding=embedding, **how)
+    task = regression(total, "bilinear_edmd")
+    assert task.C is not None, "an extended regression has its C"
+    bound, nz, nu = task.lifting, total.nz, source.nu
+    which = total.products if products is None else _named(total, products)
+    given = _with_products(task.rows, total, which)
+    names = product_names(bound, total.inputs, which)
+    regular = ridge != 0 or rank is not None
+    sentences, condition = doubts(given, bound.names, (*total.inputs, *names), regular=regular)
+    P, C, basis, state_residual, words = given.P, task.C, np.eye(nz), task.state_residual, ""
+    if rank is not None:
+        basis, words = leading(given, nz, rank, sentences)
+        P, C, bound = _projected(P, basis, nu, which), C @ basis, Projected(bound, basis)
+        state_residual = np.hypot(state_residual, lost(given.P[:, :nz], basis, task.C, given.samples))
+        which = np.arange(len(basis.T))
+    r = len(basis.T)
+    start = np.eye(P.shape[1], r) @ basis.T * difference  # what stands in K before anything is learned
+    change = Rows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples)
+    solution = solve(change, ridge=ridge)
+    K = (solution.K + start) @ basis
+    N = np.zeros((nu, r, r))
+    N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
+    task = replace(task, rows=Rows(P, given.T, given.rest, given.samples))
+    solved = rule(task.rows, ridge, solution.ridge)
+    found = Found(
+        A=K[:r].T,
+        B=K[r : r + nu].T,
+        C=C,
+        lifting=bound,
+        residual=task.rows.residual(task.x_next, K @ C.T),
+        state_residual=state_residual,
+        rank=solution.rank,
+        condition=condition,
+        rule=f"{words}, {solved}" if words else solved,
+        ridge=solution.ridge,
+        doubts=sentences,
+    )
+    model = BilinearPredictor(
+        found.A,
+        found.B,
+        N,
+        C,
+        bound,
+        task.dt,
+        task.states,
+        task.inputs,
+        report(task, found),
+        task.embedding,
+    )
+    return warned(model)
+
+
+def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
+    """Return where the observables of these names are; a Constant is left out, for u times it is u."""
+    place = {name: i for i, name in enumerate(total.lifting.names)}
+    for name in products:
+        if name not in place:
+            raise ObservableError(
+                f"products names {name!r}, which the lifting lacks; it holds {', '.join(total.lifting.names)}"
+            )
+    return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
+
+
+def _with_products(rows: Rows, total: Moments, which: Int[np.ndarray, " np"]) -> Rows:
+    """Return the rows with u⊗ψ(x) of these observables only."""
+    first = total.nz + len(total.inputs)
+    block = np.flatnonzero(np.isin(total.products, which))
+    columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
+    return Rows(rows.P[:, np.concatenate([np.arange(first), *columns])], rows.T, rows.rest, rows.samples)
+
+
+def _projected(
+    P: Float[np.ndarray, "m n"], basis: Float[np.ndarray, "nz r"], nu: int, which: Int[np.ndarray, " np"]
+) -> Float[np.ndarray, "m _"]:
+    """Return [z u u⊗z], z = basisᵀ ψ, from [ψ u u⊗ψ] without u times a Constant, which is u."""
+    nz = len(basis)
+    U = P[:, nz : nz + nu]
+    constant = np.delete(basis, which, axis=0).sum(axis=0)
+    parts = P[:, nz + nu :].reshape(len(P), nu, -1)
+    mixed = [parts[:, i] @ basis[which] + U[:, i : i + 1] * constant for i in range(nu)]
+    return np.hstack([P[:, :nz] @ basis, U, *mixed])

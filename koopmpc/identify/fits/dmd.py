@@ -1,0 +1,153 @@
+"""Dynamic mode decomposition on the states themselves, without and with inputs."""
+
+from collections.abc import Sequence
+from typing import Unpack
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Held, Source, source_of
+from koopmpc.errors import DataError
+from koopmpc.identify.fits.edmd import Method, fit
+from koopmpc.identify.moments.read import How, second_moments
+from koopmpc.identify.rank import Rank
+from koopmpc.identify.regression import Regression, warned
+from koopmpc.identify.solve import Rows
+from koopmpc.lifting.state import State
+from koopmpc.predict.linear import LinearPredictor
+
+
+def dmd(
+    episodes: Episodes | Source, *, rank: Rank = None, method: Method = "ls", **how: Unpack[How]
+) -> LinearPredictor:
+    """Fit x⁺ = A x, A = X′X⁺ by truncated SVD of the unscaled snapshots; inputs in the data are left out.
+
+    With fewer snapshots than states it works on the small side, and with `rank` it forms no (nx, nx) array.
+
+    Parameters
+    ----------
+    episodes
+        Snapshots, or a Source of them; no pair spans two episodes.
+    rank
+        Keep r singular vectors: z = U_rᵀ x, A = Ã (r, r), C = U_r, exact modes X′ V Σ⁻¹ W. By default
+        singular values below eps · max(M, nx) of the largest are cut, and A is (nx, nx). A share in (0, 1)
+        keeps the fewest directions with that part of the energy Σσ²; "hard-threshold" keeps those above the
+        optimal threshold for white noise of unknown size (Gavish & Donoho 2014).
+    method
+        "ls", least squares: noise in x shrinks A, so that modes seem to decay faster. "tls", total least
+        squares, takes x and x⁺ as noisy alike; "fb" fits forward and backward, A = (A_f A_b⁻¹)^½, which needs
+        no noise of one size, but a motion that can be run backward.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
+
+    Raises
+    ------
+    DataError
+        rank is above nx, too few pairs for "tls", or a motion that "fb" cannot run backward.
+
+    Warns
+    -----
+    FitWarning
+        Rank-deficient or ill-conditioned data.
+
+    References
+    ----------
+    Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. Dyn. 1, 2014; noise: Dawson,
+    Hemati, Williams & Rowley, "Characterizing and correcting for the effect of sensor noise in the dynamic mode
+    decomposition", Exp. Fluids 57, 2016.
+    """
+    task = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", how=how)
+    return warned(fit(task, rank=rank, method=method))
+
+
+def dmdc(
+    episodes: Episodes | Source,
+    *,
+    rank: Rank = None,
+    B: ArrayLike | None = None,
+    method: Method = "ls",
+    **how: Unpack[How],
+) -> LinearPredictor:
+    """Fit x⁺ = A x + B u by truncated SVD of the unscaled snapshots [X; U], or of X alone where B is known.
+
+    Parameters
+    ----------
+    episodes
+        Snapshots with inputs, or a Source of them.
+    rank
+        Keep r singular vectors of X, as in `dmd`; the cut without it is also that of `dmd`.
+    B
+        (nx, nu), known; identified by default.
+    method
+        As in `dmd`; inputs are exact in "tls" and "fb".
+    **how
+        As in `dmd`.
+
+    Raises
+    ------
+    DataError
+        The data have no inputs, or as in `dmd`.
+
+    Warns
+    -----
+    FitWarning
+        Rank-deficient data, or a feedback u = −K x that makes A and B inseparable.
+
+    References
+    ----------
+    Proctor, Brunton & Kutz, "Dynamic mode decomposition with control", SIAM J. Appl. Dyn. Syst. 15, 2016.
+    """
+    source = source_of(episodes)
+    if source.nu == 0:
+        raise DataError("the episodes have no inputs; pass them to dmd, or give each Episode its U")
+    if source.nw:
+        raise DataError("the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()")
+    known = None if B is None else checks.array(B, "B", (source.nx, source.nu))
+    task = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", how=how)
+    return warned(fit(task, rank=rank, method=method))
+
+
+def _regression(
+    source: Source,
+    method: str,
+    *,
+    inputs: tuple[str, ...],
+    B: Float[np.ndarray, "nx nu"] | None = None,
+    noisy: bool,
+    how: How,
+) -> Regression:
+    """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
+    lifting = State().bind(source.states)
+    nx, nu = source.nx, len(inputs)
+    episodes = source.episodes if isinstance(source, Held) and how.get("weights") is None else ()
+    pairs = sum(len(e) for e in episodes)
+    if 0 < pairs <= 2 * nx + nu:  # the snapshots themselves are no more rows than their moments
+        X, X_next = _stacked([e.X[:-1] for e in episodes]), _stacked([e.X[1:] for e in episodes])
+        P = np.hstack([X, _stacked([e.U for e in episodes])]) if nu else X
+        rows = Rows(P, X_next, np.zeros(nx), pairs)
+    else:
+        total = second_moments(source, lifting, route="qr", **how)
+        columns = total.regressors[: nx + nu]
+        rows = (total.complete if noisy else total.rows)(columns, total.targets)
+    return Regression(
+        method=method,
+        route="svd",
+        rows=rows,
+        x_next=np.arange(nx),
+        lifting=lifting,
+        states=source.states,
+        inputs=inputs,
+        dt=source.dt,
+        C=None,
+        state_residual=np.zeros(nx),
+        B=B,
+        scaled=False,
+    )
+
+
+def _stacked(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+    """Return the parts as one array; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -1,0 +1,187 @@
+"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x)."""
+
+from typing import Literal, Unpack
+
+import numpy as np
+
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
+from koopmpc.errors import DataError
+from koopmpc.identify.fits.noise import denoised, forward_backward
+from koopmpc.identify.moments.read import How
+from koopmpc.identify.rank import Rank, doubts, leading, lost
+from koopmpc.identify.regression import Found, Regression, linear_predictor, read, warned, whole
+from koopmpc.identify.solve import Ridge, Rows, cutoff, ridge_of, solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.state import Constant
+from koopmpc.predict.linear import LinearPredictor, eigen
+
+Method = Literal["ls", "tls", "fb"]
+_WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
+
+
+def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
+    """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖² and report.
+
+    Parameters
+    ----------
+    task
+        The regression.
+    ridge
+        Weight of ‖[A B] S‖², S the diagonal of column norms; 0 takes the minimum-norm solution, "gcv" chooses.
+    rank
+        Keep so many left singular vectors U_r of the snapshots ψ(x), columns unscaled: z = U_rᵀ ψ(x).
+    method
+        "ls", or "tls" or "fb" for snapshots with noise, whose rows hold all of T.
+    """
+    ridge = ridge_of(ridge)
+    if method not in _WORDS:
+        raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
+    if method != "ls" and ridge != 0:
+        raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
+    rows, nz = task.rows, task.lifting.nz
+    if task.B is not None:  # what is known of x⁺ goes to the left side
+        known = rows.P[:, nz:] @ task.B.T
+        rows = Rows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
+    free = task.inputs if task.B is None else ()
+    sentences, condition = doubts(rows, task.lifting.names, free, regular=ridge != 0 or rank is not None)
+    if rank is None:
+        found = _whole(task, rows, ridge, method, condition)
+    else:
+        found = _reduced(task, rows, ridge, rank, method, condition, sentences)
+    return linear_predictor(task, found._replace(rule=_WORDS[method] + found.rule, doubts=sentences))
+
+
+def _whole(task: Regression, rows: Rows, ridge: Ridge, method: Method, condition: float) -> Found:
+    nz = task.lifting.nz
+    given = rows.leading(nz)
+    if method == "tls":
+        given = _denoised(task, given, nz)
+    solution = forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=task.scaled)
+    K = solution.K if task.B is None else np.vstack([solution.K, task.B.T])
+    said = rule(rows, ridge, solution.ridge, scaled=task.scaled)
+    return whole(task, K, rank=solution.rank, condition=condition, rule=said, ridge=solution.ridge)
+
+
+def _reduced(
+    task: Regression,
+    rows: Rows,
+    ridge: Ridge,
+    rank: Rank,
+    method: Method,
+    condition: float,
+    sentences: list[str],
+) -> Found:
+    """Regress on [U_rᵀψ(x) u]; Ã = U_rᵀ X′ V_r Σ_r⁻¹ without input (Tu et al. 2014)."""
+    nz = task.lifting.nz
+    basis, words = leading(rows, nz, rank, sentences)
+    r = len(basis.T)
+    given = rows.leading(nz)
+    if method == "tls":
+        given = _denoised(task, given, r)
+        basis = leading(given, nz, r, [])[0]
+    P = np.hstack([given.P[:, :nz] @ basis, given.P[:, nz:]])
+    if method == "fb":
+        solution = forward_backward(Rows(P, given.T @ basis, np.zeros(r), rows.samples), r)
+        forward, drive = basis @ solution.K[:r].T, basis @ solution.K[r:].T
+    else:
+        solution = solve(Rows(P, given.T, given.rest, rows.samples), ridge=ridge)
+        forward, drive = solution.K[:r].T, solution.K[r:].T  # forward = X′ V_r Σ_r⁻¹, (nz, r)
+    A = basis.T @ forward
+    B = basis.T @ (drive if task.B is None else task.B)
+    C = basis if task.C is None else task.C @ basis
+    Z = rows.P[:, :nz]
+    seen = Rows(np.hstack([Z @ basis, task.rows.P[:, nz:]]), task.rows.T, rows.rest, rows.samples)
+    return Found(
+        A=A,
+        B=B,
+        C=C,
+        lifting=Projected(task.lifting, basis),
+        residual=seen.residual(task.x_next, np.vstack([A.T, B.T]) @ C.T),
+        state_residual=np.hypot(task.state_residual, lost(Z, basis, task.C, rows.samples)),
+        rank=r,
+        condition=condition,
+        rule=words if ridge == 0 else f"{words}, {rule(seen, ridge, solution.ridge)}",
+        ridge=solution.ridge,
+        modes=forward @ eigen(A)[1],
+    )
+
+
+def _denoised(task: Regression, rows: Rows, directions: int) -> Rows:
+    """Return the rows without the noise of ψ; a Constant and inputs have none."""
+    nz, one = task.lifting.nz, Constant().bind(task.states).names[0]
+    exact = [*(i for i, name in enumerate(task.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
+    constants = sum(i < nz for i in exact)
+    return denoised(rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=task.scaled)
+
+
+def rule(rows: Rows, asked: Ridge, ridge: float, *, scaled: bool = True) -> str:
+    """Return what a solve without a rank cut or added, in words."""
+    columns = "unit-norm" if scaled else "unscaled"
+    how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
+    if ridge > 0:
+        return f"ridge {ridge:.6g} on {columns} columns{how}"
+    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns" + (
+        ", ridge 0" + how if how else ""
+    )
+
+
+def edmd(
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    ridge: Ridge = 0.0,
+    rank: Rank = None,
+    method: Method = "ls",
+    **how: Unpack[How],
+) -> LinearPredictor:
+    """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
+
+    Nothing is added to the lifting: no state, no constant. C picks the states where the lifting holds them,
+    by name, else it is the least-squares fit of x by ψ(x), its residual in ``report.state_residual``.
+
+    Parameters
+    ----------
+    episodes
+        No pair spans two of them. A Source, ``Files("logs")`` say, is read in parts that memory need not hold.
+    lifting
+        ψ: R^nx → R^nz.
+    embedding
+        ψ acts on the state and its past, ``Delay(2)`` say; C still returns x alone.
+    ridge
+        Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz + nu) of the
+        largest, on unit-norm columns, are cut; the report's route says so. "gcv" chooses by generalised
+        cross-validation, each observable counted relative to its size; the report says what.
+    rank
+        With rank=r the columns are unscaled, and the predictor is reduced to z = U_rᵀ ψ(x), A = Ã (r, r),
+        C = C U_r, with the exact modes X′ V Σ⁻¹ W. A truncated SVD depends on the units of the data. A share
+        in (0, 1) keeps the fewest directions with that part of the energy Σσ²; "hard-threshold" keeps those
+        above the optimal threshold for white noise of unknown size (Gavish & Donoho 2014).
+    method
+        "ls", least squares: noise in ψ(x) shrinks A. "tls", total least squares, takes ψ(x) and ψ(x⁺) as noisy
+        alike, relative to each observable's size; inputs and a Constant as exact. "fb", forward and backward,
+        supposes no sizes, but that the motion can be run backward. Both suppose that noise in x adds to ψ(x).
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
+
+    Raises
+    ------
+    DataError
+        ridge is negative or given with "tls" or "fb", rank too large, an observable not finite on the data, or
+        too few pairs for "tls", or a motion that "fb" cannot run backward.
+
+    Warns
+    -----
+    FitWarning
+        Rank-deficient, ill-conditioned, or inputs that are functions of ψ(x); each is also in the report.
+
+    References
+    ----------
+    Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
+    25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
+    """
+    task = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **how)
+    return warned(fit(task, ridge=ridge, rank=rank, method=method))

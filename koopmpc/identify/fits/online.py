@@ -1,0 +1,243 @@
+"""EDMD that goes on learning while the plant runs."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.fits.edmd import rule
+from koopmpc.identify.moments.moments import Moments, with_states
+from koopmpc.identify.moments.sums import Forgetting, Window
+from koopmpc.identify.rank import doubts
+from koopmpc.identify.regression import assembled, regression
+from koopmpc.identify.solve import Ridge, ridge_of, solve
+from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.lifting.buffered import buffered
+from koopmpc.predict.linear import LinearPredictor
+
+_BLOCK = 32  # rows that the factor takes in at once
+
+
+class OnlineEDMD:
+    """Recursive least squares ψ(x⁺) = A ψ(x) + B u + E w over all pairs so far, weighted by forgetting^age.
+
+    It keeps the triangular factor of the rows [ψ(x) u w ψ(x⁺)], never a covariance: updates are orthogonal
+    transformations, so errors do not grow with their number. With a window it is the fit of the last `window` pairs.
+    Without either it is the batch fit.
+
+    It takes no embedding, for it remembers no steps. A model with delays learns from points ζ, as its states:
+    ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``update(zeta, u, zeta_next)``.
+
+    Parameters
+    ----------
+    lifting
+        ψ: R^nx → R^nz.
+    dt
+        Sample time [s].
+    states, inputs, disturbances
+        Names with units.
+    forgetting
+        λ in (0, 1]; the memory is about 1 / (1 − λ) pairs.
+    window
+        Number of pairs that count; None for all.
+    ridge
+        Tikhonov weight on unit-norm columns; "gcv" chooses it anew for each predictor.
+    keep
+        In (0, 1): no direction's information is forgotten below this share of the most it ever was, so that a plant
+        at rest does not unlearn. Lower it where the later signals are more than 1/√keep times smaller than the first.
+
+    Raises
+    ------
+    DataError
+        forgetting lies outside (0, 1], or a window is asked for beside it.
+
+    References
+    ----------
+    Sayed & Kailath, "A state-space approach to adaptive RLS filtering", IEEE Signal Process. Mag. 11, 1994 (square
+    roots); Golub & Van Loan, "Matrix Computations", 4th ed., sec. 6.5.
+    """
+
+    def __init__(
+        self,
+        lifting: Lifting,
+        *,
+        dt: float,
+        states: Sequence[str],
+        inputs: Sequence[str] = (),
+        disturbances: Sequence[str] = (),
+        forgetting: float = 1.0,
+        window: int | None = None,
+        ridge: Ridge = 0.0,
+        keep: float = 1e-6,
+    ) -> None:
+        self._lifting = lifting_of(lifting).bind(tuple(states))
+        self._full = with_states(self._lifting)
+        self._psi, self._pair = buffered(self._full), np.empty((2, self._full.nz))  # for single pairs
+        self._inputs, self._disturbances = tuple(inputs), tuple(disturbances)
+        self._dt = checks.positive(dt, "dt", "s")
+        self._ridge: Ridge = ridge_of(ridge)
+        factor = checks.positive(forgetting, "forgetting")
+        if factor > 1:
+            raise DataError(f"forgetting is {factor:g}; it must lie in (0, 1], 1 forgets nothing")
+        if not 0 < keep < 1:
+            raise DataError(f"keep is {keep:g}; it must lie between 0 and 1")
+        nz, nf = self._lifting.nz, len(self._inputs) + len(self._disturbances)
+        self._n, width = nz + nf, nf + 2 * self._full.nz
+        self._memory: Forgetting | Window
+        if window is None:
+            self._memory = Forgetting(width, self._n, factor, float(keep))
+        elif factor < 1:
+            raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
+        else:
+            self._memory = Window(width, checks.count(window, "window"), max(_BLOCK, width))
+        self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
+        self._waiting = 0
+        self.pairs = 0
+
+    @classmethod
+    def start(
+        cls,
+        episodes: Episodes,
+        lifting: Lifting,
+        *,
+        forgetting: float = 1.0,
+        window: int | None = None,
+        ridge: Ridge = 0.0,
+        keep: float = 1e-6,
+    ) -> "OnlineEDMD":
+        """Return one that has learned from these episodes, in their order, and has their names and dt."""
+        episodes = episodes_of(episodes)
+        online = cls(
+            lifting,
+            dt=episodes.dt,
+            states=episodes.states,
+            inputs=episodes.inputs,
+            disturbances=episodes.disturbances,
+            forgetting=forgetting,
+            window=window,
+            ridge=ridge,
+            keep=keep,
+        )
+        for episode in episodes:
+            online.update(episode.X[:-1], episode.U, episode.X[1:], episode.W)
+        return online
+
+    def update(self, x: ArrayLike, u: ArrayLike, x_next: ArrayLike, w: ArrayLike | None = None) -> None:
+        """Learn that u (and w) led from x to x_next: one pair, or rows of pairs, the newest last.
+
+        Parameters
+        ----------
+        x, x_next
+            (nx,) or (M, nx).
+        u
+            (nu,) or (M, nu).
+        w
+            (nw,) or (M, nw), where the model has measured disturbances.
+
+        Raises
+        ------
+        ShapeError, DataError
+            The parts do not fit together, or one holds NaN or inf: leave such a sample out.
+        """
+        nx, nu, nw = len(self._full._states), len(self._inputs), len(self._disturbances)
+        now = checks.array(x, "x")
+        single = now.ndim == 1
+        lead = () if single else (len(now),)
+        if now.shape != (*lead, nx):
+            raise ShapeError(f"x has shape {now.shape}, expected ({nx},) or rows of {nx} states")
+        forced = checks.array(u, "u", (*lead, nu))
+        after = checks.array(x_next, "x_next", (*lead, nx))
+        if w is None and nw:
+            raise DataError(f"the model has {nw} measured disturbances; pass w")
+        pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw)) if nw else None
+        count = 1 if single else len(now)
+        Z = self._lifted(now, after) if single else None
+        if Z is None or not np.isfinite(Z).all():  # rows, or what the quick way cannot do
+            with np.errstate(all="ignore"):  # what is not finite is named below
+                Z = self._full(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
+            if not np.isfinite(Z).all():
+                bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
+                raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")
+        done = 0
+        while done < count:
+            take = min(count - done, len(self._rows) - self._waiting)
+            self._write(Z, forced.reshape(count, nu), pushed, done, take)
+            done += take
+            if self._waiting == len(self._rows):
+                self._memory.push(self._rows)
+                self._waiting = 0
+        self.pairs += count
+
+    def predictor(self) -> LinearPredictor:
+        """Return the fit of all that counts now; it warns of nothing, its report does.
+
+        Raises
+        ------
+        DataError
+            There was no update yet.
+        """
+        if self.pairs == 0:
+            raise DataError("nothing was learned yet; call update first")
+        R, weight = self._memory.factor(self._rows[: self._waiting])
+        task = regression(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
+        rows = task.rows.leading(self._lifting.nz)
+        sentences = doubts(rows, task.lifting.names, task.inputs, regular=self._ridge != 0)[0]
+        solution = solve(rows, ridge=self._ridge)
+        return assembled(
+            task,
+            solution.K,
+            rule=f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
+            + rule(rows, self._ridge, solution.ridge),
+            ridge=solution.ridge,
+            doubts=sentences,
+        )
+
+    def _lifted(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
+        """Return ψ of both at a microsecond each, in memory of our own; NaN beyond 1e30."""
+        memory = self._psi.slot()
+        for z, point in zip(self._pair, (now, after), strict=True):
+            memory.arguments[0][:] = point
+            memory.evaluate()
+            z[:] = memory.results[0]
+        return self._pair
+
+    def _write(
+        self,
+        Z: Float[np.ndarray, "M2 nf"],
+        forced: Float[np.ndarray, "M nu"],
+        pushed: Float[np.ndarray, "..."] | None,
+        first: int,
+        take: int,
+    ) -> None:
+        """Write rows [ψ(x) u w, states that ψ lacks, ψ(x⁺) …] into the buffer."""
+        count, nz, full, nu = len(forced), self._lifting.nz, self._full.nz, forced.shape[1]
+        some = slice(first, first + take)
+        rows = self._rows[self._waiting : self._waiting + take]
+        rows[:, :nz] = Z[some, :nz]
+        rows[:, nz : nz + nu] = forced[some]
+        if pushed is not None:
+            rows[:, nz + nu : self._n] = pushed.reshape(count, -1)[some]
+        last = rows.shape[1] - full
+        rows[:, self._n : last] = Z[some, nz:]
+        rows[:, last:] = Z[count + first : count + first + take]
+        self._waiting += take
+
+    def _moments(self, R: Float[np.ndarray, "nd nd"], weight: float) -> Moments:
+        """Return the factor as Moments, whose rows hold the states that ψ lacks before u."""
+        nz, n, lacking = self._lifting.nz, self._n, self._full.nz - self._lifting.nz
+        if lacking:
+            order = np.r_[0:nz, n : n + lacking, nz:n, n + lacking : len(R)]
+            R = np.asarray(np.linalg.qr(R[:, order], mode="r"))
+        return Moments(
+            self._lifting,
+            (*self._inputs, *self._disturbances),
+            self._dt,
+            max(round(weight), 1),
+            weight,
+            "qr",
+            np.ascontiguousarray(R),
+        )

@@ -1,0 +1,269 @@
+"""What an engineer knows of A and B before the data: entries, rows, zeros, bounds, sums, symmetry, stored energy."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import short
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Combination(Value):
+    """low ≤ Σ Fᵢⱼ Aᵢⱼ + Σ Gᵢⱼ Bᵢⱼ ≤ high, an equation where low = high.
+
+    Parameters
+    ----------
+    low, high
+        Numbers, or ∓inf.
+    A, B
+        The weights F (nz, nz) and G (nz, nu); zero by default.
+    """
+
+    low: float
+    high: float
+    A: Float[np.ndarray, "nz nz"] | None
+    B: Float[np.ndarray, "nz nu"] | None
+
+    def __init__(self, low: float, high: float, *, A: ArrayLike | None = None, B: ArrayLike | None = None) -> None:
+        if A is None and B is None:
+            raise DataError("a Combination has no weights; pass A, B or both")
+        ends = checks.array([low, high], "low, high", (2,), infinite=True)
+        checks.crossed(ends[:1], ends[1:], "Combination")
+        for name, value in {
+            "low": float(ends[0]),
+            "high": float(ends[1]),
+            "A": None if A is None else checks.array(A, "Combination.A", (None, None)),
+            "B": None if B is None else checks.array(B, "Combination.B", (None, None)),
+        }.items():
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Storage(Value):
+    """Dissipation with V(z) = ½ zᵀP z: V(A z + B u) ≤ decay² V(z) + uᵀ(C z + D u) for every z and u.
+
+    With decay = 1 this is passivity from u to y = C z + D u in discrete time. Without C it is V(A z) ≤ decay² V(z)
+    alone: a contraction, and so a stable A where P ≻ 0. P is given; `stable_edmd` finds one.
+
+    Parameters
+    ----------
+    P
+        (nz, nz) ⪰ 0 or its diagonal: zero where an observable stores nothing.
+    decay
+        Above 0.
+    C
+        (nu, nz) output that belongs to the inputs.
+    D
+        (nu, nu); zero by default. A sampled system whose B is not zero needs D + Dᵀ ≻ 0 to be passive.
+
+    References
+    ----------
+    Byrnes & Lin, "Losslessness, feedback equivalence, and the global stabilization of discrete-time nonlinear
+    systems", IEEE Trans. Automat. Contr. 39, 1994.
+    """
+
+    P: Float[np.ndarray, "nz nz"]
+    decay: float
+    C: Float[np.ndarray, "nu nz"] | None
+    D: Float[np.ndarray, "nu nu"] | None
+
+    def __init__(
+        self, P: ArrayLike, *, decay: float = 1.0, C: ArrayLike | None = None, D: ArrayLike | None = None
+    ) -> None:
+        if C is None and D is not None:
+            raise DataError("Storage has D but no C; pass the output C that D belongs to")
+        for name, value in {
+            "P": checks.weight(P, "Storage.P"),
+            "decay": checks.positive(decay, "decay"),
+            "C": None if C is None else checks.array(C, "Storage.C", (None, None)),
+            "D": None if D is None else checks.array(D, "Storage.D", (None, None)),
+        }.items():
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Prior(Value):
+    """What is known of z⁺ = A z + B u; `constrained_edmd` finds the rest.
+
+    Parameters
+    ----------
+    A, B
+        Known entries, (nz, nz) and (nz, nu); NaN where an entry is free. With measured disturbances B stands for
+        [B E], here and below.
+    rows
+        Known rows by name: ``{"x [m]": {"x [m]": 1.0, "v [m/s]": 0.1}}`` says x⁺ = x + 0.1 v. What a row does not
+        name is zero in it. Names stand with or without the unit.
+    mask_A, mask_B
+        True where an entry may differ from zero.
+    lower_A, upper_A, lower_B, upper_B
+        Bounds, arrays or one number for all entries; ±inf where there is none. A sign is a bound at 0.
+    symmetric
+        A = Aᵀ.
+    combinations
+        Weighted sums of entries between limits.
+    storage
+        Passivity or contraction.
+
+    Raises
+    ------
+    ShapeError, DataError
+        The parts are no such arrays, or contradict each other.
+    """
+
+    A: Float[np.ndarray, "nz nz"] | None
+    B: Float[np.ndarray, "nz nu"] | None
+    rows: dict[str, dict[str, float]]
+    mask_A: Bool[np.ndarray, "nz nz"] | None
+    mask_B: Bool[np.ndarray, "nz nu"] | None
+    lower_A: Float[np.ndarray, "..."]
+    upper_A: Float[np.ndarray, "..."]
+    lower_B: Float[np.ndarray, "..."]
+    upper_B: Float[np.ndarray, "..."]
+    symmetric: bool
+    combinations: tuple[Combination, ...]
+    storage: Storage | None
+
+    def __init__(
+        self,
+        *,
+        A: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        rows: Mapping[str, Mapping[str, float]] | None = None,
+        mask_A: ArrayLike | None = None,
+        mask_B: ArrayLike | None = None,
+        lower_A: ArrayLike = -np.inf,
+        upper_A: ArrayLike = np.inf,
+        lower_B: ArrayLike = -np.inf,
+        upper_B: ArrayLike = np.inf,
+        symmetric: bool = False,
+        combinations: Sequence[Combination] = (),
+        storage: Storage | None = None,
+    ) -> None:
+        known = {
+            name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
+            for name, row in (rows or {}).items()
+        }
+        for name, value in {
+            "A": None if A is None else checks.array(A, "Prior.A", (None, None), finite=False),
+            "B": None if B is None else checks.array(B, "Prior.B", (None, None), finite=False),
+            "rows": known,
+            "mask_A": None if mask_A is None else checks.array(mask_A, "mask_A", (None, None)) != 0,
+            "mask_B": None if mask_B is None else checks.array(mask_B, "mask_B", (None, None)) != 0,
+            "lower_A": checks.array(lower_A, "lower_A", infinite=True),
+            "upper_A": checks.array(upper_A, "upper_A", infinite=True),
+            "lower_B": checks.array(lower_B, "lower_B", infinite=True),
+            "upper_B": checks.array(upper_B, "upper_B", infinite=True),
+            "symmetric": bool(symmetric),
+            "combinations": tuple(combinations),
+            "storage": storage,
+        }.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def coupled(self) -> bool:
+        """Whether rows of [A B] depend on each other."""
+        return self.symmetric or bool(self.combinations) or self.storage is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """Known entries of [A B], NaN where free, and bounds."""
+
+    known: Float[np.ndarray, "nz n"]
+    low: Float[np.ndarray, "nz n"]
+    high: Float[np.ndarray, "nz n"]
+
+    @property
+    def bounded(self) -> Bool[np.ndarray, " nz"]:
+        """Rows with a bound on a free entry."""
+        limited = np.isfinite(self.low) | np.isfinite(self.high)
+        return np.asarray((limited & np.isnan(self.known)).any(axis=1))
+
+
+def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) -> Entries:
+    """Return what is known of each entry of [A B] on these observables and inputs.
+
+    Raises
+    ------
+    ShapeError
+        A part is made for another number of observables or inputs.
+    DataError
+        Two parts contradict each other, or a name is unknown.
+    """
+    nz, nu = len(observables), len(inputs)
+    known = np.full((nz, nz + nu), np.nan)
+    low, high = np.full_like(known, -np.inf), np.full_like(known, np.inf)
+    parts = (
+        ("A", slice(0, nz), prior.A, prior.mask_A, prior.lower_A, prior.upper_A),
+        ("B", slice(nz, nz + nu), prior.B, prior.mask_B, prior.lower_B, prior.upper_B),
+    )
+    for name, columns, values, mask, lower, upper in parts:
+        shape = known[:, columns].shape
+        for bound, into, what in ((lower, low, f"lower_{name}"), (upper, high, f"upper_{name}")):
+            into[:, columns] = bound if bound.ndim == 0 else _sized(bound, shape, what)
+        if mask is not None:
+            known[:, columns][~_sized(mask, shape, f"mask_{name}")] = 0.0
+        if values is not None:
+            _put(known[:, columns], _sized(values, shape, f"Prior.{name}"), f"Prior.{name}")
+    names = [*observables, *inputs]
+    for name, row in prior.rows.items():
+        values = np.zeros((1, nz + nu))
+        for other, value in row.items():
+            values[0, _place(other, names)] = value
+        i = _place(name, observables)
+        _put(known[i : i + 1], values, f"rows[{name!r}]")
+    bad = np.argwhere((known < low) | (known > high) | (low > high))
+    if len(bad):
+        i, j = map(int, bad[0])
+        raise DataError(
+            f"the priors contradict each other at {observables[i]!r} from {names[j]!r}: known {known[i, j]:g}, "
+            f"bounds {low[i, j]:g} … {high[i, j]:g}; drop one of them"
+        )
+    for combination in prior.combinations:
+        for weights, shape, what in (
+            (combination.A, (nz, nz), "Combination.A"),
+            (combination.B, (nz, nu), "Combination.B"),
+        ):
+            if weights is not None:
+                _sized(weights, shape, what)
+    if prior.storage is not None:
+        _sized(prior.storage.P, (nz, nz), "Storage.P")
+        for matrix, shape, what in (
+            (prior.storage.C, (nu, nz), "Storage.C"),
+            (prior.storage.D, (nu, nu), "Storage.D"),
+        ):
+            if matrix is not None:
+                _sized(matrix, shape, what)
+    return Entries(known, low, high)
+
+
+def _sized(value: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
+    if value.shape != shape:
+        raise ShapeError(f"{name} has shape {value.shape}, expected {shape}: observables by observables or inputs")
+    return value
+
+
+def _put(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name: str) -> None:
+    """Write what is known; raise where something else is known already."""
+    clash = np.argwhere(np.isfinite(values) & np.isfinite(into) & (values != into))
+    if len(clash):
+        i, j = map(int, clash[0])
+        raise DataError(
+            f"{name} says {values[i, j]:g} at ({i}, {j}), where another prior says {into[i, j]:g}; drop one of them"
+        )
+    if np.isinf(values).any():
+        raise DataError(f"{name} holds infinite entries; use NaN where an entry is free")
+    np.copyto(into, values, where=np.isfinite(values))
+
+
+def _place(name: str, names: Sequence[str]) -> int:
+    found = [i for i, other in enumerate(names) if name in (other, short(other))]
+    if len(found) == 1:
+        return found[0]
+    raise DataError(f"rows names {name!r}; it can name {', '.join(names)}")

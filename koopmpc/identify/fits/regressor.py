@@ -1,0 +1,144 @@
+# pyright: basic
+"""KoopmanRegressor: a lifted linear model as a scikit-learn estimator."""
+
+from typing import Any
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+from koopmpc.identify.solve import Rows, solve
+from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.state import Constant, State
+from koopmpc.predict.linear import LinearPredictor
+
+try:
+    from sklearn.base import BaseEstimator, RegressorMixin
+    from sklearn.utils.validation import check_is_fitted, validate_data
+except ImportError as error:
+    raise ImportError(
+        "KoopmanRegressor needs scikit-learn, which is not installed: pip install 'koopmpc[sklearn]'"
+    ) from error
+
+
+class KoopmanRegressor(RegressorMixin, BaseEstimator):
+    """y = W [ψ(x) u] by ridge regression, rows of X being [x u]; with y = x⁺ it is the next state of z⁺ = A z + B u.
+
+    `fit` takes pairs, so that what scikit-learn does to rows is right: y are the next states, one row below in the same
+    episode. Cross-validate over episodes with ``GroupKFold`` and the number of its episode for each row. The score is
+    that of one step; `koopmpc.select` chooses by many.
+
+    Parameters
+    ----------
+    degree
+        Monomials up to this total degree; 1 is the state alone.
+    harmonics
+        Sines and cosines of the states up to this multiple; 0 for none.
+    lifting
+        ψ in their place.
+    alpha
+        Ridge weight on columns of unit norm; 0 cuts what is rounding.
+    n_inputs
+        How many of the last columns of X are inputs.
+    dt
+        Sample time of the predictor [s].
+
+    Attributes
+    ----------
+    coef_
+        (n_targets, nz + n_inputs), W.
+    lifting_
+        ψ, bound to the states.
+    predictor_
+        LinearPredictor with z⁺ = A z + B u, whose C is fitted where ψ lacks a state; only where y has one column for
+        each state, as next states have.
+    n_features_in_
+        Columns of X.
+
+    References
+    ----------
+    Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci. 25, 2015.
+    """
+
+    def __init__(
+        self,
+        degree: Any = 2,  # what is no number is told by fit, as scikit-learn wants it
+        harmonics: Any = 0,
+        lifting: Any = None,
+        alpha: Any = 0.0,
+        n_inputs: Any = 0,
+        dt: Any = 1.0,
+    ) -> None:
+        self.degree = degree
+        self.harmonics = harmonics
+        self.lifting = lifting
+        self.alpha = alpha
+        self.n_inputs = n_inputs
+        self.dt = dt
+
+    def fit(self, X: Any, y: Any) -> "KoopmanRegressor":
+        """Fit to rows [x u] and their targets y, (M,) or (M, n_targets); return self.
+
+        Raises
+        ------
+        DataError
+            alpha is negative, degree or harmonics no whole number, or no column is left for a state.
+        """
+        rows: Any
+        targets: Any
+        rows, targets = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        nu = checks.count(self.n_inputs, "n_inputs", 0)
+        alpha = float(checks.array(self.alpha, "alpha", ()))
+        if alpha < 0:
+            raise DataError(f"alpha is {alpha:g}; it must be 0 or above")
+        nx = rows.shape[1] - nu
+        if nx < 1:
+            raise DataError(f"X has {rows.shape[1]} columns and n_inputs is {nu}; at least one must be a state")
+        named = getattr(self, "feature_names_in_", None)
+        names = [f"x{i}" for i in range(nx)] + [f"u{i}" for i in range(nu)] if named is None else [*named]
+        self.lifting_ = self._lifting().bind(names[:nx])
+        Z, U = self.lifting_(rows[:, :nx]), rows[:, nx:]
+        table = np.asarray(targets, dtype=np.float64).reshape(len(rows), -1)
+        self.coef_ = self._solved(np.hstack([Z, U]), table, alpha)
+        self._flat = np.ndim(targets) == 1
+        vars(self).pop("predictor_", None)
+        if table.shape[1] == nx:
+            nz = self.lifting_.nz
+            K = self._solved(np.hstack([Z, U]), self.lifting_(table), alpha)
+            C = self._solved(Z, rows[:, :nx], 0.0)
+            held = [self.lifting_.names.index(name) if name in self.lifting_.names else -1 for name in names[:nx]]
+            for i, place in enumerate(held):
+                if place >= 0:
+                    C[i] = np.eye(nz)[place]
+            self.predictor_ = LinearPredictor(K[:, :nz], K[:, nz:], C, self.lifting_, self.dt, names[:nx], names[nx:])
+        return self
+
+    def predict(self, X: Any) -> np.ndarray:
+        """Return W [ψ(x) u] for rows [x u]: one step."""
+        check_is_fitted(self)
+        rows: Any = validate_data(self, X, reset=False, dtype=np.float64)
+        nx = rows.shape[1] - self.n_inputs
+        found = np.hstack([self.lifting_(rows[:, :nx]), rows[:, nx:]]) @ self.coef_.T
+        return found[:, 0] if self._flat else found
+
+    def __sklearn_tags__(self) -> Any:
+        """Return that y may have several columns."""
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
+    def _lifting(self) -> Lifting:
+        if self.lifting is not None:
+            return lifting_of(self.lifting)
+        found: Lifting = State() + Constant()
+        if checks.count(self.degree, "degree") > 1:
+            found = found + Monomials(self.degree)
+        if checks.count(self.harmonics, "harmonics", 0):
+            found = found + Fourier(self.harmonics)
+        return found
+
+    @staticmethod
+    def _solved(P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:
+        return solve(Rows(P, T, np.zeros(T.shape[1]), len(P)), ridge=alpha).K.T

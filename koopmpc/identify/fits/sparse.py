@@ -1,0 +1,217 @@
+"""EDMD that keeps few observables, or few entries of A and B."""
+
+from dataclasses import dataclass, replace
+from typing import Literal, Unpack
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from koopmpc import checks
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
+from koopmpc.errors import DataError
+from koopmpc.identify.fits.constrained import linear
+from koopmpc.identify.fits.prior import Entries
+from koopmpc.identify.moments.read import How
+from koopmpc.identify.rank import doubts
+from koopmpc.identify.regression import assembled, growth, read, warned
+from koopmpc.identify.solve import Rows, norms, onto, solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.reduced import Picked
+from koopmpc.lifting.state import Constant
+from koopmpc.predict.linear import LinearPredictor
+
+_STEPS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """K (n, nt), and by how much it misses the optimality conditions."""
+
+    K: Float[np.ndarray, "n nt"]
+    missed: float
+
+
+def lasso(
+    G: Float[np.ndarray, "n n"],
+    H: Float[np.ndarray, "n nt"],
+    weights: Float[np.ndarray, "n nt"],
+    *,
+    grouped: bool,
+    tolerance: float = 1e-10,
+) -> Sparse:
+    """Return the minimiser by accelerated proximal gradient, restarted where it turns back.
+
+    Parameters
+    ----------
+    G
+        PᵀP ⪰ 0.
+    H
+        PᵀT.
+    weights
+        Penalties ≥ 0 of the entries; `grouped` takes the first column, one penalty a row of K.
+    grouped
+        Penalise rows by their Euclidean norm, so that whole rows vanish.
+    tolerance
+        On the optimality conditions, relative to the largest entry of H.
+
+    References
+    ----------
+    Beck & Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2, 2009; restart:
+    O'Donoghue & Candès, Found. Comput. Math. 15, 2015; groups: Yuan & Lin, J. R. Stat. Soc. B 68, 2006.
+    """
+    K = np.zeros_like(H)
+    if not H.size:
+        return Sparse(K, 0.0)
+    step = 1.0 / max(float(np.linalg.eigvalsh(G)[-1]), 1e-300)
+    enough = tolerance * max(float(np.abs(H).max()), 1e-300)
+    ahead, momentum, missed = K, 1.0, np.inf
+    for _ in range(_STEPS):
+        new = _shrunk(ahead - step * (G @ ahead - H), step * weights, grouped)
+        missed = float(np.abs(new - ahead).max()) / step
+        if missed <= enough:
+            return Sparse(new, missed)
+        if np.sum((ahead - new) * (new - K)) > 0:
+            momentum = 1.0
+        later = 0.5 * (1 + np.sqrt(1 + 4 * momentum**2))
+        ahead = new + (momentum - 1) / later * (new - K)
+        K, momentum = new, later
+    return Sparse(K, missed)
+
+
+def _shrunk(K: Float[np.ndarray, "n nt"], by: Float[np.ndarray, "n nt"], grouped: bool) -> Float[np.ndarray, "n nt"]:
+    """Return argmin ½ ‖X − K‖² + the penalty of X."""
+    size = np.sqrt(np.sum(K**2, axis=1, keepdims=True)) if grouped else np.abs(K)
+    least = by[:, :1] if grouped else by
+    return K * np.maximum(1.0 - least / np.where(size > 0, size, 1.0), 0.0)
+
+
+def sparse_edmd(
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    penalty: float = 1e-3,
+    over: Literal["observables", "entries"] = "observables",
+    adaptive: bool = True,
+    **how: Unpack[How],
+) -> LinearPredictor:
+    """Fit z⁺ = A z + B u + E w on those observables z of ψ that predict the states, and each other.
+
+    The states and a Constant stay. The set S of kept observables grows from them: what minimises
+    ½ ‖T_S − P K‖² + penalty Σⱼ wⱼ ‖kⱼ‖₂ over the coefficients K of ψ(x⁺)_S, on unit-norm columns and targets, joins
+    it, kⱼ the coefficients of an observable outside S; S is done when nothing joins. A and B are then the plain least
+    squares on S: no shrinkage is left in them. With over="entries" each entry has its own penalty, S grows by what
+    has an entry that is not zero, and the least squares is over these entries.
+
+    Parameters
+    ----------
+    episodes
+        Episodes or a Source; no pair spans two of them.
+    lifting
+        ψ, the dictionary; it must hold the states.
+    embedding
+        ψ acts on the state and its past, ``Delay(2)`` say.
+    penalty
+        Above 0. With adaptive weights an observable stays out if it explains less than about this share of the
+        targets' energy.
+    over
+        "observables" (group LASSO: few columns of A) or "entries" (LASSO: few numbers in A and B).
+    adaptive
+        Weights 1 / |coefficient of a ridge fit| (by generalised cross-validation), which spare large ones and find
+        the true set from enough data; else 1.
+    **how
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
+
+    Raises
+    ------
+    DataError
+        penalty is not above 0, or the lifting lacks a state.
+
+    Warns
+    -----
+    FitWarning
+        As `edmd`. ``report.changes`` names what was dropped.
+
+    References
+    ----------
+    Yuan & Lin, "Model selection and estimation in regression with grouped variables", J. R. Stat. Soc. B 68, 2006;
+    Zou, "The adaptive lasso and its oracle properties", J. Am. Stat. Assoc. 101, 2006.
+    """
+    penalty = checks.positive(penalty, "penalty")
+    if over not in ("observables", "entries"):
+        raise DataError(f'over is {over!r}; pass "observables" or "entries"')
+    task = read(episodes, lifting, embedding, "sparse_edmd", **how)
+    names, nz = task.lifting.names, task.lifting.nz
+    missing = [state for state in task.states if state not in names]
+    if missing:
+        raise DataError(f"the lifting lacks the state {missing[0]!r}; add State() to it")
+    rows = task.rows.leading(nz)
+    one = Constant().bind(task.states).names[0]
+    kept = np.array([name in task.states or name == one for name in names])
+    used, missed = _closed(rows, kept, penalty, over == "entries", adaptive)
+    stay = np.flatnonzero(kept)
+    columns = np.concatenate([stay, np.arange(nz, len(used))])
+    few = Rows(rows.P[:, columns], rows.T[:, stay], rows.rest[stay], rows.samples)
+    picked = Picked(task.lifting, tuple(map(int, stay))).bind(task.lifting._states)
+    sentences = doubts(few, picked.names, task.inputs, regular=False)[0]
+    if missed > 1e-6:
+        sentences.append(
+            f"the LASSO met its optimality conditions only to {missed:.1e}; raise the penalty, or drop observables "
+            "that are almost functions of others"
+        )
+    known = np.where(used[np.ix_(columns, stay)], np.nan, 0.0).T
+    K = linear(few, Entries(known, np.full_like(known, -np.inf), np.full_like(known, np.inf)), 0.0)
+    dropped = [names[int(i)] for i in np.flatnonzero(~kept)]
+    plain = solve(rows).K[:, stay]
+    changes = [
+        f"{len(dropped)} of {nz} observables dropped" + (f": {', '.join(dropped)}" if dropped else ""),
+        f"{int(np.isnan(known).sum())} of {known.size} entries of [A B] are not zero",
+        growth(Rows(rows.P, few.T, few.rest, rows.samples), _spread(K, columns, len(used)), plain),
+    ]
+    assert task.C is not None, "an extended regression has its C"
+    place = {name: i for i, name in enumerate(picked.names)}
+    where = np.array([place[state] for state in task.states])
+    part = replace(task, rows=few, lifting=picked, C=task.C[:, stay], x_next=where)
+    rule = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
+    return warned(assembled(part, K, rule=rule, doubts=sentences, changes=changes))
+
+
+def _closed(
+    rows: Rows, kept: Bool[np.ndarray, " nz"], penalty: float, entries: bool, adaptive: bool
+) -> tuple[Bool[np.ndarray, "n nz"], float]:
+    """Grow `kept`, in place, until it predicts itself; return which coefficients are not zero, and the worst miss."""
+    nz, worst = len(kept), 0.0
+    size, unit = norms(rows.P), np.sqrt(np.sum(rows.T**2, axis=0) + rows.rest)
+    P, T = rows.P / np.where(size > 0, size, 1.0), rows.T / np.where(unit > 0, unit, 1.0)
+    rest = rows.rest / np.where(unit > 0, unit, 1.0) ** 2
+    while True:
+        targets = np.flatnonzero(kept)
+        rated = np.ones(P.shape[1], dtype=bool)  # the columns that pay
+        if not entries:
+            rated[nz:] = False
+            rated[targets] = False
+        if not rated.any():
+            return np.ones((P.shape[1], nz), dtype=bool), worst
+        task = Rows(P, T[:, targets], rest[targets], rows.samples)
+        plain = np.abs(solve(task, ridge="gcv").K[rated])
+        if not entries:
+            plain = np.sqrt(np.sum(plain**2, axis=1, keepdims=True)) * np.ones_like(plain)
+        weights = penalty / np.maximum(plain, 1e-12) if adaptive else np.full_like(plain, penalty)
+        own = P[:, rated] - onto(P[:, ~rated], P[:, rated])
+        found = lasso(own.T @ own, own.T @ T[:, targets], weights, grouped=not entries)
+        worst = max(worst, found.missed)
+        used = np.zeros((P.shape[1], nz), dtype=bool)
+        used[np.ix_(~rated, kept)] = True
+        used[np.ix_(rated, kept)] = found.K != 0
+        more = used[:nz].any(axis=1) & ~kept
+        if not more.any():
+            return used, worst
+        kept |= more
+
+
+def _spread(K: Float[np.ndarray, "c k"], columns: np.ndarray, n: int) -> Float[np.ndarray, "n k"]:
+    whole = np.zeros((n, len(K.T)))
+    whole[columns] = K
+    return whole

@@ -1,0 +1,210 @@
+"""Second moments of the rows [ψ(x) u ψ(x⁺)], or [ψ(x) u u⊗ψ(x) ψ(x⁺)]: all that the regressions need."""
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc.data.delay import Delay
+from koopmpc.errors import DataError, FitWarning
+from koopmpc.identify.moments.sums import absorb
+from koopmpc.identify.solve import Rows, norms, unit
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import Constant, State
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False)
+class Moments(Value):
+    """Second moments of the rows d = [ψ(x) u ψ(x⁺)] of M snapshot pairs: G = Σ w dᵀd, or R with RᵀR = Σ w dᵀd.
+
+    They add: ``a + b`` are the moments of both data sets, in any grouping, to rounding. Where ψ lacks a
+    state, the state is appended to it in these rows, so that C and the residuals need no second pass.
+
+    Attributes
+    ----------
+    lifting
+        ψ, bound to the states, or to ζ of the embedding.
+    inputs
+        Names with units; none for an autonomous system.
+    dt
+        Sample time [s].
+    samples
+        M, the pairs of weight above 0.
+    weight
+        Σ w; M where the pairs are not weighted.
+    route
+        "gram" for raw sums of products, "qr" for the triangular factor: twice the digits, six times the cost.
+    sums
+        G or R, (nd, nd).
+    bilinear
+        The rows are [ψ(x) u u⊗ψ(x) ψ(x⁺)]; a Constant is left out of the products, for u times it is u.
+    embedding
+        Where ψ acts on ζ, what makes it.
+    """
+
+    lifting: Lifting
+    inputs: tuple[str, ...]
+    dt: float
+    samples: int
+    weight: float
+    route: str
+    sums: Float[np.ndarray, "nd nd"]
+    bilinear: bool = False
+    embedding: Delay | None = None
+
+    @cached_property
+    def full(self) -> Lifting:
+        """The lifting, then the states that it lacks."""
+        return with_states(self.lifting)
+
+    @property
+    def nz(self) -> int:
+        """Number of observables in ψ."""
+        return self.lifting.nz
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states x, without their past."""
+        return self.lifting._states if self.embedding is None else self.embedding.states
+
+    @property
+    def products(self) -> Int[np.ndarray, " np"]:
+        """Observables in u⊗ψ(x): all but a Constant, or none."""
+        return multiplied(self.lifting, self.bilinear)
+
+    @property
+    def regressors(self) -> Int[np.ndarray, " n"]:
+        """Columns of ψ(x), u and u⊗ψ(x)."""
+        return np.concatenate([np.arange(self.nz), np.arange(self.full.nz, self._first)])
+
+    @property
+    def targets(self) -> Int[np.ndarray, " n"]:
+        """Columns of ψ(x⁺), the appended states last."""
+        return np.arange(self._first, self._first + self.full.nz)
+
+    @property
+    def _first(self) -> int:
+        return self.full.nz + len(self.inputs) * (1 + len(self.products))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the regressors on unit-norm columns, those that are 0 throughout left out."""
+        columns = self.rows(self.regressors, self.targets[:0]).P
+        size = norms(columns)
+        s = np.linalg.svd(columns[:, size > 0] / size[size > 0], compute_uv=False)
+        if self.samples < len(s):
+            return np.inf
+        return float(s[0] / s[-1]) if s.size and s[-1] > 0 else (np.inf if s.size else 1.0)
+
+    def __add__(self, other: "Moments") -> "Moments":
+        """Return the moments of both data sets; R + G becomes G and warns, for it loses R's digits."""
+        mine = (self.lifting, self.inputs, self.dt, self.bilinear, self.embedding)
+        if mine != (other.lifting, other.inputs, other.dt, other.bilinear, other.embedding):
+            raise DataError(
+                "the moments differ in lifting, inputs or dt, or one is bilinear; "
+                "add moments of one plant in one lifting only"
+            )
+        both = replace(self, samples=self.samples + other.samples, weight=self.weight + other.weight)
+        if self.route == other.route == "qr":
+            R = self.sums.copy(order="F")
+            absorb(R, other.sums)
+            return replace(both, sums=np.ascontiguousarray(R))
+        if self.route != other.route:
+            warnings.warn(
+                "a triangular factor was added to Gram sums: the result is Gram sums, with half the digits; "
+                'read both with route="qr"',
+                FitWarning,
+                stacklevel=2,
+            )
+        return replace(both, route="gram", sums=self._gram() + other._gram())
+
+    def rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> Rows:
+        """Return a few rows [P T] with the same second moments as these columns of all M rows.
+
+        Weights are taken with mean 1, so that a root of the mean over M rows is one over the weighted rows.
+        """
+        n, scale = len(regressors), self.samples / self.weight
+        if self.route == "qr":
+            R = _triangle(np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])])
+            return Rows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
+        G = scale * self.sums
+        size = np.sqrt(G.diagonal()[regressors])
+        size[size == 0] = 1.0
+        values, vectors = np.linalg.eigh(G[np.ix_(regressors, regressors)] / np.outer(size, size))
+        # an eigenvalue below this is rounding of the sums
+        held = values > np.finfo(float).eps * max(self.samples, n) * values.max(initial=0.0)
+        root = np.sqrt(np.where(held, values, 0.0))
+        P = root[:, None] * vectors.T * size
+        inverse = np.where(held, 1.0, 0.0) / np.where(held, root, 1.0)
+        T = inverse[:, None] * (vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None]))
+        rest = np.maximum(G.diagonal()[targets] - np.sum(T**2, axis=0), 0.0)
+        return Rows(P, T, rest, self.samples)
+
+    def complete(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> Rows:
+        """Return rows [P T] as `rows` does, with all of T inside: TᵀT is that of all M rows, too.
+
+        From Gram sums they are a root of the whole matrix, and have half the digits.
+        """
+        n = len(regressors)
+        every = self.rows(np.concatenate([regressors, targets]), targets[:0]).P
+        return Rows(every[:, :n], every[:, n:], np.zeros(len(targets)), self.samples)
+
+    def _gram(self) -> Float[np.ndarray, "nd nd"]:
+        return self.sums if self.route == "gram" else self.sums.T @ self.sums
+
+
+def multiplied(lifting: Lifting, bilinear: bool) -> Int[np.ndarray, " np"]:
+    """Return which observables u is multiplied with: all but a Constant, or none where the model is not bilinear."""
+    one = Constant().bind(lifting._states).names[0]
+    return np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
+
+
+def product_names(lifting: Lifting, inputs: tuple[str, ...], products: Int[np.ndarray, " np"]) -> tuple[str, ...]:
+    """Return ``"force [N] * theta [rad]"``, …, in the order of u⊗ψ(x)."""
+    return tuple(f"{u} * {lifting.names[int(i)]}" for u in inputs for i in products)
+
+
+def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
+    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
+
+
+def with_states(lifting: Lifting) -> Lifting:
+    """Return the lifting, then the states that it lacks."""
+    states = State().bind(lifting._states)
+    return lifting if set(states.names) <= set(lifting.names) else lifting + states
+
+
+class BothSides(NamedTuple):
+    """Rows with PᵀP = Σ pᵀp, PᵀT and TᵀT of the M snapshots, p = [ψ(x) u] and t = ψ(x⁺).
+
+    Attributes
+    ----------
+    P
+        (m, n) the observables, the inputs, and for a bilinear model their products.
+    T
+        (m, nz) the observables one step later.
+    cut
+        Singular values below this part of the largest are rounding, on columns of unit norm.
+    """
+
+    P: Float[np.ndarray, "m n"]
+    T: Float[np.ndarray, "m nz"]
+    cut: float
+
+
+def both_sides(total: Moments) -> BothSides:
+    """Return these rows, and where rounding begins: with Gram sums at half the digits."""
+    rows = total.complete(total.regressors, total.targets[: total.nz])
+    rounding = float(np.finfo(float).eps * max(total.samples, len(total.regressors) + total.nz))
+    return BothSides(rows.P, rows.T, rounding if total.route == "qr" else float(np.sqrt(rounding)))
+
+
+def orthonormal(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:
+    """Return an orthonormal basis of the span of these columns, those of norm 0 left out."""
+    live = unit(columns[:, norms(columns) > 0])
+    U, s, _ = np.linalg.svd(live, full_matrices=False)
+    return U[:, s > cut * s.max(initial=0.0)]

@@ -1,0 +1,141 @@
+"""The plants of the papers, and their trajectories, integrated far below every error that is reported.
+
+Pendulum and cart-pole as in Snyder & Song, "Koopman operator theory for nonlinear dynamic modeling using dynamic mode
+decomposition", 2021; the cart-pole with damping is that of Brunton & Kutz, "Data-Driven Science and Engineering",
+2019, section 8.7.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.riccati import Gain, lqr
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.plants.dynamics import Dynamics, right_side
+from koopmpc.plants.integrators import RK4
+from koopmpc.plants.step_map import StepMap
+
+SUBSTEPS = 8  # of a sample of 0.01 s: the error of RK4 is then below 1e-12
+
+
+@dataclass(frozen=True)
+class Pendulum(Dynamics):
+    """θ̈ = ∓(g/L) sin θ + u / (m L²): θ = 0 hangs, or with `upright` stands."""
+
+    states = ("theta [rad]", "omega [rad/s]")
+    inputs = ("torque [N m]",)
+
+    m: float = 1.0  # mass [kg], Snyder & Song 2021
+    L: float = 2.0  # length [m], Snyder & Song 2021
+    g: float = 9.81  # gravity [m/s²]
+    upright: bool = False
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """ẋ = [ω, ∓(g/L) sin θ + u / (m L²)]."""
+        pull = self.g / self.L * ca.sin(x[0]) * (1.0 if self.upright else -1.0)
+        return ca.vertcat(x[1], pull + u[0] / (self.m * self.L**2))
+
+
+@dataclass(frozen=True)
+class CartPole(Dynamics):
+    """(M + m sin²θ) v̇ = u − d v + m sin θ (L ω² + g cos θ),  L ω̇ = −v̇ cos θ − g sin θ; θ = π is upright."""
+
+    states = ("position [m]", "velocity [m/s]", "theta [rad]", "omega [rad/s]")
+    inputs = ("force [N]",)
+
+    M: float = 5.0  # cart mass [kg], Snyder & Song 2021
+    m: float = 1.0  # pole mass, at the tip [kg], Snyder & Song 2021
+    L: float = 2.0  # pole length [m], Snyder & Song 2021
+    g: float = 9.81  # gravity [m/s²]
+    d: float = 0.0  # damping of the cart [N s/m]
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """ẋ = [v, v̇, ω, ω̇]."""
+        S, C = ca.sin(x[2]), ca.cos(x[2])
+        push = u[0] - self.d * x[1] + self.m * S * (self.L * x[3] ** 2 + self.g * C)
+        acceleration = push / (self.M + self.m * S**2)
+        return ca.vertcat(x[1], acceleration, x[3], -(acceleration * C + self.g * S) / self.L)
+
+
+def jacobians(dynamics: Dynamics, x: ArrayLike) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"]]:
+    """Return A = ∂f/∂x and B = ∂f/∂u of ẋ = f(x, u) at (x, 0), exactly."""
+    point = checks.array(x, "x", (dynamics.nx,))
+    f = right_side(dynamics)
+    a, b = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    value = f(a, b)
+    both = ca.Function("jacobians", [a, b], [ca.jacobian(value, a), ca.jacobian(value, b)])
+    A, B = both(point, np.zeros(dynamics.nu))
+    return np.array(ca.DM(A).full()), np.array(ca.DM(B).full())
+
+
+def gain(dynamics: Dynamics, x: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+    """Return the continuous-time LQR of the linearisation at (x, 0)."""
+    return lqr(*jacobians(dynamics, x), Q, R)
+
+
+def printed_gain(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> Gain:
+    """Return the LQR of the matrix as the databook prints it: the sign of ∂v̇/∂θ at θ = π is wrong. Legacy."""
+    A, B = jacobians(plant, [0.0, 0.0, np.pi, 0.0])
+    A[1, 2] = -A[1, 2]
+    return lqr(A, B, Q, R)
+
+
+def frequency(plant: Pendulum, amplitude: float) -> float:
+    """Return ω = √(g/L) · agm(1, cos(θ₀/2)) [rad/s] of the hanging pendulum let go at θ₀.
+
+    The period is 4 √(L/g) K(sin θ₀/2), and the elliptic integral K(k) = π / (2 agm(1, √(1 − k²))).
+    """
+    a, b = 1.0, float(np.cos(amplitude / 2))
+    while abs(a - b) > 1e-15 * a:
+        a, b = (a + b) / 2, float(np.sqrt(a * b))
+    return float(np.sqrt(plant.g / plant.L)) * a
+
+
+def trajectories(
+    dynamics: Dynamics,
+    starts: ArrayLike,
+    *,
+    dt: float,
+    steps: int,
+    K: ArrayLike | None = None,
+    x_ref: ArrayLike = 0.0,
+    held: bool = False,
+) -> Episodes:
+    """Return x(k dt), k = 0 … steps, of ẋ = f(x, −K (x − x_ref)) from each start, without its inputs.
+
+    Parameters
+    ----------
+    starts
+        (E, nx), or one (nx,).
+    dt
+        Sample time [s].
+    K
+        (nu, nx), or (nx,) where nu is 1; no input by default.
+    x_ref
+        Scalar or (nx,), where the feedback leads.
+    held
+        Hold u = −K (x_k − x_ref) for a sample; by default the feedback is continuous, inside of the integration.
+    """
+    nx, nu = dynamics.nx, dynamics.nu
+    rows = np.atleast_2d(checks.array(starts, "starts"))
+    target = checks.vector(x_ref, "x_ref", nx)
+    matrix = np.zeros((nu, nx)) if K is None else checks.array(K, "K").reshape(nu, nx)
+    x, u, none = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("none", 0)
+    law = -ca.DM(matrix) @ (x - ca.DM(target))
+    f = right_side(dynamics)
+    F = RK4(SUBSTEPS).step(f if held else ca.Function("f", [x, u], [f(x, law)]), dt)
+    sampled = ca.Function("F", [x, none], [F(x, law)])
+    X = StepMap(sampled, dt, states=dynamics.states, inputs=()).rollouts(rows, np.empty((len(rows), steps, 0)))
+    return Episodes([Episode(X=each) for each in X], dt, dynamics.states)
+
+
+def inputs_of(data: Episodes, names: tuple[str, ...], K: ArrayLike, x_ref: ArrayLike = 0.0) -> Episodes:
+    """Return the same episodes with the inputs u_k = −K (x_k − x_ref) that drove them."""
+    matrix = checks.array(K, "K").reshape(len(names), data.nx)
+    target = checks.vector(x_ref, "x_ref", data.nx)
+    known = [Episode(X=e.X, U=-(e.X[:-1] - target) @ matrix.T) for e in data]
+    return Episodes(known, data.dt, data.states, names)

@@ -1,0 +1,193 @@
+"""One line of a table of reconstructions: fit a trajectory, rebuild it from its first state, and look elsewhere."""
+
+import warnings
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import FitWarning
+from koopmpc.identify.fits.edmd import edmd
+from koopmpc.lifting.base import Lifting
+from koopmpc.papers.plants import trajectories
+from koopmpc.plants.dynamics import Dynamics
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
+from koopmpc.values import Value
+
+CUT = 1e-10  # singular values below this share of the largest are left out: "full rank" of a table
+LINEAR = 0.05  # an eigenfunction that is off by less than this over a whole run is one
+_STEADY = 1e-4  # |λ − 1| below it: a constant, which every lifting has and which says nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction(Value):
+    """How well z⁺ = A z on z = ψ(x) tells a trajectory from its first state, x(t) = Re Φ exp(Ωt) b.
+
+    Attributes
+    ----------
+    model
+        The fit.
+    X
+        (T+1, nx), the reconstruction.
+    truth
+        (T+1, nx), the trajectory that it was fitted to.
+    rank, width
+        Singular values kept, and observables in ψ.
+    condition
+        σ₁ / σ_rank of the unscaled snapshots ψ(x_k): of what is kept.
+    error
+        ‖X − truth‖ / ‖truth‖ in the Frobenius norm.
+    held_out
+        The median of the same over trajectories that were not fitted.
+    evolution
+        (rank,) ‖φ(x_k) − λᵏ φ(x₀)‖ / ‖φ‖ of each eigenfunction, on the fitted trajectory.
+    leading
+        The eigenfunction with the largest share |b_j| ‖Φ_j‖ of the first state, of a pair that with Im λ > 0;
+        constants are left out.
+    """
+
+    model: LinearPredictor
+    X: Float[np.ndarray, "T1 nx"]
+    truth: Float[np.ndarray, "T1 nx"]
+    rank: int
+    width: int
+    condition: float
+    error: float
+    held_out: float
+    evolution: Float[np.ndarray, " nz"]
+    leading: int
+
+    @property
+    def linear(self) -> int:
+        """How many eigenfunctions are within `LINEAR`."""
+        return int(np.sum(self.evolution < LINEAR))
+
+
+def rebuilt(trajectory: Episodes, lifting: Lifting, held_out: Episodes, rank: int | None = None) -> Reconstruction:
+    """Fit ψ(x⁺) = A ψ(x) to one trajectory by truncated SVD of the unscaled snapshots, and rebuild it.
+
+    Parameters
+    ----------
+    trajectory
+        One episode without inputs.
+    lifting
+        ψ.
+    held_out
+        Trajectories of the same system from other starts.
+    rank
+        Keep so many singular values; by default all above `CUT` times the largest.
+    """
+    (episode,) = trajectory
+    bound = lifting.bind(trajectory.states)
+    s = np.linalg.svd(bound(episode.X[:-1]), compute_uv=False)
+    full = int(np.sum(s > CUT * s[0]))
+    kept = full if rank is None else min(rank, full)
+    with unwarned():
+        model = edmd(trajectory, bound, rank=kept)
+    X = reconstruction(model, episode)
+    share = np.abs(amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)
+    values = model.eigenvalues
+    moving = (np.abs(values - 1) > _STEADY) & (np.imag(values) >= 0)
+    return Reconstruction(
+        model=model,
+        X=X,
+        truth=episode.X,
+        rank=kept,
+        width=bound.nz,
+        condition=float(s[0] / s[kept - 1]),
+        error=relative(X, episode.X),
+        held_out=float(np.median([relative(reconstruction(model, e), e.X) for e in held_out])),
+        evolution=evolution_error(model, trajectory),
+        leading=int(np.argmax(np.where(moving, share, -1.0))),
+    )
+
+
+def reconstruction(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1 nx"]:
+    """Return x(t) = Re Φ exp(Ωt) b at the times of the episode, from its first state."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return reconstruct(model, episode.X[0], np.arange(len(episode.X)) * model.dt)
+
+
+def relative(X: Float[np.ndarray, "T1 nx"], truth: Float[np.ndarray, "T1 nx"]) -> float:
+    """Return ‖X − truth‖ / ‖truth‖ over all entries; inf where X left the finite numbers."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = float(np.linalg.norm(X - truth) / np.linalg.norm(truth))
+    return error if np.isfinite(error) else np.inf
+
+
+@contextmanager
+def unwarned() -> Generator[None]:
+    """Show no FitWarning: rank, condition and what a report says are in the tables."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)
+        yield
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One trajectory of one plant.
+
+    Attributes
+    ----------
+    title
+        Plant and data, in words.
+    dynamics
+        ẋ = f(x, u).
+    x0
+        Where the trajectory starts.
+    spread
+        Held-out trajectories start uniformly in x0 ± spread.
+    K, x_ref
+        u = −K (x − x_ref), continuous; none by default.
+    held
+        Hold u over a sample.
+    dt, steps
+        Sample time [s] and length.
+    others
+        How many held-out trajectories.
+    """
+
+    title: str
+    dynamics: Dynamics
+    x0: Sequence[float]
+    spread: Sequence[float]
+    K: Float[np.ndarray, "nu nx"] | None = None
+    x_ref: Sequence[float] | float = 0.0
+    held: bool = False
+    dt: float = 0.01
+    steps: int = 1000
+    others: int = 10
+
+    @cached_property
+    def trajectory(self) -> Episodes:
+        """The one that is fitted."""
+        return self._run(np.asarray([self.x0]))
+
+    @cached_property
+    def held_out(self) -> Episodes:
+        """Those that are not; the same starts each time."""
+        away = np.random.default_rng(0).uniform(-1.0, 1.0, (self.others, len(self.x0)))
+        return self._run(np.asarray(self.x0) + away * np.asarray(self.spread))
+
+    def rebuilt(self, liftings: Mapping[str, Lifting], rank: int) -> dict[tuple[str, bool], Reconstruction]:
+        """Return each lifting's reconstruction, by its name and whether all singular values were kept.
+
+        A lifting of `rank` observables has one of them alone: nothing is left out of it.
+        """
+        found: dict[tuple[str, bool], Reconstruction] = {}
+        for name, lifting in liftings.items():
+            for kept in (None, rank):
+                fit = rebuilt(self.trajectory, lifting, self.held_out, kept)
+                if kept is None or fit.width > rank:
+                    found[name, kept is None] = fit
+        return found
+
+    def _run(self, starts: Float[np.ndarray, "E nx"]) -> Episodes:
+        return trajectories(
+            self.dynamics, starts, dt=self.dt, steps=self.steps, K=self.K, x_ref=self.x_ref, held=self.held
+        )

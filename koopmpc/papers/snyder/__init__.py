@@ -1,0 +1,1 @@
+"""Snyder & Song (2021), reproduced."""

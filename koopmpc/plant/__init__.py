@@ -1,1 +1,0 @@
-"""Plants: dynamics, integrators, step maps."""

@@ -1,0 +1,11 @@
+"""Plants: dynamics, integrators, step maps."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.plants.simulated import SimulatedPlant as SimulatedPlant
+    from koopmpc.plants.step_map import Affine as Affine
+else:
+    __getattr__, __dir__, __all__ = attach(__name__, {"simulated": "SimulatedPlant", "step_map": "Affine"})

@@ -1,0 +1,229 @@
+"""x⁺ = F(x, u) as machine code: the C that CasADi generates, in a loop over episodes and steps."""
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
+
+# No fused multiply-adds and no -march: the interpreter's numbers, on any machine of this kind.
+_FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+_STEPS_A_THREAD = 50_000  # some 5 ms, against 0.1 ms for a thread
+_LOOP = """
+#ifdef _WIN32
+__declspec(dllexport)
+#endif
+void koopmpc_rollouts(long long episodes, long long steps, double* X, const double* U) {{
+  const double* arg[{sz_arg}];
+  double* res[{sz_res}];
+  casadi_int iw[{sz_iw}];
+  double w[{sz_w}];
+  for (long long e = 0; e < episodes; ++e) {{
+    for (long long k = 0; k < steps; ++k) {{
+      arg[0] = X;
+      arg[1] = U;
+      res[0] = X + {nx};
+      koopmpc_step(arg, res, iw, w, 0);
+      X += {nx};
+      U += {nu};
+    }}
+    X += {nx};
+  }}
+}}
+"""
+
+
+def source(F: ca.Function) -> str:
+    """Return C with ``koopmpc_rollouts(E, T, X, U)``: X (E, T+1, nx) from its first rows and U (E, T, nu)."""
+    x, u = ca.SX.sym("x", F.size1_in(0)), ca.SX.sym("u", F.size1_in(1))
+    step = ca.Function("koopmpc_step", [x, u], [F(x, u)])
+    generator = ca.CodeGenerator("koopmpc", {"with_header": False})
+    generator.add(step)
+    sizes = {f"sz_{name}": getattr(step, f"sz_{name}")() + 1 for name in ("arg", "res", "iw", "w")}
+    # Static: an exported name could be taken by one of the same name elsewhere in the process.
+    return (
+        "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump() + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
+    )
+
+
+def compiler() -> list[str] | None:
+    """Return the command of a C compiler: $CC, cc, gcc or clang, the first that is found."""
+    for command in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        words = shlex.split(command)
+        if words and shutil.which(words[0]):
+            return words
+    return None
+
+
+def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
+    """Return F's machine code, from `cache` if it is there; without a cache nothing is left on disk.
+
+    Raises
+    ------
+    OSError, subprocess.SubprocessError
+        The compiler fails or its output does not load.
+    """
+    return _bound(library(source(F), command, cache))
+
+
+def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
+    """Return the loaded machine code of this C, from `cache` if it is there; else nothing is left on disk.
+
+    Raises
+    ------
+    OSError, subprocess.SubprocessError
+        The compiler fails or its output does not load.
+    """
+    if cache is None:
+        with tempfile.TemporaryDirectory() as folder:  # mapped code outlives its file
+            return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
+    key = "\0".join([text, *command, *_FLAGS, platform.machine(), platform.system()])
+    path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
+    if path.is_file():
+        try:
+            return ctypes.CDLL(str(path))
+        except OSError:  # of another kind of machine: write it again
+            path.unlink()
+    return ctypes.CDLL(str(_compile(text, command, path)))
+
+
+def private_cache() -> Path | None:
+    """Return this user's folder for machine code, or None where others could write into it."""
+    if not hasattr(os, "getuid"):
+        return None
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    folder = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "koopmpc"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        ours = _private(folder) and os.access(folder, os.W_OK)
+    except OSError:
+        return None
+    return folder if ours else None
+
+
+def _private(folder: Path) -> bool:
+    """Return whether nobody but this user (and root) can change what `folder` holds or where its path leads."""
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        return False
+    above = [parent.stat() for parent in folder.resolve().parents]
+    return all(
+        parent.st_uid in (0, os.getuid()) and (not parent.st_mode & 0o022 or parent.st_mode & stat.S_ISVTX)
+        for parent in above
+    )
+
+
+def _compile(text: str, command: list[str], path: Path) -> Path:
+    """Compile into a folder of our own beside `path`, then move there in one stroke."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        code, library = Path(folder) / "step.c", Path(folder) / "step.so"
+        code.write_text(text)
+        subprocess.run([*command, *_FLAGS, "-o", str(library), str(code), "-lm"], check=True, capture_output=True)
+        library.replace(path)
+    return path
+
+
+def _bound(code: ctypes.CDLL) -> Kernel:
+    rollouts = code.koopmpc_rollouts
+    rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
+    rollouts.restype = None
+
+    def march(X: np.ndarray, U: np.ndarray) -> None:
+        rollouts(U.shape[0], U.shape[1], X.ctypes.data, U.ctypes.data)
+
+    def run(X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
+        if not (X.flags.c_contiguous and U.flags.c_contiguous):
+            raise AssertionError("machine code reads contiguous arrays only")
+        episodes, steps = U.shape[:2]
+        threads = min(os.cpu_count() or 1, episodes, episodes * steps // _STEPS_A_THREAD)
+        if threads > 1:
+            ends = [episodes * i // threads for i in range(threads + 1)]
+            parts = [slice(*pair) for pair in pairwise(ends)]
+            with ThreadPoolExecutor(threads) as pool:  # ctypes lets go of the interpreter's lock
+                list(pool.map(march, [X[part] for part in parts], [U[part] for part in parts]))
+        else:
+            march(X, U)
+
+    return run
+
+
+_CALL = """
+#ifdef _WIN32
+__declspec(dllexport)
+#endif
+int koopmpc_call(const double** arg, double** res, casadi_int* iw, double* w) {
+  return %s(arg, res, iw, w, 0);
+}
+"""
+
+
+class Routine:
+    """`function` that reads `arguments` and writes `results`, float64 arrays that hold matrices column by column.
+
+    Both routes give the same numbers. What the interpreter alone can do (implicit integrators), it does.
+    """
+
+    def __init__(self, function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        sizes = [function.nnz_in(i) for i in range(function.n_in())]
+        sizes += [function.nnz_out(i) for i in range(function.n_out())]
+        for size, array in zip(sizes, [*arguments, *results], strict=True):
+            assert array.dtype == np.float64, "machine code reads float64"
+            assert array.flags.c_contiguous, "machine code reads contiguous arrays"
+            assert array.size == size, f"an array has {array.size} entries, the function {size}"
+        self._kept: list[Any] = [*arguments, *results]  # neither route holds the arrays that it points to
+        call = _machine(function, arguments, results, self._kept)
+        self.compiled = call is not None
+        self.call: Callable[[], object] = call or _interpreter(function, arguments, results, self._kept)
+
+
+def _machine(
+    function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], kept: list[Any]
+) -> Callable[[], object] | None:
+    command = compiler()
+    if command is None:
+        return None
+    try:
+        generator = ca.CodeGenerator("koopmpc", {"with_header": False})
+        generator.add(function)
+        text = "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump() + _CALL % function.name()
+        code = library(text, command, private_cache())
+    except (OSError, RuntimeError, subprocess.SubprocessError):
+        return None
+    call = code.koopmpc_call
+    arg = (ctypes.c_void_p * (function.sz_arg() + 1))(*(a.ctypes.data for a in arguments))
+    res = (ctypes.c_void_p * (function.sz_res() + 1))(*(r.ctypes.data for r in results))
+    w = np.zeros(function.sz_w() + 1)
+    iw = np.zeros(function.sz_iw() + 1, dtype=np.int64)
+    kept += [code, arg, res, iw, w]
+    pointers = [ctypes.c_void_p(ctypes.addressof(each)) for each in (arg, res)]
+    pointers += [ctypes.c_void_p(each.ctypes.data) for each in (iw, w)]
+    return lambda: call(*pointers)
+
+
+def _interpreter(
+    function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], kept: list[Any]
+) -> Callable[[], object]:
+    buffer, evaluate = cast("tuple[Any, Callable[[], None]]", function.buffer())
+    for i, array in enumerate(arguments):
+        if array.size:
+            buffer.set_arg(i, array.data)
+    for i, array in enumerate(results):
+        if array.size:
+            buffer.set_res(i, array.data)
+    kept.append(buffer)
+    return evaluate

@@ -1,0 +1,86 @@
+"""Continuous-time models ẋ = f(x, u), y = h(x), written in CasADi operations."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, cast
+
+import casadi as ca
+
+from koopmpc.errors import DataError, ShapeError
+
+
+class Dynamics(ABC):
+    """A plant ẋ = f(x, u), y = h(x): a frozen dataclass whose fields are the parameters, with units.
+
+    `states` and `inputs` name the rows of x and u, unit included: ``("theta [rad]", "omega [rad/s]")``.
+    """
+
+    states: ClassVar[tuple[str, ...]]
+    inputs: ClassVar[tuple[str, ...]]
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @abstractmethod
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """ẋ = f(x, u): (nx, 1) from x (nx, 1) and u (nu, 1)."""
+
+    def measure(self, x: ca.SX) -> ca.SX:
+        """Return y = h(x): (ny, 1) from x (nx, 1); the whole state unless overridden."""
+        return x
+
+
+def right_side(dynamics: Dynamics) -> ca.Function:
+    """Return f of ẋ = f(x, u) as a CasADi function of x (nx) and u (nu).
+
+    Raises
+    ------
+    ShapeError
+        `rhs` returns another number of rows than there are states.
+    DataError
+        `rhs` returns no CasADi expression, or one with symbols other than x and u.
+    """
+    _check_names(dynamics)
+    x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    value = _expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", ca.vertcat(x, u), dynamics.nx)
+    return ca.Function("f", [x, u], [value], ["x", "u"], ["dx"])
+
+
+def output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
+    """Return h of y = h(x), and the names of y: a state's own name where h passes that state on."""
+    _check_names(dynamics)
+    x = ca.SX.sym("x", dynamics.nx)
+    value = _expression(dynamics.measure(x), f"{type(dynamics).__name__}.measure", x)
+    names: list[str] = []
+    for i in range(value.size1()):
+        passed = [name for j, name in enumerate(dynamics.states) if ca.is_equal(value[i], x[j])]
+        names.append(passed[0] if passed else f"y{i}")
+    return ca.Function("h", [x], [value], ["x"], ["y"]), tuple(names)
+
+
+def _expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
+    if not isinstance(value, ca.SX | ca.DM):
+        raise DataError(f"{name} returned a {type(value).__name__}; return one column, ca.vertcat(...)")
+    column = ca.SX(value)
+    if column.size2() != 1 or (rows is not None and column.size1() != rows):
+        expected = f"({rows}, 1), one row a state" if rows is not None else "one column"
+        raise ShapeError(f"{name} returned shape {column.shape}, expected {expected}")
+    free = [str(symbol) for symbol in ca.symvar(column) if not ca.depends_on(symbol, known)]
+    if free:
+        raise DataError(f"{name} holds free symbols {free}; make them parameters with numbers")
+    return ca.densify(column)
+
+
+def _check_names(dynamics: Dynamics) -> None:
+    for field in ("states", "inputs"):
+        names = cast("object", getattr(dynamics, field, None))
+        if not isinstance(names, tuple) or not all(isinstance(n, str) for n in cast("tuple[object]", names)):
+            raise DataError(f"{type(dynamics).__name__}.{field} is {names!r}; pass a tuple of names: ('theta [rad]',)")
+    if not dynamics.states:
+        raise DataError(f"{type(dynamics).__name__}.states is empty; name at least one state")

@@ -1,0 +1,218 @@
+"""The discrete-time plant x⁺ = F(x, u), y = h(x), immutable."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.plants.batch import Batch, march, warn_of
+from koopmpc.plants.buffered import Buffered, dense
+from koopmpc.plants.dynamics import Dynamics, output, right_side
+from koopmpc.plants.integrators import RK4, Integrator
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False)
+class Affine(Value):
+    """x⁺ ≈ A x + B u + c: A (nx, nx), B (nx, nu), c (nx,)."""
+
+    A: Float[np.ndarray, "nx nx"]
+    B: Float[np.ndarray, "nx nu"]
+    c: Float[np.ndarray, " nx"]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class StepMap:
+    """x⁺ = F(x, u), y = h(x), one sample of dt [s].
+
+    Parameters
+    ----------
+    F
+        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). Made of SX it runs in batches.
+    dt
+        Sample time [s].
+    h
+        CasADi function of x that returns y (ny); by default y = x.
+    states, inputs, outputs
+        Names with units; by default x0, x1, …; u0, …; and the states' names or y0, ….
+
+    Raises
+    ------
+    ShapeError
+        F or h takes or returns other shapes, or there are more or fewer names than rows.
+    DataError
+        dt is not above zero.
+    """
+
+    F: ca.Function
+    h: ca.Function
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def __init__(
+        self,
+        F: ca.Function,
+        dt: float,
+        h: ca.Function | None = None,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        outputs: Sequence[str] | None = None,
+    ) -> None:
+        _check_signature(F, "F", 2)
+        nx, nu = F.size1_in(0), F.size1_in(1)
+        if F.size1_out(0) != nx:
+            raise ShapeError(f"F returns {F.size1_out(0)} rows, expected {nx}, one a state")
+        if h is None:
+            x = ca.SX.sym("x", nx)
+            h = ca.Function("h", [x], [x], ["x"], ["y"])
+            outputs = states or _names(None, "states", "x", nx) if outputs is None else outputs
+        _check_signature(h, "h", 1)
+        if h.size1_in(0) != nx:
+            raise ShapeError(f"h takes {h.size1_in(0)} states, F has {nx}; pass h of the same x")
+        freeze = object.__setattr__
+        freeze(self, "F", dense(F))
+        freeze(self, "h", dense(h))
+        freeze(self, "dt", checks.positive(dt, "dt", "s"))
+        freeze(self, "states", _names(states, "states", "x", nx))
+        freeze(self, "inputs", _names(inputs, "inputs", "u", nu))
+        freeze(self, "outputs", _names(outputs, "outputs", "y", h.size1_out(0)))
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nx"]:
+        """x⁺ = F(x, u): (nx,) from x (nx,) and u (nu,).
+
+        NaN passes through; where an implicit method finds no x⁺ the answer is NaN, with a RuntimeWarning.
+        """
+        x, u = _vector(x, "x", len(self.states)), _vector(u, "u", len(self.inputs))
+        (x_place, u_place), (x_next,), evaluate, _ = self._step.slot()
+        x_place[:], u_place[:] = x, u
+        try:
+            evaluate()
+        except RuntimeError as error:
+            warn_of(error, x, u)
+            return np.full(self.nx, np.nan)
+        return x_next.copy()
+
+    def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
+        """Return y = h(x): (ny,) from x (nx,)."""
+        return self._output(_vector(x, "x", len(self.states)))[0]
+
+    def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
+        """x_{k+1} = F(x_k, u_k): X (T+1, nx) from x0 (nx,) and U (T, nu); the bits of T single calls."""
+        start = checks.array(x0, "x0", (self.nx,))
+        moves = checks.array(U, "U", (None, self.nu))
+        X = np.empty((len(moves) + 1, self.nx))
+        X[0] = start
+        march(self._step, X, moves)
+        return X
+
+    def rollouts(self, X0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "episodes steps nx"]:
+        """x_{k+1} = F(x_k, u_k) for E episodes at once: X (E, T+1, nx) from X0 (E, nx) and U (E, T, nu)."""
+        starts = checks.array(X0, "X0", (None, self.nx))
+        moves = checks.array(U, "U", (len(starts), None, self.nu))
+        X = np.empty((len(starts), moves.shape[1] + 1, self.nx))
+        X[:, 0] = starts
+        self._batch.fill(X, moves)
+        return X
+
+    def linearize(self, x: ArrayLike, u: ArrayLike) -> Affine:
+        """x⁺ ≈ A x + B u + c about (x*, u*): A = ∂F/∂x, B = ∂F/∂u exactly, c = F(x*, u*) − A x* − B u*."""
+        x, u = checks.array(x, "x", (self.nx,)), checks.vector(u, "u", self.nu)
+        x_next, columns_A, columns_B = self._jacobians(x, u)
+        A = np.ascontiguousarray(columns_A.reshape(self.nx, self.nx).T)
+        B = np.ascontiguousarray(columns_B.reshape(self.nu, self.nx).T)
+        return Affine(A, B, x_next - A @ x - B @ u)
+
+    @cached_property
+    def _step(self) -> Buffered:
+        return Buffered(self.F)
+
+    @cached_property
+    def _batch(self) -> Batch:
+        return Batch(self._step)
+
+    @cached_property
+    def _output(self) -> Buffered:
+        return Buffered(self.h)
+
+    @cached_property
+    def _jacobians(self) -> Buffered:
+        x, u = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu)
+        x_next = self.F(x, u)
+        A, B = ca.densify(ca.jacobian(x_next, x)), ca.densify(ca.jacobian(x_next, u))
+        together = ca.Function("linearize", [x, u], [x_next, A, B])
+        return Buffered(together.expand("linearize", {"cse": True}) if self.F.is_a("SXFunction") else together)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008
+    """Return x⁺ = F(x, u) of ẋ = f(x, u) over dt [s], u held.
+
+    Raises
+    ------
+    DataError
+        dt is not above zero.
+    ShapeError
+        `dynamics.rhs` returns another number of rows than there are states.
+    """
+    checks.positive(dt, "dt", "s")
+    F = integrator.step(right_side(dynamics), dt)
+    h, outputs = output(dynamics)
+    return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs)
+
+
+def _vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:
+    """Return `value` as float64 (length,): itself where it is one, for this is the control path."""
+    if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (length,):
+        return value
+    result = checks.array(value, name, finite=False)
+    return (
+        result.reshape(1) if result.ndim == 0 and length == 1 else checks.array(result, name, (length,), finite=False)
+    )
+
+
+def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
+    wanted = "(x, u)" if arguments == 2 else "(x)"
+    if function.n_in() != arguments or function.n_out() != 1:
+        raise ShapeError(
+            f"{name} has {function.n_in()} arguments and {function.n_out()} results, "
+            f"expected {name}{wanted} with one result"
+        )
+    sizes = [function.size2_in(i) for i in range(arguments) if function.size1_in(i)] + [function.size2_out(0)]
+    if any(columns != 1 for columns in sizes):
+        raise ShapeError(f"{name} is {function}, expected columns: {name}{wanted} with one column each")
+
+
+def _names(names: Sequence[str] | None, field: str, letter: str, count: int) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"{letter}{i}" for i in range(count))
+    if isinstance(names, str):
+        raise DataError(f"{field} is {names!r}; pass a tuple of names, one a row")
+    if len(names) != count:
+        raise ShapeError(f"{field} has {len(names)} names, expected {count}, one a row: got {tuple(names)}")
+    return tuple(names)

@@ -1,0 +1,174 @@
+# pyright: basic
+"""Columns: what an .rrd file holds, by entity and component; torn ends are cut off, changed columns found."""
+
+import json
+import struct
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.errors import LogError
+
+_MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
+_FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
+
+
+class Columns:
+    """The columns of a recording: rows in order of their step, by (entity, component).
+
+    `torn` says that the file ends within a message.
+    """
+
+    def __init__(self, chunks: Any, entities: tuple[str, ...], torn: bool) -> None:
+        self._entities, self.torn = entities, torn
+        self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
+        for chunk in chunks:
+            if not chunk.is_static and "step" not in chunk.timeline_names:
+                continue  # of no log of ours
+            batch = chunk.to_record_batch()
+            k = None if chunk.is_static else batch.column("step").to_numpy(zero_copy_only=False).astype(np.int64)
+            for name in batch.schema.names:
+                metadata = batch.schema.field(name).metadata or {}
+                if metadata.get(b"rerun:kind") == b"data":
+                    key = (chunk.entity_path, name.split(":")[-1])
+                    self._parts.setdefault(key, []).append((k, batch.column(name)))
+
+    def static(self, entity: str, component: str) -> Any:
+        """Return the one value that does not change, or None."""
+        parts = self._parts.get((entity, component))
+        return None if parts is None else parts[-1][1].to_pylist()[-1][0]
+
+    def rows(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Return the steps, the width, and the flat values of a component, in order of the steps."""
+        import pyarrow as pa
+
+        parts = self._parts.get((entity, component), [])
+        if not parts:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+        if parts[0][0] is None:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), parts[-1][1].flatten()
+        k = np.concatenate([k for k, _ in parts])
+        lists = pa.concat_arrays([column for _, column in parts])
+        order = np.argsort(k, kind="stable")
+        if (np.diff(k) < 0).any():
+            k, lists = k[order], lists.take(pa.array(order))
+        widths = lists.value_lengths().to_numpy(zero_copy_only=False)
+        return k, widths, lists.flatten()
+
+    def matrix(self, entity: str, component: str = "scalars") -> tuple[np.ndarray, np.ndarray]:
+        """Return the steps and one row of values each."""
+        k, widths, values = self.rows(entity, component)
+        flat = values if isinstance(values, np.ndarray) else values.to_numpy(zero_copy_only=False)
+        if len(widths) and (widths != widths[0]).any():
+            raise LogError(f"{entity} has rows of different lengths; the log was not written by koopmpc")
+        return k, np.array(flat).reshape(len(k), int(widths[0]) if len(widths) else 0)
+
+    def vectors(self, entity: str) -> np.ndarray:
+        """Return the rows 0, 1, … up to the first that is missing."""
+        k, values = self.matrix(entity)
+        return values[: _whole(k)]
+
+    def column(self, entity: str, component: str) -> np.ndarray:
+        """Return one number a row: 0, 1, … up to the first that is missing."""
+        k, values = self.matrix(entity, component)
+        return values[: _whole(k)].reshape(-1)
+
+    def changed(self) -> list[str]:
+        """Return the columns that are no longer what was written: the end of the log holds a checksum of each."""
+        sums: dict[str, int] = json.loads(self.static("/metrics", "sums"))
+        return [key for key, total in sums.items() if (data := self._data(key)) is not None and crc32(data) != total]
+
+    def _data(self, key: str) -> Any:
+        """Return the bytes that a checksum is made of; None for what is not read."""
+        import pyarrow as pa
+
+        entity, component = key.split(":")
+        if entity not in self._entities:
+            return None
+        values = self.rows(entity, component)[2]
+        if isinstance(values, pa.StringArray):
+            return "".join(values.to_pylist()).encode()
+        return np.ascontiguousarray(values).data
+
+
+def _whole(k: np.ndarray) -> int:
+    """Return how many of 0, 1, 2, … stand at the head of `k`."""
+    gaps = np.flatnonzero(k != np.arange(len(k)))
+    return int(gaps[0]) if len(gaps) else len(k)
+
+
+def read_columns(path: Path, entities: tuple[str, ...]) -> Columns:
+    """Return the columns of the `entities` in the file.
+
+    Raises
+    ------
+    LogError
+        The file is missing, no .rrd, or damaged beyond a torn end.
+    """
+    from rerun.chunk import RrdReader
+
+    check_log(path)
+    try:
+        with _whole_messages(path) as (whole, torn), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Rerun's word on a missing footer: load_run has its own
+            chunks = RrdReader(whole).stream().filter(content=list(entities)).to_chunks()
+            return Columns(chunks, entities, torn)
+    except LogError:
+        raise
+    except Exception as error:  # the reader of Rerun raises whatever its own parts raise
+        raise LogError(f"{path} is no log, or is damaged: {error}") from error
+
+
+def check_log(path: Path) -> None:
+    """Raise where `path` is no file, or none that starts as a recording does; it is not read further.
+
+    Raises
+    ------
+    LogError
+        The file is missing, a folder, cannot be opened, or is no .rrd.
+    """
+    try:
+        with checks.existing(path, "pass the .rrd of a run").open("rb") as file:
+            start = file.read(len(_MAGIC))
+    except LogError:
+        raise
+    except OSError as error:
+        raise LogError(f"{path} cannot be read: {error.strerror}") from error
+    if start != _MAGIC:
+        raise LogError(f"{path} is no log of koopmpc: it does not start as an .rrd file does")
+
+
+@contextmanager
+def _whole_messages(path: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield a file that ends with a whole message, and whether `path` ends within one.
+
+    It is `path` itself, or a copy without its last, torn message.
+
+    An .rrd is a header of 12 bytes and then messages, each with a header of 16 bytes (kind and length, little-endian).
+    """
+    size, end = path.stat().st_size, _FILE_HEADER
+    with path.open("rb") as file:
+        file.seek(max(size - 12, 0))
+        closed = file.read(8) == _FOOTER
+        while not closed and end + _MESSAGE_HEADER <= size:
+            file.seek(end)
+            kind, length = struct.unpack("<QQ", file.read(_MESSAGE_HEADER))
+            if not _END < kind <= _LAST_KIND or end + _MESSAGE_HEADER + length > size:
+                break
+            end += _MESSAGE_HEADER + length
+        if closed or end == size:
+            yield path, False
+            return
+        file.seek(0)
+        head = file.read(end)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "whole.rrd"
+        copy.write_bytes(head)
+        yield copy, True

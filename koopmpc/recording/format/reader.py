@@ -1,0 +1,168 @@
+# pyright: basic
+"""load_run: a log back into the Run that was written, to the bit."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from koopmpc.control.move import Fallback, Status
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.sampling import Signals, episodes_from
+from koopmpc.data.files.storage import reads
+from koopmpc.errors import LogError
+from koopmpc.loop.run import Plans, Run
+from koopmpc.recording.description import About, from_json
+from koopmpc.recording.format.columns import Columns, read_columns
+
+_ENTITIES = (
+    "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/slack", "/solver/time_ms",
+    "/solver/status", "/prediction/x", "/prediction/u", "/description", "/metrics",
+)  # fmt: skip
+
+
+def load_run(path: str | Path) -> Run:
+    """Return the Run that `record` or a `Recorder` wrote to `path`, equal to the bit.
+
+    A log that was cut short, or whose writer died, yields the steps that are whole, and a UserWarning.
+
+    Raises
+    ------
+    LogError
+        The file is missing, no log of koopmpc, damaged, or holds no whole step.
+    """
+    path = Path(path)
+    log = read_columns(path, _ENTITIES)
+    try:
+        return _run(log, path)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise LogError(f"{path} is damaged: {error}") from error
+
+
+def _run(log: Columns, path: Path) -> Run:
+    about, planned_steps = _about(log, path)
+    X, reference = log.vectors("/state"), log.vectors("/reference")
+    U = log.vectors("/control/u")
+    seconds = log.column("/solver/time_ms", "seconds")
+    iterations = log.column("/solver/time_ms", "iterations")
+    counts = [len(X) - 1, len(seconds)]
+    counts += [len(U)] if about.inputs else []
+    counts += [len(reference) - 1] if len(reference) else []
+    steps = min(counts)
+    if steps < 1:
+        raise LogError(f"{path} holds no whole step; its run ended before the second state was written")
+    end = log.static("/metrics", "steps")
+    total = planned_steps if end is None else end
+    if total != steps:
+        of = "" if total is None else f" of {total}"
+        warnings.warn(
+            f"{path} ends after step {steps}{of}: the file was cut short or its writer did not close it; "
+            "the run holds what is there",
+            UserWarning,
+            stacklevel=3,
+        )
+    elif end is None or log.torn:
+        warnings.warn(f"{path}: its end is cut, all {steps} steps are there", UserWarning, stacklevel=3)
+    if end == steps and (changed := log.changed()):
+        raise LogError(f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy")
+    status, fallback = _statuses(log, steps, path)
+    return Run(
+        X=X[: steps + 1],
+        Y=_measured(log, X)[: steps + 1],
+        U=U[:steps] if len(U) else np.empty((steps, 0)),
+        reference=reference[: steps + 1] if len(reference) else np.empty((steps + 1, 0)),
+        status=status,
+        fallback=fallback,
+        solve_time=seconds[:steps],
+        iterations=iterations[:steps].astype(np.int64),
+        plans=_plans(log, steps),
+        u_reference=_sparse(log, "/control/u_reference", steps, len(about.inputs)),
+        slack=_sparse(log, "/solver/slack", steps, 1)[:, 0],
+        **about.fields(),
+    )
+
+
+def _about(log: Columns, path: Path) -> tuple[About, int | None]:
+    text = log.static("/description", "json")
+    if text is None:
+        raise LogError(
+            f"{path} is a Rerun recording, but no log of koopmpc: it has no description, or was cut before it"
+        )
+    return from_json(text)
+
+
+def _measured(log: Columns, X: np.ndarray) -> np.ndarray:
+    """Return the measurements: the states, but for the rows that were written apart."""
+    k, values = log.matrix("/measurement")
+    if not len(k):
+        return X.copy()
+    if values.shape[1] != X.shape[1]:
+        return values
+    Y = X.copy()
+    inside = k < len(Y)
+    Y[k[inside]] = values[inside]
+    return Y
+
+
+def _sparse(log: Columns, entity: str, steps: int, width: int) -> np.ndarray:
+    """Return the rows of an entity: zero, but for those that were written."""
+    k, values = log.matrix(entity)
+    held, inside = np.zeros((steps, width)), k < steps
+    if len(k):
+        held[k[inside]] = values[inside]
+    return held
+
+
+def _statuses(log: Columns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
+    """Return what each step ended with: the last change at or before it."""
+    k, _, words = log.rows("/solver/status", "state")
+    if not len(k) or k[0] != 0:
+        raise LogError(f"{path} lacks the status of its first step; it was not written by koopmpc")
+    try:
+        pairs = [_pair(word) for word in words.to_pylist()]
+    except KeyError as error:
+        raise LogError(f"{path} holds the status {error}, which this version of koopmpc does not know") from error
+    held = [pairs[i] for i in np.searchsorted(k, np.arange(steps), side="right") - 1]
+    return tuple(s for s, _ in held), tuple(f for _, f in held)
+
+
+def _pair(word: str) -> tuple[Status, Fallback]:
+    status, _, fallback = word.partition(" → ")
+    return Status[status], Fallback[fallback or "NONE"]
+
+
+def _plans(log: Columns, steps: int) -> Plans | None:
+    """Return the plans, NaN where a step had none; None where no step had one."""
+    parts = []
+    for entity in ("/prediction/x", "/prediction/u"):
+        k, values = log.matrix(entity)
+        width = log.static(entity, "last_width")
+        if width is None or not len(k):
+            return None
+        whole = np.full((steps, values.shape[1] // width, width), np.nan)
+        inside = k < steps
+        whole[k[inside]] = values[inside].reshape(-1, *whole.shape[1:])
+        parts.append(whole)
+    return Plans(*parts)
+
+
+@reads(".rrd")
+def run_episodes(path: Path) -> Episodes:
+    """Return the inputs and states of a run's log, or its measurements where the plant hides them all, as episodes.
+
+    A row with a value missing cuts.
+
+    Raises
+    ------
+    LogError
+        The log is missing, damaged, or was not written by koopmpc.
+    DataError
+        The run has no two steps in sequence whose state is known.
+    """
+    run = load_run(path)
+    steps = len(run.U)
+    U = np.vstack([run.U, np.full((1, run.U.shape[1]), np.nan)])
+    hidden = not np.isfinite(run.X).any()
+    X, names = (run.Y, run.outputs) if hidden else (run.X, run.states)
+    signals = Signals(None, X, U, np.empty((steps + 1, 0)), np.arange(steps + 1))
+    return Episodes(episodes_from([signals], run.dt, str(path)), run.dt, names, run.inputs)

@@ -1,0 +1,243 @@
+# pyright: basic
+"""Writer: the one way in which rows become a Rerun recording."""
+
+import json
+import uuid
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.control.move import Fallback, Status
+from koopmpc.errors import KoopmpcError
+from koopmpc.loop.metrics import metrics
+from koopmpc.loop.run import Run
+from koopmpc.recording.description import About, drawable, metrics_to_markdown, to_json, to_markdown
+from koopmpc.recording.format.rows import Rows, blocks
+from koopmpc.recording.views.blueprint import blueprint, input_limits, styles
+from koopmpc.recording.views.eigenvalues import Model, draw_eigenvalues
+from koopmpc.recording.views.scenes import Bounds, Drawing, Names, Scene, draw, draw_ahead, stages
+
+_FLUSH = 3.0  # longest wait for a sink [s]
+
+
+class Writer:
+    """One recording: `about` first, then blocks of rows in order, then the end.
+
+    In a block the states go last: a state that can be read says that all else of its row can be read. So a file that
+    was cut holds whole blocks, and long rows are written as several.
+    """
+
+    def __init__(
+        self,
+        about: About,
+        *,
+        path: Path | None,
+        viewer: str | None = None,
+        scene: Scene | None = None,
+        model: Model | None = None,
+        steps: int | None = None,
+    ) -> None:
+        """Check what is told; `viewer` is the address of a viewer that is up."""
+        import rerun as rr
+
+        self._about, self._scene, self._model = about, scene, model
+        self._page, self._json = to_markdown(about), to_json(about, steps)  # refuses what cannot be saved
+        self._path, self._viewer = path, viewer
+        self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
+        self._opened, self._ahead = False, False  # ahead: whether a plan was ever drawn
+        self._bounds, self._shown = Bounds(), Bounds().ranges()
+        self._status: tuple[Status, Fallback] | None = None
+        self._styled: set[str] = set()
+        self._sums: dict[str, int] = {}  # of each column's bytes: a damaged log must not read as a whole one
+        self._u: np.ndarray | None = None
+        self._names = Names()
+        if path is not None:
+            with checks.writing(path, "ab"):
+                pass  # Rerun makes no folders, and says nothing of what it cannot write
+
+    def write(self, rows: Rows) -> None:
+        """Write the rows that follow, block by block."""
+        parts = blocks(rows)
+        drawings = [self._drawings(part) for part in parts]  # all, for the layout shows as much as they fill
+        if not self._opened:
+            self._open()
+        for part, drawn in zip(parts, drawings, strict=True):
+            self._write(part, drawn)
+
+    def _write(self, rows: Rows, drawings: dict[str, Drawing]) -> None:
+        import rerun as rr
+
+        n, m = len(rows.X), len(rows.U)
+        k = rows.k + np.arange(n)
+        if "state" not in self._styled:
+            for entity, style in styles(self._about, rows).items():
+                self._style(entity, style)
+        for entity, drawing in drawings.items():
+            self._style(entity, drawing.style)
+            self._rec.send_columns(entity, self._times(k), drawing.columns)
+        if len(rows.planned):
+            self._vectors("prediction/x", rows.planned, rows.plan_X)
+            self._vectors("prediction/u", rows.planned, rows.plan_U)
+        measured = _differ(rows.X, rows.Y)
+        self._vectors("measurement", k[measured], rows.Y[measured])
+        self._vectors("reference", k, rows.reference)
+        if m:
+            self._vectors("control/u", k[:m], rows.U)
+            held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
+            self._vectors("control/u_reference", k[held], rows.u_reference[held])
+            gave = np.flatnonzero(rows.slack)
+            self._vectors("solver/slack", k[gave], rows.slack[gave, None])
+            ends = np.unique(k[[0, m - 1]])
+            limits = [value for _, value in input_limits(self._about)]
+            self._vectors("control/limits", ends, np.tile(limits, (len(ends), 1)))
+            self._vectors("solver/deadline_ms", ends, np.full((len(ends), 1), 1e3 * self._about.dt))
+            exact = rr.DynamicArchetype.columns(
+                "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
+            )
+            scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
+            self._sum("/solver/time_ms:seconds", np.ascontiguousarray(rows.solve_time).data)
+            self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
+            self._rec.send_columns("solver/time_ms", self._times(k[:m]), [*scalars, *exact])
+            self._statuses(rows)
+        self.flush()  # what was logged waits to be sent; columns do not
+        self._vectors("state", k, rows.X)
+
+    def flush(self) -> None:
+        """Wait until the sinks have what was written."""
+        self._rec.flush(timeout_sec=_FLUSH)
+
+    def end(self, run: Run | None) -> None:
+        """Write the metrics of the whole `run` and close; the log says from now on that it is complete."""
+        import rerun as rr
+
+        numbers: dict[str, Any] = {"steps": 0}
+        text = "No step was recorded."
+        if run is not None:
+            numbers["steps"] = run.steps
+            try:
+                with np.errstate(all="ignore"):
+                    found = metrics(run)
+                text = metrics_to_markdown(found, self._about.tracked(run.reference.shape[1]))
+                numbers |= {"cost": found.cost, "effort": found.effort, "violation": found.violation}
+            except (KoopmpcError, ValueError) as error:
+                text = f"The metrics cannot be computed: {error}"
+        if not self._opened:
+            self._open()
+        document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
+        self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
+        if self._bounds.ranges() != self._shown:
+            self._rec.send_blueprint(self._blueprint(), make_active=False)
+        self.flush()
+        self._rec.disconnect()
+
+    def _open(self) -> None:
+        """Open the sinks, once the first drawings say how large the animation is, and write what is static."""
+        import rerun as rr
+
+        self._opened = True
+        sinks: list[Any] = [] if self._path is None else [rr.FileSink(self._path)]
+        sinks += [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
+        self._rec.set_sinks(*sinks)
+        self._rec.send_recording_name(drawable(self._about.title))
+        self._sum("/description:json", self._json.encode())
+        text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
+        self._rec.log("description", text, rr.AnyValues(json=self._json), static=True)
+        self.flush()  # a log that is cut says what it was
+        self._rec.send_blueprint(self._blueprint(), make_active=False)
+        if self._model is not None:
+            for entity, drawing in draw_eigenvalues(self._model).items():
+                self._style(entity, drawing)
+
+    def _blueprint(self) -> Any:
+        self._shown = self._bounds.ranges()
+        bounds = self._bounds if self._scene is not None else None
+        return blueprint(self._about, bounds=bounds, model=self._model)
+
+    def _times(self, k: np.ndarray) -> list[Any]:
+        import rerun as rr
+
+        nanoseconds = np.rint(k * self._about.dt * 1e9).astype("timedelta64[ns]")
+        return [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)]
+
+    def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray) -> None:
+        """Write one vector a row; higher dimensions go flat, their last width kept beside them."""
+        import rerun as rr
+
+        if not values.size:
+            return
+        width = values[0].size
+        columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(len(k), width))
+        self._sum(f"/{entity}:scalars", np.ascontiguousarray(values).data)
+        if values.ndim > 2:
+            self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
+        self._rec.send_columns(entity, self._times(k), columns)
+
+    def _sum(self, column: str, data: Any) -> None:
+        self._sums[column] = zlib.crc32(data, self._sums.get(column, 0))
+
+    def _style(self, entity: str, style: Any) -> None:
+        """Log what holds for the whole run, once."""
+        if entity not in self._styled:
+            self._styled.add(entity)
+            self._rec.log(entity, style, static=True)
+
+    def _statuses(self, rows: Rows) -> None:
+        """Write the status where it changes, and a line of text for every fallback that sets in."""
+        import rerun as rr
+
+        pairs = list(zip(rows.status, rows.fallback, strict=True))
+        changed = [i for i, pair in enumerate(pairs) if pair != (pairs[i - 1] if i else self._status)]
+        self._status = pairs[-1]
+        if changed:
+            words = [_word(*pairs[i]) for i in changed]
+            self._sum("/solver/status:state", "".join(words).encode())
+            times = self._times(rows.k + np.array(changed))
+            self._rec.send_columns("solver/status", times, rr.StateChange.columns(state=words))
+        fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
+        if fallen:
+            texts = [f"step {rows.k + i}: {_word(*pairs[i])}" for i in fallen]
+            columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+            self._rec.send_columns("log", self._times(rows.k + np.array(fallen)), columns)
+
+    def _drawings(self, rows: Rows) -> dict[str, Drawing]:
+        """Return the scene of every row, and of a few stages of its plan, by entity."""
+        scene = self._scene
+        if scene is None:
+            return {}
+        ahead: dict[int, list[Any]] = {}
+        for k, X, U in zip(rows.planned, rows.plan_X, rows.plan_U, strict=True):
+            if np.isfinite(X).all() and np.isfinite(U).all():
+                ahead[int(k)] = [
+                    self._names.checked(scene(X[i], U[min(i, len(U) - 1)]), int(k)) for i in stages(len(U))
+                ]
+        now: list[Sequence[Any]] = []
+        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
+            self._u = rows.U[i] if i < len(rows.U) else self._u
+            x = y if np.isnan(x).any() and len(y) == len(x) else x
+            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
+            now.append([] if shapes is None else self._names.checked(shapes, rows.k + i))
+        drawn = draw(self._names, now, self._bounds)
+        found = {f"world/{name}": drawing for name, drawing in drawn.items()}
+        if ahead or self._ahead:
+            self._ahead = True
+            futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
+            drawn = draw_ahead(self._names, now, futures, self._bounds)
+            found |= {f"world/prediction/{name}": drawing for name, drawing in drawn.items()}
+        return found
+
+
+def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    """Return the rows of Y that are not, to the bit, those of X."""
+    if X.shape != Y.shape or not X.size:
+        return np.arange(len(Y))
+    return np.flatnonzero(
+        (np.ascontiguousarray(X).view(np.int64) != np.ascontiguousarray(Y).view(np.int64)).any(axis=1)
+    )
+
+
+def _word(status: Status, fallback: Fallback) -> str:
+    return status.name if fallback is Fallback.NONE else f"{status.name} → {fallback.name}"

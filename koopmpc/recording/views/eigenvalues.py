@@ -1,0 +1,182 @@
+# pyright: basic
+"""The eigenvalues of A over the unit circle, and how far each can be trusted."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from koopmpc.predict.bilinear import BilinearPredictor
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.plane import Plane, eigenfunctions_on
+from koopmpc.recording.description import drawable
+from koopmpc.recording.views.scenes import BACKGROUND
+from koopmpc.validate.residuals import ResidualDMD
+
+# Anchors of equal steps: lightness grows evenly along the first, and the second closes.
+_SEQUENCE = np.array(
+    [[68, 1, 84], [71, 45, 123], [59, 82, 139], [44, 114, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
+     [170, 220, 50], [253, 231, 37]], dtype=np.float64,
+)  # fmt: skip
+_CIRCLE = np.array(
+    [[226, 217, 226], [140, 163, 200], [97, 94, 178], [75, 32, 113], [47, 20, 55], [110, 30, 70], [170, 87, 83],
+     [205, 165, 145], [226, 217, 226]], dtype=np.float64,
+)  # fmt: skip
+
+
+def sequence(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "... 3"]:
+    """Return colours of values from 0, dark, to 1, light."""
+    return _between(_SEQUENCE, np.clip(values, 0.0, 1.0))
+
+
+def circle(phases: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "... 3"]:
+    """Return colours of phases [rad]: dark at 0, blue below, red above, light at ±π."""
+    return _between(_CIRCLE, np.clip(phases / (2 * np.pi) + 0.5, 0.0, 1.0))
+
+
+def _between(anchors: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "... 3"]:
+    places = np.linspace(0.0, 1.0, len(anchors))
+    bands: list[np.ndarray] = [np.asarray(np.interp(values, places, anchors[:, i])) for i in range(3)]
+    return np.stack(bands, axis=-1).round().astype(np.uint8)
+
+
+_WIDEST = 3.0  # beyond it an eigenvalue is not in the picture
+_CROWDED = 0.35  # share of the picture below which the eigenvalues get one of their own
+_BELOW, _ABOVE = 1e-2, 1e1  # shares of the tolerance that the shades go from and to
+_LIGHT = 0.85  # of the shades: the rest is too light for points
+
+
+Model = LinearPredictor | BilinearPredictor
+
+
+def draw_eigenvalues(model: Model, residuals: ResidualDMD | None = None) -> dict[str, Any]:
+    """Return static archetypes by entity. Rerun's y points down.
+
+    Without residuals eigenvalues outside the unit circle are red. With them a point is the darker the smaller its
+    residual, and one that may be spurious is a ring.
+    """
+    import rerun as rr
+
+    values = np.asarray(model.eigenvalues if residuals is None else residuals.eigenvalues)
+    turn = np.linspace(0, 2 * np.pi, 721)
+    size = reach(model)
+    axes = [[(-size, 0), (size, 0)], [(0, -size), (0, size)]]
+    at = np.stack([np.real(values), -np.imag(values)], axis=1)
+    labels = [f"λ = {v:.4f}, |λ| = {abs(v):.4f}" for v in values]
+    if residuals is None:
+        outside = np.abs(values) > 1 + 1e-9
+        colors = np.where(outside[:, None], [214, 60, 60], [40, 110, 200]).astype(np.uint8)
+    else:
+        labels = [f"{label}, residual {r:.2g}" for label, r in zip(labels, residuals.residuals, strict=True)]
+        share = np.clip(residuals.residuals / residuals.tolerance, _BELOW, _ABOVE)
+        level = np.log(share / _BELOW) / np.log(_ABOVE / _BELOW)
+        colors = sequence(_LIGHT * level)
+    drawn = {
+        "model/axes": rr.LineStrips2D(axes, radii=rr.Radius.ui_points(0.5), colors=[205, 210, 216], draw_order=1),
+        "model/circle": rr.LineStrips2D(
+            [np.stack([np.cos(turn), np.sin(turn)], axis=1)],
+            radii=rr.Radius.ui_points(1.0),
+            colors=[120, 130, 145],
+            draw_order=2,
+        ),
+        "model/eigenvalues": rr.Points2D(
+            at, radii=rr.Radius.ui_points(5.0), colors=colors, labels=labels, show_labels=False, draw_order=30
+        ),
+    }
+    if residuals is not None and residuals.spurious.any():
+        drawn["model/spurious"] = rr.Points2D(
+            at[residuals.spurious], radii=rr.Radius.ui_points(2.6), colors=BACKGROUND, draw_order=31
+        )
+    return drawn
+
+
+def reach(model: Model) -> float:
+    """Return how far the picture goes: over the unit circle, and over eigenvalues not far outside."""
+    values = np.asarray(model.eigenvalues)
+    return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)
+
+
+def eigenvalue_views(model: Model, *, residuals: bool = False) -> list[Any]:
+    """Return the view of the unit circle, and a closer one where the eigenvalues crowd."""
+    size, values = reach(model), np.asarray(model.eigenvalues)
+    views = [_view("Eigenvalues of A and the unit circle", 0.0, 0.0, size)]
+    told = "Darker: smaller residual; rings may be spurious" if residuals else "Closer"
+    re, im = np.real(values), np.imag(values)
+    half = max(np.ptp(re), np.ptp(im)) / 2
+    if half < _CROWDED * size:
+        views.append(_view(told, (re.min() + re.max()) / 2, 0.0, 1.3 * half + 1e-3))
+    return views
+
+
+def _view(name: str, x: float, y: float, size: float) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(
+        origin="model",
+        name=name,
+        background=list(BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=[x - size, x + size], y_range=[y - size, y + size]),
+    )
+
+
+_INK = (250, 250, 250)
+
+
+def draw_eigenfunctions(
+    predictor: LinearPredictor, which: Sequence[int], plane: Plane
+) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return for each picture its entity, its title, and static archetypes by entity."""
+    pictures: list[tuple[str, str, dict[str, Any]]] = []
+    for j, phi in zip(which, eigenfunctions_on(predictor, which, plane), strict=True):
+        value = predictor.eigenvalues[j]
+        entity = f"eigenfunction/{j}"
+        if value.imag == 0:
+            low, high = float(phi.real.min()), float(phi.real.max())
+            level = (phi.real - low) / ((high - low) or 1.0)
+            title = f"φ{j} from {low:.2g} (dark) to {high:.2g} (light), λ = {value.real:.4g}"
+            pictures.append((f"{entity}/value", title, _picture(f"{entity}/value", sequence(level), plane)))
+            continue
+        shades = {"magnitude": sequence(np.abs(phi)), "phase": circle(np.angle(phi))}
+        sign = "+" if value.imag > 0 else "−"
+        titles = {
+            "magnitude": f"|φ{j}|, 0 (dark) to 1 (light), λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i",
+            "phase": f"phase of φ{j}: 0 dark, ±π light, + red, − blue",
+        }
+        pictures += [(f"{entity}/{k}", titles[k], _picture(f"{entity}/{k}", shades[k], plane)) for k in shades]
+    return pictures
+
+
+def plane_view(entity: str, title: str, plane: Plane) -> Any:
+    """Return the view of one picture, with room for what is written around it."""
+    import rerun.blueprint as rrb
+
+    n, m = len(plane.across), len(plane.up)
+    return rrb.Spatial2DView(
+        origin=entity,
+        name=drawable(title),
+        background=list(BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-0.3 * n, 1.1 * n], y_range=[-0.08 * m, 1.25 * m]),
+    )
+
+
+def _picture(entity: str, shades: np.ndarray, plane: Plane) -> dict[str, Any]:
+    """Return the picture, rows from the top down, and its axes in words."""
+    import rerun as rr
+
+    m, n = shades.shape[:2]
+    (x, y), across, up = map(drawable, plane.names), plane.across, plane.up
+    words = {
+        (0.04 * n, 1.06 * m): f"{across[0]:.3g}",
+        (0.5 * n, 1.14 * m): x,
+        (1.0 * n, 1.06 * m): f"{across[-1]:.3g}",
+        (-0.09 * n, 0.96 * m): f"{up[0]:.3g}",
+        (-0.15 * n, 0.5 * m): y,
+        (-0.09 * n, 0.04 * m): f"{up[-1]:.3g}",
+    }
+    return {
+        f"{entity}/picture": rr.Image(np.ascontiguousarray(shades[::-1])),
+        f"{entity}/axes": rr.Points2D(
+            list(words), labels=list(words.values()), radii=0.0, colors=_INK, show_labels=True, draw_order=40
+        ),
+    }

@@ -1,0 +1,11 @@
+"""From data alone: models and controllers chosen by evidence."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.synthesis.candidates import Candidate as Candidate
+    from koopmpc.synthesis.selection import Selection as Selection
+else:
+    __getattr__, __dir__, __all__ = attach(__name__, {"candidates": "Candidate", "selection": "Selection"})

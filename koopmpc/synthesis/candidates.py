@@ -1,0 +1,222 @@
+"""What a selection tries where nobody says: liftings for a plant of which nothing is known but its data."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.algebra import Sum
+from koopmpc.lifting.base import Lifting, lifting_of, short
+from koopmpc.lifting.fourier import Fourier
+from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.radial import Gaussian, ThinPlate
+from koopmpc.lifting.random_fourier import RandomFourier
+from koopmpc.lifting.standardized import Standardized
+from koopmpc.lifting.state import Constant, State
+from koopmpc.values import Arrays, Value, from_data, to_data
+
+MOST = 120  # observables of a lifting that is tried unasked
+_REGRESSORS = 260  # [ψ(x) u u⊗ψ(x)] of a model that is tried unasked
+_EACH = 10  # snapshot pairs for each regressor, at least
+_POINTS = 2000  # of the data that distances are taken of
+_ANGLE = re.compile(r"(.*[\W_\d])?(theta|phi|psi|alpha|beta|gamma|angle|roll|pitch|yaw|heading|attitude)[\W_\d]*")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate(Value):
+    """A model to try: a lifting of the state, or of ζ where there is an embedding, and whether u multiplies ψ(x).
+
+    Attributes
+    ----------
+    name
+        For the leaderboard.
+    lifting
+        ψ.
+    embedding
+        ψ acts on the state and its past.
+    bilinear
+        z⁺ = A z + B u + Σ uᵢ Nᵢ z instead of z⁺ = A z + B u.
+    """
+
+    name: str
+    lifting: Lifting
+    embedding: Delay | None = None
+    bilinear: bool = False
+
+    def __reduce__(
+        self,
+    ) -> tuple[Any, ...]:  # as data, so that a lifting of the user's own crosses processes too
+        arrays: Arrays = {}
+        return _unpacked, (to_data(self, arrays), arrays)
+
+    @property
+    def delays(self) -> int:
+        """Past steps in ζ."""
+        return 0 if self.embedding is None else self.embedding.steps
+
+    @property
+    def kind(self) -> str:
+        """Return "linear" or "bilinear"."""
+        return "bilinear" if self.bilinear else "linear"
+
+    def bind(self, states: Sequence[str], inputs: Sequence[str]) -> "Candidate":
+        """Return the sized copy for a plant with these names."""
+        sized = None if self.embedding is None else self.embedding.fitted(states, inputs)
+        bound = self.lifting.bind(states if sized is None else sized.names)
+        return Candidate(self.name, bound, sized, self.bilinear)
+
+
+def expanded(
+    given: Sequence[Candidate | Lifting], episodes: Episodes, delays: Sequence[int], bilinear: bool
+) -> list[Candidate]:
+    """Return the candidates bound to the data; a plain lifting becomes one for each number of delays and each kind.
+
+    A lifting that is made for the states alone, as one with centres is, is tried without delays only.
+    """
+    found: list[Candidate] = []
+    for i, one in enumerate(given):
+        if isinstance(one, Candidate):
+            found.append(one.bind(episodes.states, episodes.inputs))
+            continue
+        name = f"{i}: {_title(lifting_of(one))}"
+        for d in delays:
+            try:
+                bound = Candidate(name, one, Delay(d) if d else None).bind(episodes.states, episodes.inputs)
+            except ShapeError:
+                if d == 0:
+                    raise
+                continue
+            kinds = (False, True) if bilinear else (False,)
+            found += [Candidate(name, bound.lifting, bound.embedding, kind) for kind in kinds]
+    if not found:
+        raise DataError("there is no candidate; pass at least one lifting, and 0 among the delays")
+    return found
+
+
+def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.random.Generator) -> list[Candidate]:
+    """Return the candidates for an unknown plant: linear, polynomial, trigonometric, radial and random ones.
+
+    Those with more observables than 120, more regressors than 260, or fewer than 10 snapshot pairs for each of
+    these are left out. With delays the nonlinear observables are those of the present state, the past enters linearly.
+    """
+    pairs = sum(len(episode) for episode in episodes)
+    room = min(_REGRESSORS, max(pairs // _EACH, 2 * (episodes.nx + episodes.nu)))
+    X = np.concatenate([episode.X[:-1] for episode in episodes])
+    found: list[Candidate] = []
+    for d in delays:
+        embedding = Delay(d) if d else None
+        families = list(_trigonometric(episodes.states, X))
+        families += list(_scaled(episodes, X, rng)) if d == 0 else [_quadratic(episodes.nx)]
+        for name, lifting in [("x, 1", State() + Constant()), *families]:
+            one = Candidate(name, lifting, embedding).bind(episodes.states, episodes.inputs)
+            nz, nu = one.lifting.nz, episodes.nu
+            if nz > MOST or (nz + nu > room and name != "x, 1"):
+                continue
+            found.append(one)
+            if bilinear and nz + nu * nz <= room:
+                found.append(Candidate(name, one.lifting, one.embedding, bilinear=True))
+    return found
+
+
+def angles(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> list[int]:
+    """Return the states that look like angles in rad: by unit, else by name, and not confined to a speck.
+
+    A state in rad that moves by less than 0.2 rad is its own sine.
+    """
+    moving = np.ptp(X, axis=0) > 0.2
+    return [i for i, name in enumerate(states) if moving[i] and _angle(name)]
+
+
+def jumps(episodes: Episodes) -> dict[int, int]:
+    """Return for each angle that was wrapped how often it jumps by 2π."""
+    X = np.concatenate([episode.X for episode in episodes])
+    found: dict[int, int] = {}
+    for i in angles(episodes.states, X):
+        steps = np.abs(np.concatenate([np.diff(episode.X[:, i]) for episode in episodes]))
+        count = int(np.sum(np.abs(steps - 2 * np.pi) < 1.0))
+        if count and np.median(steps) < 1.0:
+            found[i] = count
+    return found
+
+
+def _angle(name: str) -> bool:
+    stem, bracket, unit = name.partition("[")
+    if bracket:
+        return unit.strip(" ]").lower() in ("rad", "radian", "radians")
+    return _ANGLE.fullmatch(stem.strip().lower()) is not None and not stem.lower().startswith("d")
+
+
+def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Iterator[tuple[str, Lifting]]:
+    """Yield sines and cosines of the angles, alone and times the other states; of all where none looks like one."""
+    found, base = angles(states, X), State() + Constant()
+    if found:
+        which, where = found, ", ".join(short(states[i]) for i in found)
+    else:
+        which = [i for i, name in enumerate(states) if "[" not in name and 0.2 < np.ptp(X[:, i]) < 50]
+        where = "all"
+    if not which:
+        return
+    rest = [i for i in range(len(states)) if i not in found]
+    for k in (1, 2, 3):
+        circle = Fourier(k, which)
+        yield f"fourier {k} ({where})", base + circle
+        if rest and k < 3:
+            others = State(rest)
+            yield f"fourier {k} ({where}) × state", base + circle + circle * others
+            squares = others * others
+            yield f"fourier {k} ({where}) × squares", base + circle + squares + circle * (others + squares)
+
+
+def _quadratic(nx: int) -> tuple[str, Lifting]:
+    present = State(list(range(nx)))
+    return "monomials 2", State() + Constant() + present * present
+
+
+def _scaled(
+    episodes: Episodes, X: Float[np.ndarray, "M nx"], rng: np.random.Generator
+) -> Iterator[tuple[str, Lifting]]:
+    """Yield polynomials, bells, splines and random features of the standardized states."""
+    whole = Standardized.of(episodes, State())
+    points = (X[rng.choice(len(X), min(len(X), _POINTS), replace=False)] - whole.mean) / whole.scale
+    points = np.asarray(np.unique(points, axis=0), dtype=np.float64)
+    rng.shuffle(points)
+    base = State() + Constant()
+
+    def scaled(lifting: Lifting) -> Lifting:
+        return base + Standardized(lifting, whole.mean, whole.scale)
+
+    for degree in (2, 3, 4, 5):
+        if _monomials(episodes.nx, degree) <= MOST:
+            yield f"monomials {degree}", scaled(Monomials(degree))
+    half = len(points) // 2
+    apart = np.sqrt(np.sum((points[:half] - points[half : 2 * half]) ** 2, axis=1))
+    width = float(f"{np.median(apart):.2g}") if half else 1.0
+    for count in (30, 80):
+        centers = points[:count]
+        yield f"gaussian {len(centers)}", scaled(Gaussian(centers, width))
+        yield f"thin plate {len(centers)}", scaled(ThinPlate(centers))
+    for count in (50, 100):
+        yield f"random fourier {count}", scaled(RandomFourier(count, width, rng))
+
+
+def _monomials(nx: int, degree: int) -> int:
+    """Return how many monomials there are of degree 0 … degree."""
+    number = 1
+    for i in range(1, degree + 1):
+        number = number * (nx + i) // i
+    return number
+
+
+def _title(lifting: Lifting) -> str:
+    parts = lifting.parts if isinstance(lifting, Sum) else (lifting,)
+    return " + ".join(type(part).__name__ for part in parts)
+
+
+def _unpacked(tree: Any, arrays: Arrays) -> Candidate:
+    return from_data(tree, arrays)

@@ -1,0 +1,162 @@
+"""Episodes for cross-validation: a part of the data that memory holds, in folds of whole episodes or of blocks."""
+
+from collections.abc import Sized
+from itertools import islice, pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.source import Source
+from koopmpc.errors import DataError
+from koopmpc.identify.moments.read import spread
+
+_PARTS = 16  # of a source that a sample is taken from
+_SHORTEST, _LONGEST = 10, 50  # steps of a horizon that nobody named
+_CORRELATED = 0.5
+
+
+class Folds(NamedTuple):
+    """Episodes, which fold each is in, and what was done to the data, in sentences."""
+
+    episodes: Episodes
+    fold: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def number(self) -> int:
+        """Number of folds."""
+        return max(self.fold) + 1
+
+
+def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
+    """Return episodes of about `pairs` snapshot pairs at most, spread over the source, and a sentence if not all.
+
+    Raises
+    ------
+    DataError
+        The source can be read once only.
+    """
+    if not source.replayable:
+        raise DataError(
+            "a stream is read once, and a selection reads its data several times; pass Episodes, Files(folder), or "
+            "Stream of a list"
+        )
+    parts = source.parts()
+    if isinstance(parts, Sized):
+        every = list(parts)
+        chosen = [every[i] for i in spread(len(every), _PARTS)] if len(every) > _PARTS else every
+        whole = len(chosen) == len(every)
+    else:
+        chosen, whole = list(islice(parts, _PARTS)), False
+    quota = max(pairs // len(chosen), 1)
+    taken: list[Episodes] = []
+    for part in chosen:
+        loaded = part.load()
+        taken.append(_thinned(loaded, quota))
+        whole = whole and taken[-1] is loaded
+    result = joined(taken)
+    if whole:
+        return result, ()
+    steps = sum(len(episode) for episode in result)
+    return result, (
+        f"chosen on {steps} steps in {len(result)} episodes, evenly spread over the data, and fitted to all",
+    )
+
+
+def usual_horizon(episodes: Episodes) -> int:
+    """Return the steps after which half of the states have forgotten half of themselves, 10 to 50, if episodes last.
+
+    A state has where its correlation with what it was, over all episodes, is below 0.5. At most half of the episodes'
+    length, that of the shortest fifth.
+    """
+    longest = max(int(np.quantile([len(episode) for episode in episodes], 0.2)) // 2, 1)
+    mean = np.mean(np.concatenate([episode.X for episode in episodes]), axis=0)
+    for h in range(min(_SHORTEST, longest), min(_LONGEST, longest) + 1):
+        now = np.concatenate([e.X[:-h] for e in episodes if len(e) >= h]) - mean
+        then = np.concatenate([e.X[h:] for e in episodes if len(e) >= h]) - mean
+        size = np.sqrt(np.sum(now**2, axis=0) * np.sum(then**2, axis=0))
+        alike = np.sum(now * then, axis=0) / np.where(size > 0, size, 1.0)
+        if np.median(alike) < _CORRELATED:
+            return h
+    return min(_LONGEST, longest)
+
+
+def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator) -> Folds:
+    """Return the episodes in folds of about equal size; few long ones are first cut into blocks.
+
+    Episodes are dealt out at random. Blocks stay in order, so that a fold is one stretch of time: neighbours are alike.
+
+    Parameters
+    ----------
+    episodes
+        Of any length.
+    needed
+        Steps that one must have to be scored.
+    folds
+        How many, if there are as many episodes.
+    rng
+        Deals out the episodes.
+
+    Raises
+    ------
+    DataError
+        Less than two episodes, or blocks, are long enough.
+    """
+    notes: list[str] = []
+    long = [episode for episode in episodes if len(episode) >= needed]
+    short = len(episodes) - len(long)
+    if short:
+        notes.append(
+            f"{short} of {len(episodes)} episodes are shorter than the {needed} steps that a forecast needs, and took "
+            "no part in the choice"
+        )
+    cut = 0 < len(long) < 2 * folds
+    if cut:
+        number, total = len(long), sum(map(len, long))
+        block = max(2 * needed, total // (4 * folds))
+        long = [piece for episode in long for piece in blocks(episode, block)]
+        cut = len(long) > number
+        if cut:
+            notes.append(
+                f"{number} episode{'s are' if number > 1 else ' is'} too few for {folds} folds: cut into {len(long)} "
+                "blocks, and a fold is one stretch of them; what follows itself is alike, so the errors may flatter"
+            )
+    if len(long) < 2:
+        raise DataError(
+            f"{len(episodes)} episodes give {len(long)} of {needed} steps or more, and a choice needs 2: pass a "
+            "shorter horizon, or longer episodes"
+        )
+    count = min(folds, len(long))
+    lengths = np.array([len(episode) for episode in long])
+    fold = np.zeros(len(long), dtype=np.intp)
+    if cut:
+        fold[:] = np.minimum((np.cumsum(lengths) - lengths / 2) * count / lengths.sum(), count - 1)
+        fold[:] = np.unique(fold, return_inverse=True)[1]
+    else:
+        size = np.zeros(count)
+        for i in rng.permutation(len(long)):
+            fold[i] = np.argmin(size)
+            size[fold[i]] += lengths[i]
+    kept = Episodes(long, episodes.dt, episodes.states, episodes.inputs, episodes.disturbances)
+    if fold.max() == 0:
+        raise DataError(f"all {len(long)} episodes fell into one fold; pass more of them, or a shorter horizon")
+    return Folds(kept, tuple(fold.tolist()), tuple(notes))
+
+
+def blocks(episode: Episode, steps: int) -> list[Episode]:
+    """Return an episode in equal blocks of `steps` or more; none shares a pair with another."""
+    count = max(len(episode) // steps, 1)
+    at = np.linspace(0, len(episode), count + 1).astype(int)
+    return [Episode(X=episode.X[a : b + 1], U=episode.U[a:b], W=episode.W[a:b]) for a, b in pairwise(at)]
+
+
+def _thinned(episodes: Episodes, quota: int) -> Episodes:
+    """Return evenly spread episodes of about `quota` steps in all; of one that is longer, its beginning."""
+    total = sum(len(episode) for episode in episodes)
+    if total <= quota:
+        return episodes
+    wanted = max(len(episodes) * quota // total, 1)
+    kept = [episodes[i] for i in spread(len(episodes), wanted)]
+    cut = [e if len(e) <= quota else Episode(X=e.X[: quota + 1], U=e.U[:quota], W=e.W[:quota]) for e in kept]
+    return Episodes(cut, episodes.dt, episodes.states, episodes.inputs, episodes.disturbances)

@@ -1,0 +1,171 @@
+"""select: lifting, embedding, ridge and kind of model, chosen by multi-step cross-validation over episodes."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError, FitWarning
+from koopmpc.identify.fits.bilinear import bilinear_edmd
+from koopmpc.identify.fits.edmd import edmd
+from koopmpc.lifting.base import Lifting
+from koopmpc.parallel import map_tasks
+from koopmpc.predict.linear import LinearPredictor
+from koopmpc.synthesis.candidates import Candidate, expanded, jumps, usual
+from koopmpc.synthesis.cross_validation import Trial, ridges_of, tried
+from koopmpc.synthesis.folds import folded, sampled, usual_horizon
+from koopmpc.synthesis.selection import Row, Selection, choice, row_of
+from koopmpc.validate.scoring import Predictor
+
+Progress = Callable[[str, int, int | None], None]
+RIDGES = (0.0, 1e-9, 1e-7, 1e-5, 1e-3)
+
+
+def select(
+    episodes: Episodes | Source,
+    *,
+    candidates: Sequence[Candidate | Lifting] | None = None,
+    horizon: int | None = None,
+    folds: int = 5,
+    ridges: ArrayLike = RIDGES,
+    delays: Sequence[int] = (0, 1, 2),
+    bilinear: bool = True,
+    sample: int = 30_000,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+    rng: np.random.Generator | int = 0,
+) -> Selection:
+    """Choose the model with min over models of max over folds of the h-step error, h = 1 … horizon, and fit it to all.
+
+    Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon: one-step errors
+    do not choose a model that a controller can look ahead with. An error is relative to the state's standard deviation,
+    so neither units nor where zero is count; a forecast that runs away counts as infinite. The models are ranked by
+    their worst fold, and of all within one standard error of the best the smallest is taken (Breiman et al. 1984).
+
+    A source larger than memory is chosen on a sample of it, whole episodes from evenly spread parts; the winner is
+    then fitted to all of it, part by part.
+
+    Parameters
+    ----------
+    episodes
+        Several, since no fold cuts through one. Fewer than twice the folds are cut into blocks first, and the notes
+        say so. A Source that can be read again.
+    candidates
+        Liftings, each of which is tried with all `delays` and both kinds; or `Candidate`, each as it stands. By default
+        linear, polynomial, trigonometric, radial and random ones, for plants of 2 to 12 states.
+    horizon
+        Steps ahead: the controller's. By default those after which half of the states have forgotten half of
+        themselves, 10 to 50, at most half an episode.
+    folds
+        At least 2.
+    ridges
+        Weights to try, on unit-norm columns.
+    delays
+        Past steps to try in an embedding.
+    bilinear
+        Try z⁺ = A z + B u + Σ uᵢ Nᵢ z too, where there are inputs and no measured disturbances.
+    sample
+        Snapshot pairs to choose on, about.
+    workers, scheduler
+        As in `koopmpc.parallel.map_tasks`: a candidate is a task, and then a part of the source.
+    progress
+        Called with what is done, how many of it are, and how many there are, None where nobody knows.
+    rng
+        Deals out the episodes, draws centres and features.
+
+    Raises
+    ------
+    DataError
+        Too few steps for two folds of one horizon; a stream that can be read once only; no candidate; a negative ridge.
+    KoopmpcError
+        A worker died on the same task each time, or no scheduler answers.
+
+    Warns
+    -----
+    FitWarning
+        A state jumps by 2π: it was wrapped, and no model can follow that; every candidate's forecasts run away; or the
+        chosen fit itself is doubtful.
+
+    References
+    ----------
+    Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
+    """
+    source, draw = source_of(episodes), checks.generator(rng)
+    weights = ridges_of(ridges)
+    folds = checks.count(folds, "folds", 2)
+    past = sorted({checks.count(d, "delays", 0) for d in delays})
+    if not past:
+        raise DataError("delays is empty; pass 0 for a model without an embedding")
+    held, notes = sampled(source, checks.count(sample, "sample"))
+    for i, count in jumps(held).items():
+        warnings.warn(
+            f"{held.states[i]} jumps by 2π {count} times: it was wrapped, and a model of it as a state cannot follow; "
+            "unwrap it first, with numpy.unwrap along each episode",
+            FitWarning,
+            stacklevel=2,
+        )
+    ahead = usual_horizon(held) if horizon is None else checks.count(horizon, "horizon")
+    both = bilinear and source.nu > 0 and source.nw == 0
+    given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
+    first = max(one.delays for one in given)
+    data = folded(held, ahead + first, folds, draw)
+    trials = [Trial(one, data.episodes, data.fold, ahead, first, weights) for one in given]
+    results = map_tasks(
+        tried,
+        trials,
+        workers=workers,
+        scheduler=scheduler,
+        progress=None if progress is None else partial(progress, "candidates"),
+    )
+    rows = tuple(sorted(map(row_of, results), key=lambda row: (row.worst, row.size)))
+    chosen = choice(rows)
+    if not np.isfinite(rows[chosen].worst):
+        warnings.warn(
+            f"the forecasts of all {len(rows)} candidates run away within {ahead} steps; pass a shorter horizon, or "
+            "candidates that know the plant",
+            FitWarning,
+            stacklevel=2,
+        )
+    linear = choice(rows, "linear") if any(row.kind == "linear" for row in rows) else chosen
+
+    def refit(row: Row) -> Predictor:
+        told = None if progress is None else partial(progress, f"fit of {row.title}")
+        if row.kind == "linear":
+            return edmd(
+                source,
+                row.lifting,
+                embedding=row.embedding,
+                ridge=row.ridge,
+                workers=workers,
+                scheduler=scheduler,
+                progress=told,
+            )
+        return bilinear_edmd(
+            source,
+            row.lifting,
+            embedding=row.embedding,
+            ridge=row.ridge,
+            difference=True,
+            workers=workers,
+            scheduler=scheduler,
+            progress=told,
+        )
+
+    predictor = refit(rows[chosen])
+    best_linear = predictor if linear == chosen else refit(rows[linear])
+    return Selection(
+        predictor=predictor,
+        linear=best_linear if isinstance(best_linear, LinearPredictor) else None,
+        leaderboard=rows,
+        chosen=chosen,
+        chosen_linear=linear,
+        horizon=ahead,
+        folds=data.number,
+        notes=(*notes, *data.notes),
+    )

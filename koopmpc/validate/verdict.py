@@ -1,0 +1,278 @@
+"""From the evidence on a predictor to sentences: what is wrong, and what to do."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.validate.bands import ConformalBand, Covered
+from koopmpc.validate.excitation import Persistency
+from koopmpc.validate.regions import Coverage
+from koopmpc.validate.residuals import ResidualDMD
+from koopmpc.validate.scoring import Score
+from koopmpc.validate.subspace import Invariance
+from koopmpc.values import Value
+
+USABLE = 0.2  # share of a state's range beyond which the band of its errors is of no use
+SMALL = 0.05  # share up to which it need not beat x̂ = x_k
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence(Value):
+    """What a predictor does on episodes that it was not fitted to.
+
+    Attributes
+    ----------
+    score, holding
+        Errors of the predictor, and those of x̂_{k+h} = x_k, which needs no model.
+    spread
+        (nx,) range of each state in the held-out episodes, in its unit.
+    residuals
+        Residual of each eigenpair on the held-out episodes; for a linear predictor the same as `linearity_error`.
+    invariance
+        Of the dictionary, on the held-out episodes.
+    coverage
+        Of the training episodes where they were given, else of those held out.
+    persistency, feedback
+        Of the inputs, on the same episodes as `coverage`; None without inputs.
+    band
+        Conformal band of the held-out episodes.
+    train_score, unseen
+        Errors on the training episodes, and the share of the held-out samples that lie where these never were;
+        None where they were not given.
+    closed_loop, recalibrated
+        How many closed-loop forecasts lay in the band, and the band calibrated on those episodes; None where
+        they were not given.
+    radius
+        Spectral radius of A.
+    dt
+        Sampling time [s].
+    inputs
+        Those that `feedback` is about.
+    """
+
+    score: Score
+    holding: Score
+    spread: Float[np.ndarray, " nx"]
+    residuals: ResidualDMD
+    invariance: Invariance
+    coverage: Coverage
+    persistency: Persistency | None
+    feedback: Float[np.ndarray, " nu"] | None
+    band: ConformalBand
+    train_score: Score | None
+    unseen: float | None
+    closed_loop: Covered | None
+    recalibrated: ConformalBand | None
+    radius: float
+    dt: float
+    inputs: tuple[str, ...]
+
+    @property
+    def error(self) -> Float[np.ndarray, "horizon nx"]:
+        """(horizon, nx) the larger edge of the 5 … 95 % band of the errors, as a share of the state's range."""
+        edge = np.maximum(np.abs(self.score.low), np.abs(self.score.high))
+        return np.divide(edge, self.spread, out=np.where(edge > 0, np.inf, 0.0), where=self.spread > 0)
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(nx,) steps ahead to which each state can be trusted: its errors are small, or beat x̂ = x_k and not large."""
+        beaten = self.score.rmse < self.holding.rmse
+        good = (self.error <= SMALL) | ((self.error <= USABLE) & beaten)
+        return np.cumprod(good, axis=0).sum(axis=0)
+
+    @property
+    def steps(self) -> int:
+        """How many steps ahead all states can be trusted."""
+        return int(self.usable.min())
+
+
+_INVARIANT = 0.1  # one-step error of an observable, as a share of its size
+_OVERFIT = 2.0  # held-out over training error
+_UNSEEN = 0.05  # share of the held-out samples
+_GROWS = 2.0  # of a spurious eigenfunction over the horizon
+_EXPLAINED = 0.9  # share of an input's energy
+_NAMED = 3  # names in a sentence
+_LONG = 32  # characters of a name in a sentence
+
+
+@dataclass(frozen=True, eq=False)
+class Finding(Value):
+    """One reason for distrust or care.
+
+    Attributes
+    ----------
+    grave
+        It forbids the horizon; else it asks for care.
+    says
+        What is wrong, with the number.
+    do
+        What to do about it.
+    """
+
+    grave: bool
+    says: str
+    do: str
+
+
+def findings(evidence: Evidence) -> tuple[Finding, ...]:
+    """Return what speaks against the predictor, the gravest first."""
+    checks = (_errors, _spectrum, _dictionary, _fit, _inputs, _band, _closed_loop)
+    found = [finding for check in checks for finding in check(evidence)]
+    return tuple(sorted(found, key=lambda finding: not finding.grave))
+
+
+def _errors(evidence: Evidence) -> list[Finding]:
+    horizon, steps = evidence.score.horizon, evidence.steps
+    if steps == horizon:
+        return []
+    state = int(np.argmin(evidence.usable))
+    name, there = evidence.score.states[state], evidence.error[:, state]
+    far = f"{percent(there[steps])} of its range at step {steps + 1}, {percent(there[-1])} at step {horizon}"
+    says = f"the 5 … 95 % band of the errors of {name} reaches {far}"
+    if there[steps] <= USABLE:
+        says += ", and holding its value predicts no worse"
+    if evidence.unseen is not None and evidence.unseen > _UNSEEN:
+        do = "collect data where the model will be used"
+    elif _overfit(evidence):
+        do = "collect more data, take fewer observables or a larger ridge"
+    else:
+        do = "take richer observables or bilinear_edmd, and compare their scores over this horizon"
+    shorten = f"; a horizon of {steps} steps is within reach" if steps else ""
+    return [Finding(True, says, do + shorten)]
+
+
+def _spectrum(evidence: Evidence) -> list[Finding]:
+    of = evidence.residuals
+    bad = of.spurious
+    if not bad.any():
+        return []
+    with np.errstate(over="ignore"):
+        growth = np.abs(of.eigenvalues) ** evidence.score.horizon
+    growing = bad & (growth > _GROWS)
+    worst = int(np.argmax(np.where(growing, growth, 0.0) if growing.any() else of.residuals))
+    told = f"λ = {_complex(complex(of.eigenvalues[worst]))} with residual {percent(float(of.residuals[worst]))}"
+    says = f"{int(bad.sum())} of {len(bad)} eigenpairs are spurious (residual above {percent(of.tolerance)} a step)"
+    if growing.any():
+        n = int(growing.sum())
+        says += f", and {n} of them grow{'s' * (n == 1)}: {told} by {growth[worst]:.2g} over the horizon"
+        return [Finding(False, says, "drop observables, raise the ridge, or truncate the rank")]
+    do = "read no modes or frequencies from these; predictions may still be good"
+    return [Finding(False, f"{says}, the worst {told}", do)]
+
+
+def _dictionary(evidence: Evidence) -> list[Finding]:
+    errors = evidence.invariance.errors
+    bad = np.flatnonzero(errors > _INVARIANT)
+    if not bad.size:
+        return []
+    worst = bad[np.argsort(-errors[bad], kind="stable")]
+    names = ", ".join(f"{shown(evidence.invariance.names[int(i)])} {percent(float(errors[i]))}" for i in worst[:_NAMED])
+    says = (
+        f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "
+        f"more than {percent(_INVARIANT)} of its size ({names}{', …' if bad.size > _NAMED else ''})"
+    )
+    return [
+        Finding(
+            False,
+            says,
+            "for a longer horizon add what their next values depend on; compare scores before dropping one",
+        )
+    ]
+
+
+def _fit(evidence: Evidence) -> list[Finding]:
+    found: list[Finding] = []
+    if evidence.train_score is not None and _overfit(evidence):
+        ratio = evidence.score.total / max(evidence.train_score.total, np.finfo(float).tiny)
+        says = f"errors on held-out episodes are {ratio:.3g} times those on the training episodes"
+        found.append(Finding(False, says, "collect more data, take fewer observables or a larger ridge"))
+    if evidence.unseen is not None and evidence.unseen > _UNSEEN:
+        said = "; ".join(str(region) for region in evidence.coverage.empty[:_NAMED])
+        found.append(
+            Finding(
+                False,
+                f"{percent(evidence.unseen)} of the held-out samples lie where the training data never were"
+                + (f": {said}" if said else ""),
+                "collect data there, or keep the controller away from there",
+            )
+        )
+    return found
+
+
+def _inputs(evidence: Evidence) -> list[Finding]:
+    found: list[Finding] = []
+    if evidence.persistency is not None and evidence.persistency.order < min(2, evidence.persistency.asked):
+        found.append(
+            Finding(
+                False,
+                f"the inputs excite to order {evidence.persistency.order} only: B cannot be told apart",
+                "excite every input, with noise or PRBS",
+            )
+        )
+    if evidence.feedback is not None:
+        bad = np.flatnonzero(evidence.feedback > _EXPLAINED)
+        names = ", ".join(f"{evidence.inputs[int(i)]} {percent(float(evidence.feedback[i]))}" for i in bad[:_NAMED])
+        if bad.size:
+            found.append(
+                Finding(
+                    False,
+                    f"feedback: ψ(x) explains most of the inputs ({names}), so A and B are hard to tell apart",
+                    "add noise to the inputs",
+                )
+            )
+    return found
+
+
+def _band(evidence: Evidence) -> list[Finding]:
+    band = evidence.band
+    if np.isfinite(band.quantile):
+        return []
+    if band.episodes >= band.needed:
+        return [Finding(False, "forecasts leave the finite numbers", "look at the spectrum of A")]
+    return [
+        Finding(
+            False,
+            f"no band at {percent(band.level)}: {band.episodes} calibration episodes, "
+            f"at least {band.needed} are needed",
+            "hold out more episodes, or ask for a lower level",
+        )
+    ]
+
+
+def _closed_loop(evidence: Evidence) -> list[Finding]:
+    loop, band = evidence.closed_loop, evidence.band
+    if loop is None:
+        return []
+    chance = 2 * np.sqrt(band.level * (1 - band.level) * (1 / band.episodes + 1 / loop.episodes))
+    if loop.share >= band.level - chance:
+        return []
+    return [
+        Finding(
+            False,
+            f"in closed loop {percent(loop.share)} of the forecasts stay in the {percent(band.level)} band",
+            "use the band recalibrated on closed-loop episodes, or fit with closed-loop data",
+        )
+    ]
+
+
+def _overfit(evidence: Evidence) -> bool:
+    train = evidence.train_score
+    return train is not None and evidence.score.total > max(_OVERFIT * train.total, 1e-6)
+
+
+def percent(share: float) -> str:
+    """Return 0.123 as "12 %"."""
+    value = 100 * float(share)
+    if not value <= 1000:
+        return "> 1000 %"
+    return f"{value:.0f} %" if value >= 10 or value == round(value) else f"{value:.2g} %"
+
+
+def shown(name: str) -> str:
+    """Return the name, a long one with its middle left out."""
+    return name if len(name) <= _LONG else f"{name[: _LONG // 2]}…{name[-_LONG // 2 + 1 :]}"
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.3g}" if abs(value.imag) < 1e-12 else f"{value.real:.3g} ± {abs(value.imag):.3g}i"

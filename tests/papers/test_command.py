@@ -1,0 +1,108 @@
+"""`koopmpc reproduce`: everything is written, names are checked, and verdicts are printed."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import koopmpc as km
+from koopmpc.cli.app import app
+from koopmpc.papers import registry
+from koopmpc.papers.contest import ORACLE, costs
+from koopmpc.papers.page import Page, percent
+from koopmpc.papers.registry import Claim, Outcome, Paper, Verdict, find_paper, judged
+from koopmpc.papers.snyder.control import SHAKINGS, contest, predictions
+from koopmpc.papers.snyder.settings import scenes
+
+
+@pytest.mark.slow
+def test_the_shortened_paper_writes_all_its_files(tmp_path):
+    told = []
+    outcome = find_paper("snyder").reproduce(tmp_path, True, told.append)
+    text = outcome.report.read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
+    assert len(pictures) == len(set(pictures)) >= 17
+    for picture in pictures:
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    assert outcome.recording.stat().st_size > 1e6
+    assert len(outcome.claims) == 24
+    assert {claim.where.split(",")[0] for claim in outcome.claims} >= {"abstract", "results", "discussion"}
+    assert text.count("\n## ") == 10
+    assert len(told) == 5
+
+
+def test_data_that_excite_find_B_and_feedback_data_do_not():
+    each = predictions(scenes()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
+    assert each["DMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
+    assert each["EDMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
+    assert each["DMDc, feedback data"].warned == "A and B inseparable"
+    assert np.isnan(each["DMD, feedback data"].b)
+    assert each["EDMDc, exciting data"].excited < each["DMD, feedback data"].excited / 2
+    assert each["DMDc, feedback data"].b < 0
+
+
+def test_energy_bounds_the_cost_of_the_hanging_pendulum_from_below():
+    def value(x):  # V = 2√10 E solves min over u of 10 ω² + u² + ∇V·f(x, u) = 0
+        return 2 * np.sqrt(10) * (2 * x[1] ** 2 + 19.62 * (1 - np.cos(x[0])))
+
+    task = contest("pendulum, hanging, π/4", 40, 12, episodes=20)
+    task = replace(task, models={"Fourier 1": task.models["Fourier 1"]})
+    runs = task.runs()
+    free, limited = costs(runs, False), costs(runs, True)
+    total = {name: free[name] + value(runs[name, False].X[-1]) for name in free}
+    assert total["LQR, linearisation"] == pytest.approx(value(task.x0), rel=5e-3)
+    assert total[ORACLE] == pytest.approx(value(task.x0), rel=5e-3)
+    assert min(total.values()) > 0.995 * value(task.x0)
+    assert limited["MPC, Fourier 1"] < 1.1 * limited[ORACLE]
+    for (_, kind), run in runs.items():
+        if kind:
+            assert np.abs(run.U).max() <= 2.0 + 1e-9
+
+
+def test_an_unknown_paper_is_told():
+    with pytest.raises(km.errors.ProblemError, match=r"no paper 'snider', did you mean 'snyder'\?; there are snyder"):
+        find_paper("snider")
+    result = CliRunner().invoke(app, ["reproduce", "nobody"])
+    assert result.exit_code == 2
+    assert "there is no paper 'nobody'" in result.output
+
+
+def test_the_command_prints_verdicts_and_paths(tmp_path, monkeypatch):
+    def reproduce(folder, quick, progress):
+        assert not quick
+        progress("working")
+        claims = (Claim("abstract", "it works", Verdict.IN_PART, "half of it"),)
+        return Outcome(claims, folder / "report.md", folder / "x.rrd")
+
+    monkeypatch.setattr(registry, "PAPERS", ("mine",))
+    monkeypatch.setattr(
+        registry, "import_module", lambda name: type("M", (), {"paper": Paper("mine", "Mine", reproduce)})
+    )
+    result = CliRunner().invoke(app, ["reproduce", "mine", "--logs", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    for word in ("Mine", "it works", "holds in part", "half of it", "report.md", "x.rrd", "done in"):
+        assert word in result.output
+
+
+def test_verdicts_and_cells():
+    assert judged("a", "b", holds=True, why="c").verdict is Verdict.HOLDS
+    assert judged("a", "b", holds=False, in_part=True, why="c").verdict is Verdict.IN_PART
+    assert judged("a", "b", holds=False, why="c").verdict is Verdict.FAILS
+    assert [percent(v) for v in (0.0, 0.0111, 3.4e-6, np.inf, np.nan, 1e3)] == [
+        "0", "1.11", "3.4e-04", "diverges", "diverges", "diverges",
+    ]  # fmt: skip
+
+
+def test_a_page_escapes_and_joins(tmp_path):
+    page = Page("mine", tmp_path)
+    page.text("## Title", "two\nlines")
+    page.table(("|u|", "b"), [(1, "x")])
+    path = page.picture("one", "A picture")
+    assert path == tmp_path / "mine" / "one.png"
+    assert page.markdown == (
+        "## Title\n\ntwo lines\n\n| \\|u\\| | b |\n| --- | --- |\n| 1 | x |\n\n"
+        "![A picture](mine/one.png)\n\n*A picture*\n"
+    )
+    assert "![" not in page.spoken

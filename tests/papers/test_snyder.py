@@ -1,0 +1,259 @@
+"""The numbers of the founding paper: errors, gains, frequencies, verdicts, and that the page of docs/ holds them."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import koopmpc as km
+from koopmpc.papers.contest import ORACLE, Prediction
+from koopmpc.papers.page import Page
+from koopmpc.papers.plants import Pendulum, frequency
+from koopmpc.papers.registry import Verdict
+from koopmpc.papers.snyder import beyond as snyder_beyond
+from koopmpc.papers.snyder import text as snyder_appendix
+from koopmpc.papers.snyder import text as snyder_text
+from koopmpc.papers.snyder.beyond import origin
+from koopmpc.papers.snyder.claims import of_figures, of_text
+from koopmpc.papers.snyder.equations import equations, sides
+from koopmpc.papers.snyder.paper import held_change, rebuilt
+from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, gains, scenes
+
+PAGE = Path(__file__).parents[2] / "docs" / "snyder.md"
+# Relative reconstruction errors in %, computed independently: (scene, observables, full rank).
+KNOWN = {
+    ("pendulum", "DMD", True): 1.11,
+    ("pendulum", "EDMD monomials 2", True): 1.14,
+    ("pendulum", "EDMD monomials 3", True): 3.4e-4,
+    ("pendulum", "EDMD Fourier 1", True): 0.018,
+    ("pendulum", "EDMD Fourier 2", True): 0.0024,
+    ("pendulum-lqr", "DMD", True): 4.44,
+    ("pendulum-lqr", "EDMD monomials 2", True): 2.54,
+    ("pendulum-lqr", "EDMD monomials 3", True): 0.031,
+    ("pendulum-lqr", "EDMD Fourier 1", True): 2.0,
+    ("pendulum-lqr", "EDMD Fourier 2", True): 1.1,
+    ("upright", "DMD", True): 103.0,
+    ("cart-pole", "DMD", True): 108.0,
+    ("cart-pole", "EDMD monomials 2", False): 99.0,
+    ("cart-pole", "EDMD monomials 2", True): 18.7,
+    ("cart-pole", "EDMD Fourier 1", False): 34.0,
+    ("cart-pole", "EDMD Fourier 1", True): 18.0,
+    ("cart-pole-lqr", "DMD", True): 4.31,
+    ("cart-pole-lqr", "EDMD monomials 2", False): 4.30,
+    ("cart-pole-lqr", "EDMD monomials 2", True): 5e-7,
+    ("cart-pole-lqr", "EDMD Fourier 1", False): 4.30,
+    ("cart-pole-lqr", "EDMD Fourier 1", True): 3e-5,
+}
+
+
+def spread(percent):
+    """Return the factor that an error may be off by: below 1e-4 % rounding decides."""
+    return 30.0 if percent < 1e-4 else 1.5
+
+
+@pytest.fixture(scope="module")
+def stage():
+    found = scenes()
+    return {name: found[name] for name in ("pendulum", "pendulum-lqr", "upright", "cart-pole", "cart-pole-lqr")}
+
+
+@pytest.fixture(scope="module")
+def fits(stage):
+    return {name: rebuilt(scene) for name, scene in stage.items()}
+
+
+@pytest.mark.parametrize("key", KNOWN)
+def test_errors_of_reconstruction(fits, key):
+    scene, method, full = key
+    got, known = 100 * fits[scene][method, full].error, KNOWN[key]
+    assert known / spread(known) < got < known * spread(known)
+
+
+def test_ranks_that_the_cut_leaves(fits):
+    assert fits["cart-pole"]["EDMD monomials 2", True].rank == 15
+    assert fits["cart-pole-lqr"]["EDMD monomials 2", True].rank == 14
+    assert fits["cart-pole-lqr"]["EDMD Fourier 1", False].rank == 4
+    assert ("pendulum", "DMD", False) not in {(s, *key) for s, each in fits.items() for key in each}
+
+
+def test_gains_to_the_digits():
+    got = {name: K.ravel() for name, K in gains().items()}
+    for name, known, digits in (
+        ("pendulum", [0.0, 3.1623], 4),
+        ("upright", [39.24, 17.998], 3),
+        ("cart-pole", [-2.2361, -7.9534, 175.6827, 74.7644], 4),
+        ("cart-pole-g10", [-2.2361, -7.9351, 178.4349, 75.1935], 4),
+        ("databook", [-100.0, -197.537, 1491.281, 668.445], 3),
+        ("databook-legacy", [-100.0, -183.179, 1683.180, 646.613], 3),
+    ):
+        np.testing.assert_allclose(got[name], known, rtol=0, atol=0.51 * 10.0**-digits)
+
+
+def test_the_shift_stays_upright(stage):
+    X = stage["cart-pole-lqr"].trajectory[0].X
+    assert np.abs(X[:, 2] - np.pi).max() == pytest.approx(0.032, abs=6e-4)
+    u = -(X - [1.0, 0.0, np.pi, 0.0]) @ gains()["cart-pole"].ravel()
+    assert np.abs(u).max() == pytest.approx(4.47, abs=6e-3)
+
+
+@pytest.mark.parametrize("amplitude", [1e-6, np.pi / 4, 1.5, 3.0])
+def test_frequency_by_the_elliptic_integral(amplitude):
+    plant = Pendulum()
+    exact = np.sqrt(plant.g / plant.L) * np.pi / (2 * ellipk(np.sin(amplitude / 2) ** 2))
+    assert frequency(plant, amplitude) == pytest.approx(exact, rel=1e-12)
+
+
+def test_eigenvalues_are_those_of_the_amplitude_and_not_of_small_angles(fits):
+    small, right = frequency(Pendulum(), 0.0), frequency(Pendulum(), np.pi / 4)
+    assert small == pytest.approx(np.sqrt(9.81 / 2))
+    for method in OBSERVABLES:
+        fit = fits["pendulum"][method, True]
+        turn = abs(km.spectrum.continuous_eigenvalues(fit.model)[fit.leading].imag)
+        assert turn == pytest.approx(right, rel=1e-3)
+        assert turn < 0.97 * small
+
+
+def test_leading_eigenfunctions_evolve_by_powers_of_their_eigenvalue(fits):
+    led = {
+        (scene, method): fit.evolution[fit.leading]
+        for scene, each in fits.items()
+        for (method, full), fit in each.items()
+        if full
+    }
+    assert led["pendulum", "EDMD monomials 3"] < 1e-5
+    assert led["pendulum", "DMD"] < 0.02
+    assert led["cart-pole-lqr", "EDMD monomials 2"] < 1e-6
+    assert led["cart-pole", "DMD"] > 0.5
+
+
+def test_the_origin_and_truncation_explain_the_cart_pole(stage):
+    causes = origin(stage["cart-pole-lqr"])
+    assert 2e-5 < causes["DMD on x − x_ref"].error < 5e-5
+    assert causes["DMD with a constant"].error < 1e-4 * 4
+    assert causes["DMD"].error > 1000 * causes["DMD on x − x_ref"].error
+    assert causes["EDMD monomials 2"].error < 1e-6 * causes["EDMD monomials 2, rank 4"].error
+
+
+def test_a_held_input_changes_little(stage, fits):
+    assert 1e-4 < held_change(stage, fits) < 0.02
+
+
+@pytest.mark.parametrize(("method", "rank"), [("DMD", 2), ("EDMD monomials 3", 10), ("EDMD Fourier 1", 4)])
+def test_each_equation_is_its_function(stage, method, rank):
+    lifting = OBSERVABLES[method]
+    trajectory = stage["pendulum"].trajectory
+    checked = equations(trajectory, lifting, rank)
+    assert {e.number for e in checked} == {"10–12", "14–17", "18–23", "24–26", "27–31"}
+    for equation in checked:
+        assert equation.residual < 1e-8, equation
+
+
+def test_eigenfunctions_are_left_eigenvectors(stage):
+    left, right = sides(stage["pendulum"].trajectory, OBSERVABLES["EDMD monomials 3"])
+    assert left < 0.05 * right
+
+
+def test_verdicts_of_the_figures(fits):
+    found = {claim.where: claim.verdict for claim in of_figures(fits)}
+    assert len(found) == sum(len(shown.scenes) for shown in FIGURES)
+    for where, verdict in {
+        "pendulum-dmd, pendulum": Verdict.HOLDS,
+        "pendulum-monomials-3, pendulum": Verdict.HOLDS,
+        "pendulum-fourier-1, pendulum-lqr": Verdict.IN_PART,
+        "pendulum-fourier-2, pendulum": Verdict.FAILS,
+        "cart-pole-dmd, cart-pole": Verdict.HOLDS,
+        "cart-pole-monomials-2, cart-pole-lqr": Verdict.IN_PART,
+    }.items():
+        assert found[where] is verdict
+
+
+def test_the_page_holds_these_numbers_and_verdicts(stage, fits):
+    text = PAGE.read_text(encoding="utf-8")
+    titles = {scene.title: name for name, scene in stage.items()}
+    verdicts = {claim.where: claim.verdict.value for claim in of_figures(fits)}
+    seen = 0
+    for line in text.split("## The figures, in numbers")[1].split("## The figures\n")[0].splitlines():
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if len(cells) != 12 or cells[1] not in titles:
+            continue
+        figure, scene, method, rank = cells[0], titles[cells[1]], cells[2], int(cells[3].split()[0])
+        fit = next(f for (m, _), f in fits[scene].items() if m == method and f.rank == rank)
+        for cell, value in ((cells[5], fit.error), (cells[6], fit.held_out)):
+            written = float(cell)
+            assert written / spread(written) < 100 * value < written * spread(written)
+        if cells[10]:
+            assert cells[10] == f"**{verdicts[f'{figure}, {scene}']}**"
+        seen += 1
+    assert seen == 28
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
+    assert len(pictures) >= 17
+    assert all((PAGE.parent / picture).is_file() for picture in pictures)
+
+
+def test_the_lessons_of_the_page_are_those_of_its_costs():
+    text = PAGE.read_text(encoding="utf-8")
+    (cubic,) = re.findall(r"steer it at ([\d.]+) times", text)
+    ((lifted, local),) = re.findall(r"observables takes ([\d.]+) times .* linearisation ([\d.]+):", text)
+    free = text.split("Inputs without limits:")[1].split("Inputs limited:")[0]
+    ratio = {
+        cells[1].strip(): [float(cell.split("(")[1].split(")")[0]) for cell in cells[2:-1]]
+        for cells in (line.split("|") for line in free.splitlines() if "(" in line)
+    }
+    hanging, upright, shift, _ = np.transpose(list(ratio.values()))
+    assert list(ratio)[-1] == ORACLE
+    assert ratio["LQR, monomials 3"][0] == hanging.max() == pytest.approx(float(cubic), abs=0.005)
+    assert float(cubic) > 2
+    assert ratio["LQR, linearisation"][0] == pytest.approx(hanging.min(), abs=1e-3)
+    assert ratio["LQR, Fourier 1"][1] == float(lifted) < float(local) == ratio["LQR, linearisation"][1]
+    assert upright.min() == 1.0
+    assert shift.max() < 1.001
+
+
+def told(fits, *, ours, feedback, excited):
+    """Return the verdicts of abstract and discussion for made-up costs and predictions."""
+    names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
+    predicted = {"pendulum": {name: Prediction(name, feedback, excited, 1.0, "–") for name in names}}
+    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": ours, ORACLE: 1.0}}
+    return {claim.says: claim.verdict for claim in of_text(fits, 3e-5, predicted, ratios)}
+
+
+def test_verdicts_of_the_text_follow_the_numbers(fits):
+    linear, data = "linear control acts on the nonlinear system", "data under LQR show a controlled system"
+
+    def verdict(says, **numbers):
+        found = told(fits, **({"ours": 1.0, "feedback": 0.0, "excited": 0.0} | numbers))
+        return next(value for claim, value in found.items() if claim.startswith(says))
+
+    assert verdict(linear, ours=1.02) is Verdict.HOLDS
+    assert verdict(linear, ours=1.08) is Verdict.IN_PART
+    assert verdict(linear, ours=1.3) is Verdict.FAILS
+    assert verdict(data, excited=0.01) is Verdict.HOLDS
+    assert verdict(data, excited=0.5) is Verdict.IN_PART
+    assert verdict(data, excited=0.5, feedback=0.5) is Verdict.FAILS
+    assert verdict("the pendulum is inverted") is Verdict.FAILS
+    assert verdict("truncation has to be avoided") is Verdict.HOLDS
+    assert verdict("the cart-pole is beyond") is Verdict.IN_PART
+    assert verdict("EDMD finds the leading Koopman eigenfunctions") is Verdict.IN_PART
+
+
+def test_the_parts_of_the_report(stage, fits, tmp_path, monkeypatch):
+    saved = []
+    for module in (snyder_text, snyder_beyond):
+        monkeypatch.setattr(module, "save", lambda made, path: saved.append(path.stem))
+    page = Page("snyder", tmp_path)
+    claims = of_figures(fits)
+    snyder_text.settings(page, claims, 0.01, 10)
+    snyder_text.verdicts(page, claims)
+    snyder_text.numbers(page, stage, fits, claims)
+    snyder_text.gains_table(page)
+    snyder_text.frequencies(page, fits)
+    snyder_text.theory(page, stage["pendulum"], fits)
+    snyder_appendix.appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
+    gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
+    assert gains_of_page.strip() in page.markdown
+    assert saved == ["pendulum-eigenfunctions", "appendix-pendulum-dmdc"]
+    assert [curves.columns[-1] for curves in page.curves] == ["log10 of the relative error"] * 2
+    assert "| DMDc, LQR data | 2 of 3 |" in page.markdown
+    assert page.markdown.count("\n| pendulum-") == 18 + 10  # lines of the figures, and claims

@@ -1,0 +1,206 @@
+import stat
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.plants import batch, compiled
+from koopmpc.plants.graph import Graph
+from tests.plants.models import CartPole, Pendulum
+
+needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
+MAPS = {
+    "euler": km.discretize(CartPole(), 0.02, km.Euler()),
+    "rk4": km.discretize(CartPole(), 0.02),
+    "substeps": km.discretize(Pendulum(damping=0.1), 0.05, km.RK4(3)),
+}
+
+
+@pytest.fixture(scope="module")
+def kernels(tmp_path_factory):
+    command = compiled.compiler()
+    assert command is not None
+    cache = tmp_path_factory.mktemp("cache")
+    return {name: compiled.kernel(plant.F, command, cache) for name, plant in MAPS.items()}
+
+
+def empty(X0, U):
+    X = np.full((len(X0), U.shape[1] + 1, X0.shape[1]), np.nan)
+    X[:, 0] = X0
+    return X
+
+
+def random_episodes(plant, episodes, steps, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(episodes, plant.nx)), 5 * rng.normal(size=(episodes, steps, plant.nu))
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", MAPS)
+@given(seed=st.integers(0, 2**32 - 1), episodes=st.sampled_from([1, 3, 70]), steps=st.sampled_from([0, 1, 9]))
+def test_machine_code_graph_and_interpreter_agree_to_1e12_a_step(kernels, name, seed, episodes, steps):
+    plant = MAPS[name]
+    X0, U = random_episodes(plant, episodes, steps, seed)
+    by_code, by_columns = empty(X0, U), empty(X0, U)
+    kernels[name](by_code, U)
+    batch.vectorised(Graph.trace(plant.F), by_columns, U)
+    for X in (by_code, by_columns):
+        assert X[:, 0].tolist() == X0.tolist()
+        for e, k in np.ndindex(episodes, steps):
+            want = plant(X[e, k], U[e, k])
+            assert np.abs(X[e, k + 1] - want).max() <= 1e-12 * max(1.0, np.abs(want).max())
+
+
+@needs_compiler
+def test_threads_share_the_episodes(kernels, monkeypatch):
+    X0, U = random_episodes(MAPS["rk4"], 1003, 5)
+    alone, shared = empty(X0, U), empty(X0, U)
+    kernels["rk4"](alone, U)
+    monkeypatch.setattr(compiled, "_STEPS_A_THREAD", 100)
+    monkeypatch.setattr("os.cpu_count", lambda: 7)
+    kernels["rk4"](shared, U)
+    assert shared.tobytes() == alone.tobytes()
+
+
+def test_columns_beyond_one_chunk():
+    plant = MAPS["rk4"]
+    X0, U = random_episodes(plant, batch._CHUNK + 3, 2)
+    X = empty(X0, U)
+    batch.vectorised(Graph.trace(plant.F), X, U)
+    for e in (0, batch._CHUNK - 1, batch._CHUNK, batch._CHUNK + 2):
+        np.testing.assert_allclose(X[e], plant.rollout(X0[e], U[e]), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "integrator", [km.Euler(), km.RK4(2), km.ImplicitMidpoint(), km.Collocation(2), km.CVODES()], ids=repr
+)
+@pytest.mark.parametrize("episodes", [1, 70])
+def test_rollouts_are_rollouts(integrator, episodes):
+    plant = km.discretize(CartPole(), 0.02, integrator)
+    X0, U = random_episodes(plant, episodes, 5)
+    X = plant.rollouts(X0, U)
+    assert X.shape == (episodes, 6, 4)
+    for e in range(episodes):
+        np.testing.assert_allclose(X[e], plant.rollout(X0[e], U[e]), rtol=1e-12, atol=1e-12)
+
+
+def test_no_episodes_and_no_steps():
+    plant = MAPS["rk4"]
+    assert plant.rollouts(np.empty((0, 4)), np.empty((0, 5, 1))).shape == (0, 6, 4)
+    assert plant.rollouts(np.ones((3, 4)), np.empty((3, 0, 1))).tolist() == np.ones((3, 1, 4)).tolist()
+
+
+def test_functions_of_matrices_run_in_batches():
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u", 1)
+    A = np.array([[0.9, 0.1], [-0.2, 0.8]])
+    plant = km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + u]), 0.1)
+    X0, U = random_episodes(plant, 100, 3)
+    X = plant.rollouts(X0, U)
+    np.testing.assert_allclose(X[:, 1:], X[:, :-1] @ A.T + U, rtol=1e-13, atol=1e-14)
+
+
+def test_operations_that_a_graph_refuses_run_in_batches():
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    plant = km.StepMap(ca.Function("F", [x, u], [ca.erf(x) + u]), 0.1)
+    X0, U = random_episodes(plant, 100, 3)
+    np.testing.assert_allclose(plant.rollouts(X0, U)[9], plant.rollout(X0[9], U[9]), rtol=1e-13)
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    tmp_path.chmod(0o700)
+    return tmp_path / "koopmpc"
+
+
+@needs_compiler
+def test_large_batches_compile_once_a_user(cache, monkeypatch):
+    X0, U = random_episodes(MAPS["rk4"], 100, 200)
+    first = km.discretize(CartPole(), 0.02).rollouts(X0, U)
+    (library,) = cache.iterdir()
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+    monkeypatch.setattr(compiled, "_compile", lambda *_: pytest.fail("compiled twice"))
+    assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == first.tobytes()
+    assert list(cache.iterdir()) == [library]
+
+
+@needs_compiler
+def test_small_batches_do_not_compile(cache):
+    X0, U = random_episodes(MAPS["rk4"], 99, 200)
+    km.discretize(CartPole(), 0.02).rollouts(X0, U)
+    assert not cache.exists()
+
+
+@needs_compiler
+def test_a_broken_file_in_the_cache_is_written_again(cache):
+    X0, U = random_episodes(MAPS["rk4"], 100, 200)
+    want = km.discretize(CartPole(), 0.02).rollouts(X0, U)
+    (library,) = cache.iterdir()
+    library.unlink()
+    library.write_bytes(b"no machine code")
+    assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == want.tobytes()
+
+
+@needs_compiler
+def test_without_a_private_folder_nothing_is_left_on_disk(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setattr(compiled, "private_cache", lambda: None)
+    X0, U = random_episodes(MAPS["rk4"], 100, 200)
+    plant = km.discretize(CartPole(), 0.02)
+    np.testing.assert_allclose(plant.rollouts(X0, U)[3, 1], plant(X0[3], U[3, 0]), rtol=1e-12)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_that_others_can_write_are_not_trusted(cache):
+    assert compiled.private_cache() == cache
+    cache.chmod(0o722)
+    assert compiled.private_cache() is None
+    cache.chmod(0o700)
+    cache.parent.chmod(0o777)
+    assert compiled.private_cache() is None
+    cache.parent.chmod(0o700)
+    cache.rmdir()
+    real = cache.parent / "elsewhere"
+    real.mkdir(0o700)
+    cache.symlink_to(real)
+    assert compiled.private_cache() is None
+    cache.unlink()
+    cache.write_text("a file")
+    assert compiled.private_cache() is None
+
+
+def test_a_compiler_that_fails_costs_one_warning(cache, tmp_path, monkeypatch):
+    script = tmp_path / "broken-cc"
+    script.write_text("#!/bin/sh\necho out of order >&2\nexit 1\n")
+    script.chmod(0o700)
+    monkeypatch.setenv("CC", str(script))
+    plant = km.discretize(CartPole(), 0.02)
+    X0, U = random_episodes(plant, 100, 200)
+    with pytest.warns(RuntimeWarning, match=r"broken-cc could not compile the step map.*out of order") as caught:
+        X = plant.rollouts(X0, U)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert plant.rollouts(X0, U).tobytes() == X.tobytes()
+    np.testing.assert_allclose(X[5, 1], plant(X0[5], U[5, 0]), rtol=1e-12)
+
+
+def test_the_compiler_may_have_arguments(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "sh -c")
+    assert compiled.compiler() == ["sh", "-c"]
+    monkeypatch.setenv("CC", "no-such-compiler -m64")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert compiled.compiler() is None
+
+
+def test_without_a_compiler_batches_run_over_columns(monkeypatch):
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
+    plant = km.discretize(CartPole(), 0.02)
+    X0, U = random_episodes(plant, 100, 200)
+    X = plant.rollouts(X0, U)
+    np.testing.assert_allclose(X[50, 1], plant(X0[50], U[50, 0]), rtol=1e-12)

@@ -1,0 +1,137 @@
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import koopmpc as km
+from koopmpc.plants.dynamics import right_side
+from koopmpc.plants.integrators import gauss_legendre
+from tests.plants.models import CartPole, Pendulum, Spring, energy
+
+X0, TORQUE, END = [1.0, 0.5], 0.7, 2.0
+
+
+def exact(dynamics=None, x0=X0, u=TORQUE, end=END):
+    """x(end) by another code: Dormand & Prince's order 8 at rtol 1e-13."""
+    f = right_side(dynamics or Pendulum(damping=0.3))
+    flow = solve_ivp(lambda t, x: np.asarray(f(x, u)).ravel(), (0, end), x0, method="DOP853", rtol=1e-13, atol=1e-14)
+    return flow.y[:, -1]
+
+
+@pytest.mark.parametrize(
+    ("integrator", "order", "steps"),
+    [
+        (km.Euler(), 1, (400, 800, 1600, 3200)),
+        (km.RK4(), 4, (20, 40, 80, 160)),
+        (km.RK4(substeps=3), 4, (10, 20, 40, 80)),
+        (km.ImplicitMidpoint(), 2, (50, 100, 200, 400)),
+        (km.Collocation(1), 2, (50, 100, 200, 400)),
+        (km.Collocation(2), 4, (10, 20, 40, 80)),
+        (km.Collocation(3), 6, (6, 9, 12, 18)),
+    ],
+    ids=repr,
+)
+def test_order_by_regression(integrator, order, steps):
+    truth = exact()
+    errors = []
+    for n in steps:
+        plant = km.discretize(Pendulum(damping=0.3), END / n, integrator)
+        errors.append(np.abs(plant.rollout(X0, np.full((n, 1), TORQUE))[-1] - truth).max())
+    slope = np.polyfit(np.log([END / n for n in steps]), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, abs=0.15 * order**0.5)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8, 1e-10])
+def test_cvodes_keeps_its_tolerance(tolerance):
+    plant = km.discretize(Pendulum(damping=0.3), END, km.CVODES(rtol=tolerance, atol=tolerance))
+    assert np.abs(plant(X0, [TORQUE]) - exact()).max() < 100 * tolerance
+
+
+def test_substeps_are_steps():
+    fine = km.discretize(CartPole(), 0.01).rollout([0, 0.3, 0, 0], np.full((4, 1), 2.0))[-1]
+    assert km.discretize(CartPole(), 0.04, km.RK4(4))([0, 0.3, 0, 0], [2.0]) == pytest.approx(
+        fine, rel=1e-13, abs=1e-15
+    )
+
+
+def test_implicit_midpoint_has_its_own_equation():
+    dt, plant = 0.1, km.discretize(CartPole(), 0.1, km.ImplicitMidpoint())
+    x, u = np.array([0.1, 0.5, -0.3, 2.0]), np.array([4.0])
+    x_next = plant(x, u)
+    slope = np.asarray(right_side(CartPole())((x + x_next) / 2, u)).ravel()
+    assert x_next == pytest.approx(x + dt * slope, abs=1e-13)
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 5, 8])
+def test_gauss_legendre_meets_the_order_conditions(stages):
+    a, b = gauss_legendre(stages)
+    c = a.sum(axis=1)
+    for k in range(1, 2 * stages + 1):
+        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-13)  # B(2s)
+    for k in range(1, stages + 1):
+        assert a @ c ** (k - 1) == pytest.approx(c**k / k, rel=1e-12, abs=1e-14)  # C(s)
+
+
+@pytest.mark.parametrize("integrator", [km.ImplicitMidpoint(), km.Collocation(2), km.Collocation(4)], ids=repr)
+def test_gauss_methods_turn_a_linear_oscillator_by_its_pade_approximant(integrator):
+    plant = km.discretize(Spring(), 0.5, integrator)
+    A = plant.linearize([0.0, 0.0], []).A
+    assert pytest.approx(np.eye(2), abs=1e-13) == A.T @ A  # on the circle: no damping at all
+
+
+def test_implicit_methods_take_stiff_plants_at_large_steps():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    f = ca.Function("f", [x, u], [ca.vertcat(-1e6 * (x[0] - x[1]), u - x[1])])
+    plant = km.StepMap(km.Collocation(2).step(f, 0.1), 0.1)
+    X = plant.rollout([1e4, 1e4], np.zeros((100, 1)))
+    assert X[-1, 1] == pytest.approx(1e4 * np.exp(-10), rel=1e-4)
+    assert np.isfinite(X).all()
+
+
+PERIOD = 2.1393  # [s] about, at 1 rad
+
+
+def test_implicit_midpoint_keeps_the_energy_for_ten_thousand_periods():
+    plant = km.discretize(Pendulum(), PERIOD / 20, km.ImplicitMidpoint())
+    E = energy(plant.rollout([1.0, 0.0], np.zeros((200_000, 1)))).reshape(-1)
+    swing = np.ptp(E[:2000])
+    assert np.ptp(E) < 1.01 * swing  # as far off in the last hundred periods as in the first
+    assert abs(E[-20_000:].mean() - E[:20_000].mean()) < 1e-3 * swing
+
+
+def test_the_energy_drift_of_rk4_falls_with_its_order():
+    drifts, steps = [], (10, 14, 20, 28, 40)
+    for n in steps:
+        plant = km.discretize(Pendulum(), PERIOD / n)
+        E = energy(plant.rollout([1.0, 0.0], np.zeros((200 * n, 1))))
+        drifts.append(E[0] - E[-1])
+    assert min(drifts) > 0
+    slope = -np.polyfit(np.log(steps), np.log(drifts), 1)[0]
+    assert 4 < slope < 5.5  # at least the method's order; 5 on a linear oscillator
+
+
+def test_a_step_without_an_answer_is_nan_and_says_so():
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    blow_up = ca.Function("f", [x, u], [x**2 + u])  # x(t) = 1/(1 − t)
+    for integrator in (km.CVODES(), km.ImplicitMidpoint()):
+        plant = km.StepMap(integrator.step(blow_up, 2.0), 2.0)
+        with pytest.warns(RuntimeWarning, match=r"found no x⁺ from x=\[1\.\].*x⁺ is NaN, try a smaller dt"):
+            assert np.isnan(plant(1.0, 0.0)).all()
+        with pytest.warns(RuntimeWarning, match="found no x⁺"):
+            X = plant.rollout([1.0], np.zeros((3, 1)))
+        assert X[0] == 1.0
+        assert np.isnan(X[1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: km.RK4(0), "substeps is 0; it must be at least 1"),
+        (lambda: km.Collocation(0), "degree is 0; it must be at least 1"),
+        (lambda: km.CVODES(rtol=0.0), "rtol is 0; it must be above zero"),
+        (lambda: km.CVODES(atol=-1.0), "atol is -1; it must be above zero"),
+    ],
+)
+def test_settings_are_checked(build, message):
+    with pytest.raises(km.errors.DataError, match=message):
+        build()

@@ -1,0 +1,291 @@
+"""select: which model wins, on what it is judged, and what it says of the data."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.synthesis.candidates import Candidate, angles
+from koopmpc.synthesis.cross_validation import Trial, tried
+from koopmpc.synthesis.folds import folded, sampled, usual_horizon
+from koopmpc.synthesis.selection import choice
+from koopmpc.values import from_data, to_data
+
+A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])
+
+
+def episodes_of(step, count=20, steps=30, nx=2, nu=1, seed=0, keep=None, names=None):
+    rng = np.random.default_rng(seed)
+    made = []
+    for _ in range(count):
+        X, U = [rng.uniform(-1, 1, nx)], rng.uniform(-1, 1, (steps, nu))
+        for u in U:
+            X.append(step(X[-1], u))
+        made.append(km.Episode(X=np.array(X)[:, :keep], U=U))
+    return km.Episodes(made, 0.1, names)
+
+
+def linear(x, u):
+    return A @ x + B @ u
+
+
+def quadratic(x, u):
+    return np.array([0.9 * x[0], 0.8 * x[1] + 0.3 * x[0] ** 2 + 0.2 * u[0]])
+
+
+def bilinear(x, u):
+    return np.array([0.9 * x[0] + 0.1 * x[1], 0.9 * x[1] - 0.1 * x[0] + 0.4 * u[0] * x[0]])
+
+
+PLAIN, SQUARES = km.State() + km.Constant(), km.State() + km.Constant() + km.Monomials(2)
+
+
+def noisy(data, size, seed=1):
+    rng = np.random.default_rng(seed)
+    return km.Episodes(
+        [km.Episode(X=e.X + size * rng.standard_normal(e.X.shape), U=e.U) for e in data], data.dt, data.states
+    )
+
+
+def test_a_linear_plant_gets_the_linear_model_though_larger_ones_hold_it():
+    found = km.select(noisy(episodes_of(linear), 0.01), horizon=8, folds=2, delays=[0], ridges=[0.0, 1e-6])
+    assert (found.best.name, found.best.kind, found.chosen) == ("x, 1", "linear", found.chosen_linear)
+    assert found.predictor is found.linear
+    assert len(found.leaderboard) > 20
+
+
+def test_a_closed_quadratic_dictionary_wins_and_is_exact_over_the_horizon():
+    found = km.select(episodes_of(quadratic), candidates=[PLAIN, SQUARES], horizon=10, delays=[0])
+    assert found.best.nz == 6
+    assert found.best.worst < 1e-9
+    plain = next(row for row in found.leaderboard if row.kind == "linear" and row.nz == 3)
+    assert plain.worst > 0.05
+
+
+def test_inputs_that_multiply_the_state_get_a_bilinear_model_and_the_best_linear_one_beside_it():
+    data = episodes_of(bilinear)
+    found = km.select(data, candidates=[PLAIN], horizon=8, delays=[0])
+    assert (found.best.kind, found.best_linear.kind) == ("bilinear", "linear")
+    assert found.best.worst < 1e-9 < 0.05 < found.best_linear.worst
+    row = found.best
+    assert found.predictor == km.bilinear_edmd(data, row.lifting, ridge=row.ridge, difference=True)
+    assert found.linear == km.edmd(data, found.best_linear.lifting, ridge=found.best_linear.ridge)
+    only = km.select(data, candidates=[PLAIN], horizon=8, delays=[0], bilinear=False)
+    assert {row.kind for row in only.leaderboard} == {"linear"}
+
+
+def test_what_is_not_measured_is_found_in_the_past():
+    """Of two linear states one is measured: one delay closes the model."""
+    found = km.select(episodes_of(linear, keep=1), candidates=[km.State()], horizon=8)
+    assert found.best.delays == 1
+    assert found.best.worst < 1e-9
+    assert isinstance(found.predictor.embedding, km.Delay)
+
+
+def test_a_score_is_the_relative_error_of_fits_that_never_saw_the_fold():
+    """Beside a loop that fits to all folds but one and rolls out from every start of that one."""
+    data = noisy(episodes_of(quadratic, count=6, steps=14), 0.02)
+    fold, horizon, ridge = (0, 1, 2, 0, 1, 2), 5, 1e-3
+    lifting = SQUARES.bind(data.states)
+    result = tried(Trial(Candidate("", lifting), data, fold, horizon, 2, (ridge,)))
+    spread = np.concatenate([e.X for e in data]).std(axis=0)
+    for f in range(3):
+        train = km.Episodes([e for e, g in zip(data, fold, strict=True) if g != f], data.dt)
+        model = km.edmd(train, lifting, ridge=ridge)
+        gaps = [
+            (e.X[k + 1 : k + horizon + 1] - model.rollout(e.X[k], e.U[k : k + horizon])[1:]) / spread
+            for e, g in zip(data, fold, strict=True)
+            if g == f
+            for k in range(2, len(e) - horizon + 1)
+        ]
+        expected = np.sqrt(np.mean(np.square(gaps), axis=(0, 2)))
+        assert result.error[f] == pytest.approx(expected, rel=1e-8)
+    assert result.scores == pytest.approx(np.sqrt(np.mean(result.error**2, axis=1)))
+
+
+def test_neither_units_nor_offsets_change_the_choice_or_the_errors():
+    data = noisy(episodes_of(quadratic), 0.01)
+    scale, offset = np.array([1e3, 1e-3]), np.array([2e3, 2e-3])
+    moved = km.Episodes([km.Episode(X=e.X * scale + offset, U=e.U) for e in data], data.dt)
+    kwargs = {"candidates": [PLAIN, SQUARES], "horizon": 6, "delays": [0, 1], "ridges": [0.0]}
+    one, other = km.select(data, **kwargs), km.select(moved, **kwargs)
+    assert [r.title for r in one.leaderboard[:4]] == [r.title for r in other.leaderboard[:4]]
+    assert one.best.title == other.best.title
+    assert other.best.worst == pytest.approx(one.best.worst, rel=1e-3)
+
+
+def test_what_runs_away_counts_as_infinite_and_the_smallest_of_such_is_taken():
+    """Noise of sizes from 1e-3 to 1e3, to which a polynomial of degree 5 is fitted, and no other model is there."""
+    rng = np.random.default_rng(0)
+    made = [
+        km.Episode(X=rng.standard_normal((25, 2)) * 10.0 ** rng.integers(-3, 4), U=np.zeros((24, 0))) for _ in range(10)
+    ]
+    data = km.Episodes(made, 0.1)
+    with pytest.warns(km.FitWarning) as told:
+        found = km.select(data, candidates=[km.State() + km.Monomials(5)], horizon=20, ridges=[0.0], delays=[0])
+    assert any("the forecasts of all 1 candidates run away within 20" in str(one.message) for one in told)
+    assert np.isinf(found.best.worst)
+    assert "inf" in str(found)
+
+
+def test_the_smallest_model_within_one_standard_error_is_chosen():
+    found = km.select(episodes_of(linear), candidates=[PLAIN, SQUARES], horizon=8, bilinear=False)
+    rows = [
+        replace(found.leaderboard[0], worst=w, deviation=d, size=s)
+        for w, d, s in [(1.0, 0.2, 50), (1.1, 0.0, 20), (1.19, 0.0, 30), (1.3, 0.0, 2)]
+    ]
+    assert choice(tuple(rows)) == 1
+    assert choice((replace(rows[0], worst=np.inf, deviation=0.0), replace(rows[3], worst=np.inf))) == 1
+
+
+def test_workers_change_nothing_and_a_lifting_of_ones_own_reaches_them():
+    import casadi as ca
+
+    own = km.Expressions(lambda x: [x[0], x[1], ca.sin(x[0]) * x[1]], ("a", "b", "c"))
+    data = episodes_of(quadratic, count=8)
+    told = []
+    found = [
+        km.select(
+            data,
+            candidates=[SQUARES, own],
+            horizon=5,
+            delays=[0],
+            workers=workers,
+            progress=lambda *args: told.append(args),
+        )
+        for workers in (None, 2)
+    ]
+    timeless = [tuple(replace(row, seconds=0.0) for row in each.leaderboard) for each in found]
+    assert timeless[0] == timeless[1]
+    assert found[0].predictor == found[1].predictor
+    assert told[0] == ("candidates", 0, 4)
+    assert ("candidates", 4, 4) in told
+
+
+def test_a_source_is_chosen_on_a_sample_and_fitted_to_all():
+    sets = [episodes_of(quadratic, count=4, steps=20, seed=s) for s in range(12)]
+    found = km.select(
+        km.Stream(sets), candidates=[SQUARES], horizon=5, delays=[0], sample=300, bilinear=False, ridges=[1e-6]
+    )
+    assert found.predictor.report.samples == 12 * 4 * 20
+    assert "chosen on" in found.notes[0]
+    assert "fitted to all" in found.notes[0]
+    with pytest.raises(km.errors.DataError, match="a selection reads its data several times"):
+        km.select(km.Stream(iter(sets)), candidates=[SQUARES])
+
+
+def test_one_long_episode_is_cut_into_blocks_and_the_choice_says_so():
+    found = km.select(episodes_of(quadratic, count=1, steps=400), candidates=[SQUARES], horizon=5, delays=[0])
+    assert found.folds == 5
+    assert "1 episode is too few for 5 folds: cut into" in str(found)
+
+
+def test_blocks_share_no_pair_and_a_fold_of_them_is_one_stretch():
+    (whole,) = data = episodes_of(linear, count=1, steps=203)
+    found = folded(data, 6, 5, np.random.default_rng(0))
+    assert sum(len(e) for e in found.episodes) == 203
+    assert np.array_equal(np.concatenate([e.X[:-1] for e in found.episodes]), whole.X[:-1])
+    assert list(found.fold) == sorted(found.fold)
+    assert set(found.fold) == set(range(5))
+
+
+def test_whole_episodes_are_dealt_out_evenly_and_short_ones_are_counted():
+    rng = np.random.default_rng(0)
+    data = km.Episodes(
+        [km.Episode(X=rng.standard_normal((n + 1, 1)), U=np.zeros((n, 0))) for n in [40] * 12 + [3] * 2], 0.1
+    )
+    found = folded(data, 10, 4, rng)
+    assert "2 of 14 episodes are shorter than the 10 steps" in found.notes[0]
+    assert np.bincount(found.fold).tolist() == [3, 3, 3, 3]
+    with pytest.raises(km.errors.DataError, match="pass a shorter horizon, or longer episodes"):
+        folded(data[12:], 10, 4, rng)
+
+
+def test_a_sample_is_whole_episodes_or_the_beginning_of_one():
+    data = episodes_of(linear, count=50, steps=20)
+    held, notes = sampled(km.Stream([data]), 200)
+    assert sum(map(len, held)) == 200
+    assert all(any(np.array_equal(one.X, e.X) for e in data) for one in held)
+    assert notes
+    held, _ = sampled(km.Stream([episodes_of(linear, count=1, steps=500)]), 100)
+    assert [len(e) for e in held] == [100]
+
+
+@pytest.mark.parametrize(("decay", "expected"), [(0.5, 10), (0.97, 23), (0.9999, 50)])
+def test_the_usual_horizon_is_where_half_is_forgotten(decay, expected):
+    rng = np.random.default_rng(0)
+    X = np.zeros((20000, 1))
+    X[0] = rng.standard_normal(1) / np.sqrt(1 - decay**2)
+    for k in range(19999):
+        X[k + 1] = decay * X[k] + rng.standard_normal()
+    assert usual_horizon(km.Episodes([km.Episode(X=X, U=np.zeros((19999, 0)))], 0.1)) == pytest.approx(expected, abs=3)
+    short = km.Episodes([km.Episode(X=X[:8], U=np.zeros((7, 0)))], 0.1)
+    assert usual_horizon(short) == 3
+
+
+def test_angles_are_told_by_unit_then_by_name():
+    names = ["theta [rad]", "omega [rad/s]", "roll [deg]", "phi", "dtheta", "x", "pole_angle", "theta2"]
+    X = np.random.default_rng(0).uniform(-2, 2, (50, 8))
+    assert angles(names, X) == [0, 3, 6, 7]
+    X[:, 3] *= 0.01
+    assert angles(names, X) == [0, 6, 7]
+
+
+def test_a_wrapped_angle_is_named():
+    rng = np.random.default_rng(0)
+    turning = [np.cumsum(np.full((40, 1), 0.3), axis=0) + rng.uniform(-3, 3) for _ in range(6)]
+    wrapped = [km.Episode(X=(t + np.pi) % (2 * np.pi) - np.pi, U=np.zeros((39, 0))) for t in turning]
+    with pytest.warns(km.FitWarning, match=r"theta jumps by 2π \d+ times: it was wrapped"):
+        km.select(km.Episodes(wrapped, 0.1, ["theta"]), candidates=[PLAIN], horizon=4, delays=[0])
+
+
+def test_a_lifting_made_for_the_states_is_tried_without_delays_only():
+    bells = km.State() + km.Gaussian(np.zeros((1, 2)), 1.0)
+    found = km.select(episodes_of(linear), candidates=[bells, PLAIN], horizon=5, bilinear=False)
+    assert {row.delays for row in found.leaderboard if row.name.startswith("0")} == {0}
+    assert {row.delays for row in found.leaderboard if row.name.startswith("1")} == {0, 1, 2}
+
+
+def test_measured_disturbances_are_in_the_fit_and_in_the_forecast():
+    rng = np.random.default_rng(0)
+    made = []
+    for e in episodes_of(linear, count=8):
+        W, X = rng.uniform(-1, 1, (len(e), 1)), e.X.copy()
+        for k in range(len(e)):
+            X[k + 1] = A @ X[k] + B @ e.U[k] + [0.2, 0.0] * W[k]
+        made.append(km.Episode(X=X, U=e.U, W=W))
+    found = km.select(km.Episodes(made, 0.1), candidates=[PLAIN], horizon=6)
+    assert {row.kind for row in found.leaderboard} == {"linear"}
+    assert found.best.worst < 1e-9
+    assert found.predictor.disturbances == ("w0",)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"ridges": [-1.0]}, "ridges is"),
+        ({"ridges": []}, "at least one"),
+        ({"delays": []}, "delays is empty"),
+        ({"folds": 1}, "folds is 1; it must be at least 2"),
+        ({"candidates": []}, "there is no candidate"),
+        ({"horizon": 300}, "pass a shorter horizon"),
+    ],
+)
+def test_a_mistake_is_told(change, words):
+    with pytest.raises(km.errors.DataError, match=words):
+        km.select(episodes_of(linear, count=4), **({"candidates": [PLAIN]} | change))
+
+
+def test_a_selection_is_data():
+    found = km.select(episodes_of(linear, count=6), candidates=[PLAIN], horizon=5, folds=2)
+    arrays = {}
+    assert from_data(to_data(found, arrays), arrays) == found
+
+
+def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():
+    lines = str(km.select(episodes_of(bilinear, count=8), horizon=5, folds=2, ridges=[0.0], delays=[0])).splitlines()
+    assert lines[0].startswith("chosen: bilinear: ")
+    assert any(line.startswith(" → ") for line in lines)
+    assert any("linear: x, 1 " in line for line in lines)
+    assert max(map(len, lines)) <= 120

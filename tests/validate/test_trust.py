@@ -1,0 +1,213 @@
+"""The trust report: a good model is trusted, bad ones are not, and it says why."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.values import from_data, to_data
+from tests.plants.models import Pendulum
+
+HORIZON = 10
+LIFTING = km.State() + km.Fourier(2, states=[0])
+
+
+def swings(episodes: int, seed: int, theta: float = 1.5, torque: float = 5.0) -> km.Episodes:
+    plant = km.discretize(Pendulum(), 0.05)
+    starts = km.Uniform([-theta, -theta], [theta, theta])
+    return km.collect(plant, starts, km.Noise(-torque, torque), episodes=episodes, steps=40, rng=seed)
+
+
+@pytest.fixture(scope="module")
+def data() -> tuple[km.Episodes, km.Episodes]:
+    return swings(120, 0).split(0.5)
+
+
+def test_a_good_model_is_trusted(data) -> None:
+    train, held_out = data
+    report = km.trust(km.edmd(train, LIFTING), held_out, HORIZON, train=train)
+    assert report.trusted
+    assert report.steps == HORIZON
+    assert str(report).startswith("TRUST")
+    assert not any(finding.grave for finding in report.findings)
+    assert report.error.max() < 0.2
+    assert report.unseen is not None
+    assert report.unseen < 0.05
+    assert (report.score.rmse[-1] < report.holding.rmse[-1]).all()
+
+
+def test_a_model_of_an_exact_subspace_is_trusted_without_care() -> None:
+    rng = np.random.default_rng(0)
+    runs = []
+    for _ in range(60):
+        U, X = rng.uniform(-1, 1, (20, 1)), [rng.uniform(-1, 1, 2)]
+        for u in U:
+            x = X[-1]
+            X.append(np.array([0.9 * x[0], 0.5 * x[1] + 0.31 * x[0] ** 2 + u[0]]))
+        runs.append(km.Episode(X=X, U=U))
+    train, held_out = km.Episodes(runs, 0.1).split(0.5)
+    closed = km.State() + km.Expressions(lambda x: [x[0] ** 2], ("square",))
+    report = km.trust(km.edmd(train, closed), held_out, 15, train=train)
+    assert report.findings == ()
+    assert str(report).startswith("TRUST over 15 steps (1.5 s)\n")
+    assert report.band.width.max() < 1e-9
+
+
+def test_narrow_data_are_found_out(data) -> None:
+    narrow = swings(20, 1, theta=0.2, torque=1.0)
+    report = km.trust(km.edmd(narrow, LIFTING), data[1], HORIZON, train=narrow)
+    assert not report.trusted
+    text = str(report)
+    assert text.startswith(f"DO NOT TRUST beyond {report.steps} of 10 steps")
+    assert "collect data where the model will be used" in text
+    assert "of the held-out samples lie where the training data never were" in text
+    assert "was never visited" in text
+    assert report.unseen is not None
+    assert report.unseen > 0.5
+
+
+def test_too_few_data_for_too_many_observables_are_found_out(data) -> None:
+    train, held_out = data
+    centers = np.random.default_rng(0).uniform(-1, 1, (60, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", km.FitWarning)
+        model = km.edmd(train[:2], km.State() + km.Gaussian(centers, 0.5))
+    report = km.trust(model, held_out, HORIZON, train=train[:2])
+    assert not report.trusted
+    assert any("times those on the training episodes" in finding.says for finding in report.findings)
+    assert report.residuals.spurious.any()
+
+
+def test_its_parts_are_those_of_their_own_functions(data) -> None:
+    train, held_out = data
+    model = km.edmd(train, LIFTING)
+    report = km.trust(model, held_out, HORIZON)
+    assert report.score == km.score(model, held_out, HORIZON)
+    assert report.train_score is None
+    assert report.unseen is None
+    assert np.allclose(
+        np.sort(report.residuals.residuals), np.sort(km.spectrum.linearity_error(model, held_out)), rtol=1e-7
+    )
+    held = [np.abs(e.X[k + 3] - e.X[k]) ** 2 for e in held_out for k in range(len(e) - HORIZON + 1)]
+    assert np.allclose(report.holding.rmse[2], np.sqrt(np.mean(held, axis=0)), rtol=1e-10)
+    spread = np.ptp(np.concatenate([e.X for e in held_out]), axis=0)
+    assert np.array_equal(report.spread, spread)
+    assert km.trust(model, held_out, HORIZON) == report  # the same seed, the same report
+
+
+def test_steps_end_where_a_band_leaves_its_share_of_the_range(data) -> None:
+    report = km.trust(km.edmd(data[0], km.State()), swings(60, 5, theta=2.0), 40)
+    assert 0 < report.steps < 40
+    assert (report.error[: report.steps] <= 0.2).all()
+    worst = report.error[report.steps]
+    beaten = report.score.rmse[report.steps] < report.holding.rmse[report.steps]
+    assert ((worst > 0.2) | ((worst > 0.05) & ~beaten)).any()
+
+
+def test_bilinear_and_autonomous_models(data) -> None:
+    train, held_out = data
+    report = km.trust(km.bilinear_edmd(train, LIFTING + km.Constant()), held_out, HORIZON, train=train)
+    assert report.trusted
+    free = km.Episodes([km.Episode(X=e.X) for e in swings(30, 2, torque=1e-9)], 0.05)
+    report = km.trust(km.edmd(free, km.State() + km.Fourier(1, states=[0])), free, HORIZON)
+    assert report.persistency is None
+    assert report.feedback is None
+    assert "exciting" not in str(report)
+
+
+def test_a_model_that_remembers_sees_what_is_not_measured() -> None:
+    whole = swings(120, 6)
+    angles = km.Episodes([km.Episode(X=e.X[:, :1], U=e.U) for e in whole], 0.05, ("theta [rad]",), ("torque [N m]",))
+    train, held_out = angles.split(0.5)
+    blind = km.trust(km.edmd(train, km.State()), held_out, HORIZON, train=train)
+    past = km.trust(km.edmd(train, km.State() + km.Constant(), embedding=km.Delay(2)), held_out, HORIZON, train=train)
+    assert not blind.trusted
+    assert past.trusted
+    assert past.invariance.names == (
+        "theta [rad]",
+        "torque[k-1] [N m]",
+        "theta[k-1] [rad]",
+        *past.invariance.names[3:],
+    )
+    assert str(past).startswith("TRUST")
+    bilinear = km.bilinear_edmd(train, km.State() + km.Constant(), embedding=km.Delay(2))
+    assert km.trust(bilinear, held_out, HORIZON).trusted
+
+
+def test_feedback_and_weak_inputs_ask_for_care(data) -> None:
+    rng = np.random.default_rng(3)
+    for gain, noise, expected in (
+        (1.0, 1e-2, "feedback: ψ(x) explains most of the inputs"),
+        (0, 0, "excite to order"),
+    ):
+        runs = []
+        for _ in range(30):
+            x, X, U = rng.uniform(-1, 1), [], []
+            X.append([x])
+            for _ in range(20):
+                u = -gain * x + noise * rng.standard_normal() + (1 - gain)
+                x = 0.95 * x + 0.1 * u
+                X.append([x])
+                U.append([u])
+            runs.append(km.Episode(X=X, U=U))
+        loop = km.Episodes(runs, 0.1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", km.FitWarning)
+            model = km.edmd(loop, km.State())
+        findings = km.trust(model, loop, 5).findings
+        assert any(expected in finding.says for finding in findings)
+
+
+def test_closed_loop_coverage_is_shown_beside_the_promise(data) -> None:
+    train, held_out = data
+    model = km.edmd(train, km.State())
+    steep = swings(60, 4, theta=3.0)
+    loop = km.Episodes([km.Episode(X=e.X, U=e.U) for e in steep], 0.05, steep.states, steep.inputs)
+    report = km.trust(model, held_out, HORIZON, closed_loop=loop)
+    assert report.closed_loop is not None
+    assert report.recalibrated is not None
+    assert report.closed_loop.share < 0.8
+    assert report.recalibrated.quantile > report.band.quantile
+    assert any("in closed loop" in finding.says for finding in report.findings)
+    assert "\nclosed loop  " in str(report)
+
+
+def test_few_episodes_give_no_band_and_it_says_so(data) -> None:
+    train, held_out = data
+    report = km.trust(km.edmd(train, LIFTING), held_out[:4], HORIZON)
+    assert np.isinf(report.band.quantile)
+    assert any("3 calibration episodes, at least 9 are needed" in f.says for f in report.findings)
+    assert report.trusted
+
+
+def test_a_model_that_diverges_gets_a_report_too(data) -> None:
+    train, held_out = data
+    good = km.edmd(train, km.State())
+    wild = km.LinearPredictor(np.diag([1e200, 1e3]), good.B, good.C, km.State(), good.dt, good.states, good.inputs)
+    report = km.trust(wild, held_out, HORIZON, train=train)
+    assert report.steps == 0
+    assert str(report).startswith("DO NOT TRUST, not even for one step (0.05 s)")
+    assert any("leave the finite numbers" in finding.says for finding in report.findings)
+    assert any("2 of them grow" in finding.says for finding in report.findings)
+
+
+def test_it_is_a_value_of_plain_data(data) -> None:
+    train, held_out = data
+    report = km.trust(km.edmd(train, LIFTING), held_out, HORIZON, train=train, closed_loop=train)
+    again = from_data(json.loads(json.dumps(to_data(report))))
+    assert isinstance(again, km.validate.TrustReport)
+    assert again == report
+    assert str(again) == str(report)
+
+
+def test_bad_input_is_refused(data) -> None:
+    train, held_out = data
+    model = km.edmd(train, LIFTING)
+    with pytest.raises(km.errors.DataError, match="has 40 steps, the horizon is 41"):
+        km.trust(model, held_out, 41)
+    with pytest.raises(km.errors.DataError, match="there is 1 held-out episode"):
+        km.trust(model, held_out[:1], 5)
+    with pytest.raises(km.errors.ShapeError, match="the episodes have states"):
+        km.trust(model, km.Episodes([km.Episode(X=e.X, U=e.U) for e in held_out], 0.05), 5)
