@@ -181,4 +181,15 @@ else:
             "spectrum": "predict.spectrum",
             "validate": "validate",
         },
+        core=(
+            "bench.library",
+            "control.linear.linear_mpc",
+            "control.lqr",
+            "control.nonlinear.bilinear_mpc",
+            "control.nonlinear.nonlinear_mpc",
+            "data.collect",
+            "identify.fits.bilinear",
+            "identify.fits.edmd",
+            "loop.simulate",
+        ),
     )

@@ -1,0 +1,71 @@
+"""The front door: what `import koopmpc` gives, when it is imported, and that type checkers see the same."""
+
+import ast
+import importlib
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import koopmpc as km
+
+ROOT = Path(km.__file__).parent
+SERVING = ["koopmpc", *(f"koopmpc.{room.name}" for room in ROOT.iterdir() if (room / "__init__.py").exists())]
+SERVING = [name for name in SERVING if hasattr(importlib.import_module(name), "__all__")] + ["koopmpc.identify.moments"]
+
+
+def test_the_daily_names_are_few() -> None:
+    assert len(km.__all__) <= 90
+    assert km.__all__ == sorted(set(km.__all__))
+
+
+def test_importing_every_module_leaves_every_public_name_what_it_was() -> None:
+    before = {
+        (room, name): getattr(importlib.import_module(room), name)
+        for room in SERVING
+        for name in importlib.import_module(room).__all__
+    }
+    for module in pkgutil.walk_packages(km.__path__, "koopmpc."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    for (room, name), found in before.items():
+        assert getattr(importlib.import_module(room), name) is found, f"{room}.{name}"
+
+
+@pytest.mark.parametrize("room", SERVING)
+def test_type_checkers_see_the_same_names(room: str) -> None:
+    module = importlib.import_module(room)
+    tree = ast.parse(Path(module.__file__ or "").read_text())
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    shown = {
+        alias.asname: f"{node.module}.{alias.name}"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    public = {name for name in shown if name in module.__all__}
+    assert public == set(module.__all__)
+    assert set(shown) == set(dir(module)) & set(shown) | public
+    for name, path in shown.items():
+        home, _, attribute = path.rpartition(".")
+        value = getattr(module, name)
+        held = getattr(importlib.import_module(home), attribute, None)
+        assert value is (importlib.import_module(path) if held is None else held), name
+
+
+def test_nothing_is_imported_before_the_first_name_and_no_drawing_library_by_it() -> None:
+    code = (
+        "import sys, koopmpc as km\n"
+        "assert not [m for m in sys.modules if m.startswith('koopmpc.') and m != 'koopmpc.lazy'], sys.modules\n"
+        "km.Cost\n"
+        "heavy = {'matplotlib', 'rerun', 'cvxpy', 'sklearn', 'pandas', 'distributed', 'osqp'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match=r"module 'koopmpc' has no attribute 'edmdd'"):
+        km.edmdd  # noqa: B018
