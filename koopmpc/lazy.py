@@ -31,6 +31,8 @@ def attach(
         if name in rooms or name in home:
             while waiting:
                 import_module(waiting.pop())
+            ready = {known: getattr(loaded[file], known) for known, file in home.items() if file in loaded}
+            loaded[package].__dict__.update(ready)
         if name in rooms:
             found = import_module(rooms[name])
         elif name in home:
