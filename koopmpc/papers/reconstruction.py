@@ -21,6 +21,7 @@ from koopmpc.values import Value
 
 CUT = 1e-10  # singular values below this share of the largest are left out: "full rank" of a table
 LINEAR = 0.05  # an eigenfunction that is off by less than this over a whole run is one
+_HUGE = 100.0  # a relative error beyond it has no digits worth reading
 _STEADY = 1e-4  # |λ − 1| below it: a constant, which every lifting has and which says nothing
 
 
@@ -118,6 +119,14 @@ def relative(X: Float[np.ndarray, "T1 nx"], truth: Float[np.ndarray, "T1 nx"]) -
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.linalg.norm(X - truth) / np.linalg.norm(truth))
     return error if np.isfinite(error) else np.inf
+
+
+def percent(error: float) -> str:
+    """Return a relative error in %, with three digits; "diverges" where it is huge or not a number."""
+    if not error < _HUGE:
+        return "diverges"
+    value = 100 * error
+    return f"{value:.3g}" if value == 0 or value >= 1e-3 else f"{value:.1e}"
 
 
 @contextmanager

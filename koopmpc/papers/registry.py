@@ -1,4 +1,4 @@
-"""The papers that are done again, by name: each a module of its name here that defines `paper`.
+"""The papers that are done again, by name: each a folder of its name here, whose paper.py defines `paper`.
 
 docs/<name>.md is the report.md of such a run, and docs/<name>/ its pictures: copy both after a change.
 """
@@ -86,4 +86,4 @@ def find_paper(name: str) -> Paper:
     """
     if name not in PAPERS:
         raise ProblemError(f"there is no paper {name!r}{nearest(name, PAPERS)}; there are {', '.join(PAPERS)}")
-    return import_module(f"koopmpc.bench.reproduce.{name}").paper
+    return import_module(f"koopmpc.papers.{name}.paper").paper

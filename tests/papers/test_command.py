@@ -11,7 +11,7 @@ import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.papers import registry
 from koopmpc.papers.contest import ORACLE, costs
-from koopmpc.papers.page import Page, percent
+from koopmpc.papers.reconstruction import percent
 from koopmpc.papers.registry import Claim, Outcome, Paper, Verdict, find_paper, judged
 from koopmpc.papers.snyder.control import SHAKINGS, contest, predictions
 from koopmpc.papers.snyder.settings import scenes
@@ -61,6 +61,10 @@ def test_energy_bounds_the_cost_of_the_hanging_pendulum_from_below():
             assert np.abs(run.U).max() <= 2.0 + 1e-9
 
 
+def test_every_paper_is_found_by_its_name():
+    assert [find_paper(name).name for name in registry.PAPERS] == list(registry.PAPERS)
+
+
 def test_an_unknown_paper_is_told():
     with pytest.raises(km.errors.ProblemError, match=r"no paper 'snider', did you mean 'snyder'\?; there are snyder"):
         find_paper("snider")
@@ -93,16 +97,3 @@ def test_verdicts_and_cells():
     assert [percent(v) for v in (0.0, 0.0111, 3.4e-6, np.inf, np.nan, 1e3)] == [
         "0", "1.11", "3.4e-04", "diverges", "diverges", "diverges",
     ]  # fmt: skip
-
-
-def test_a_page_escapes_and_joins(tmp_path):
-    page = Page("mine", tmp_path)
-    page.text("## Title", "two\nlines")
-    page.table(("|u|", "b"), [(1, "x")])
-    path = page.picture("one", "A picture")
-    assert path == tmp_path / "mine" / "one.png"
-    assert page.markdown == (
-        "## Title\n\ntwo lines\n\n| \\|u\\| | b |\n| --- | --- |\n| 1 | x |\n\n"
-        "![A picture](mine/one.png)\n\n*A picture*\n"
-    )
-    assert "![" not in page.spoken

@@ -8,11 +8,11 @@ import pytest
 from scipy.special import ellipk
 
 import koopmpc as km
+from koopmpc.bench import page as pages
+from koopmpc.bench.page import Page
 from koopmpc.papers.contest import ORACLE, Prediction
-from koopmpc.papers.page import Page
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict
-from koopmpc.papers.snyder import beyond as snyder_beyond
 from koopmpc.papers.snyder import text as snyder_appendix
 from koopmpc.papers.snyder import text as snyder_text
 from koopmpc.papers.snyder.beyond import origin
@@ -240,9 +240,8 @@ def test_verdicts_of_the_text_follow_the_numbers(fits):
 
 def test_the_parts_of_the_report(stage, fits, tmp_path, monkeypatch):
     saved = []
-    for module in (snyder_text, snyder_beyond):
-        monkeypatch.setattr(module, "save", lambda made, path: saved.append(path.stem))
-    page = Page("snyder", tmp_path)
+    monkeypatch.setattr(pages, "save", lambda made, path: saved.append(path.stem))
+    page = Page(tmp_path, beside="snyder")
     claims = of_figures(fits)
     snyder_text.settings(page, claims, 0.01, 10)
     snyder_text.verdicts(page, claims)

@@ -4,14 +4,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from koopmpc.bench.page import Page
 from koopmpc.figures.reconstruction import plot_reconstruction
 from koopmpc.figures.runs import plot_runs
-from koopmpc.figures.style import save
 from koopmpc.lifting.state import Constant, State
 from koopmpc.loop.run import Run
 from koopmpc.papers.contest import ORACLE, Contest, Prediction, centred, costs
-from koopmpc.papers.page import Page, percent
-from koopmpc.papers.reconstruction import Reconstruction, Scene, rebuilt
+from koopmpc.papers.reconstruction import Reconstruction, Scene, percent, rebuilt
 from koopmpc.papers.snyder import words
 from koopmpc.papers.snyder.control import LASTING, SHAKINGS, TASKS
 from koopmpc.papers.snyder.settings import OBSERVABLES, TARGET
@@ -61,8 +60,8 @@ def why(page: Page, scene: Scene, causes: Mapping[str, Reconstruction]) -> None:
         name: causes[name].X + (np.asarray(TARGET) if "x_ref" in name else 0.0)
         for name in ("DMD", "DMD with a constant", "DMD on x − x_ref", "EDMD monomials 2")
     }
-    path = page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation")
-    save(plot_reconstruction({scene.title: (truth, curves)}, scene.dt, scene.dynamics.states), path)
+    made = plot_reconstruction({scene.title: (truth, curves)}, scene.dt, scene.dynamics.states)
+    page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation", made)
     page.curve("why cart-pole", scene.dt, scene.dynamics.states, {"truth": truth, **curves})
 
 
@@ -157,8 +156,8 @@ def control(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int)
             for title, each in runs.items()
             if title.startswith(plant)
         }
-        path = page.picture(f"control-{plant}", f"{plant.capitalize()}: closed loops with limited inputs")
-        save(plot_runs(shown), path)
+        caption = f"{plant.capitalize()}: closed loops with limited inputs"
+        page.picture(f"control-{plant}", caption, plot_runs(shown))
         for title, each in shown.items():
             first = next(iter(each.values()))
             values = {name: np.hstack([run.X[:-1], run.U]) for name, run in each.items()}

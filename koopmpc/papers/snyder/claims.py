@@ -5,8 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from koopmpc.papers.contest import Prediction
-from koopmpc.papers.page import percent
-from koopmpc.papers.reconstruction import Reconstruction
+from koopmpc.papers.reconstruction import Reconstruction, percent
 from koopmpc.papers.registry import Claim, judged
 from koopmpc.papers.snyder.settings import FIGURES, Shown
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from koopmpc.papers.page import Page
+from koopmpc.bench.page import Page
 from koopmpc.papers.reconstruction import Reconstruction, Scene
 from koopmpc.papers.registry import Outcome, Paper, Progress
 from koopmpc.papers.snyder import beyond, text
@@ -18,7 +18,7 @@ RESOLVED = 1e-6  # errors below it are rounding, and differ by a factor from mac
 
 def reproduce(folder: Path, quick: bool, progress: Progress) -> Outcome:
     """Write the report, the figures and the recording into `folder`; `quick` shortens what takes long."""
-    page = Page("snyder", folder)
+    page = Page(folder, beside="snyder")
     progress("trajectories and their reconstructions")
     others = 3 if quick else 10
     stage = scenes(others)
@@ -48,9 +48,8 @@ def reproduce(folder: Path, quick: bool, progress: Progress) -> Outcome:
     beyond.inputs(page, predicted, exciting)
     beyond.control(page, tasks, runs, length["episodes"])
     progress("report and recording")
-    report, recording = folder / "report.md", folder / "snyder.rrd"
-    report.write_text(page.markdown, encoding="utf-8")
-    record_curves(page.curves, recording, application="koopmpc-reproduce-snyder", page=page.spoken)
+    report, recording = page.write(), folder / "snyder.rrd"
+    record_curves(page.curves, recording, application="koopmpc-reproduce-snyder", page=page.words)
     return Outcome((*said, *shown), report, recording)
 
 

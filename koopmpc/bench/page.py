@@ -1,0 +1,99 @@
+"""Page: a report in Markdown, written part by part; its pictures lie in a folder beside it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.figures.style import save
+from koopmpc.recording.views.curves import Curves
+
+if TYPE_CHECKING:
+    from koopmpc.figures.style import Figure
+
+
+@dataclass
+class Page:
+    """Headings, paragraphs, tables, code and pictures in the order in which they are added.
+
+    Pictures have relative paths, so the report may be copied to any place together with them.
+
+    Attributes
+    ----------
+    folder
+        Where the report lies.
+    beside
+        Name of the folder inside `folder` that holds the pictures; "" puts them beside the report.
+    parts
+        Markdown of each part; the report has a blank line between two of them.
+    curves
+        Curves that a recording shows beside the same text.
+    """
+
+    folder: Path
+    beside: str = ""
+    parts: list[str] = field(default_factory=list[str])
+    curves: list[Curves] = field(default_factory=list[Curves])
+
+    def text(self, *paragraphs: str) -> None:
+        """Add headings or paragraphs; line breaks inside one become blanks."""
+        self.parts.extend(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+    def items(self, lines: Iterable[str]) -> None:
+        """Add a list with one item for each line."""
+        self.parts.append("\n".join(f"- {line}" for line in lines))
+
+    def code(self, text: str, language: str = "text") -> None:
+        """Add a block that is shown as it stands."""
+        self.parts.append(f"```{language}\n{text}\n```")
+
+    def table(self, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+        """Add a table; a | inside a cell is escaped."""
+        lines = [headings, ["---"] * len(headings), *rows]
+        self.parts.append("\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines))
+
+    def picture(self, name: str, caption: str, made: "Figure") -> None:
+        """Save the figure as <name>.png and add it with its caption.
+
+        Raises
+        ------
+        LogError
+            The picture cannot be written; then the page stays as it was.
+        """
+        path = Path(self.beside, f"{name}.png")
+        save(made, self.folder / path)
+        self.parts.append(f"![{caption}]({path.as_posix()})\n\n*{caption}*")
+
+    def curve(self, title: str, dt: float, columns: Sequence[str], values: Mapping[str, np.ndarray]) -> None:
+        """Add curves to the recording: one tab, a plot for each column, a line for each name in `values`."""
+        self.curves.append(Curves(title, dt, tuple(columns), dict(values)))
+
+    @property
+    def markdown(self) -> str:
+        """The whole report."""
+        return "\n\n".join(self.parts) + "\n"
+
+    @property
+    def words(self) -> str:
+        """The report without its pictures, for a recording."""
+        return "\n\n".join(part for part in self.parts if not part.startswith("![")) + "\n"
+
+    def write(self, name: str = "report.md") -> Path:
+        """Write the report into `folder` and return its path.
+
+        Raises
+        ------
+        LogError
+            The file cannot be written.
+        """
+        path = self.folder / name
+        with checks.writing(path) as stream:
+            stream.write(self.markdown.encode())
+        return path
+
+
+def _cell(value: object) -> str:
+    return str(value).replace("|", r"\|")
