@@ -1,17 +1,21 @@
 """Frozen data: equality to the bit, and a plain tree of numbers and names in place of a pickle.
 
 A `Value` is a frozen dataclass of numbers, strings, enums, tuples, arrays and other Values. `to_data` writes it
-as a JSON-able tree, `from_data` builds it again. Only classes of koopmpc are looked up, by name, and they are
-built through their own constructors: loading a file runs no code of that file.
+as a JSON-able tree, `from_data` builds it again. Only classes of koopmpc are looked up, by name, they are built
+through their own constructors, and their fields must be of the types that the class declares: loading a file runs
+no code of that file.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
+from functools import cache
 from math import copysign
-from typing import Any, ClassVar, cast
+from types import UnionType
+from typing import Any, ClassVar, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
+from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
 from numpy.typing import NDArray
 
 from koopmpc.errors import DataError, LogError
@@ -124,11 +128,55 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
         if kind not in Value._kinds:
             raise LogError(f"the file holds a {kind!r}, which this version of koopmpc does not know")
         build = cast("Callable[..., Any]", Value._kinds[kind])
-        return build(**{key: from_data(item, arrays, enums) for key, item in node.items() if key != "kind"})
+        value = build(**{key: from_data(item, arrays, enums) for key, item in node.items() if key != "kind"})
+        _check_types(value)
+        return value
     except LogError:
         raise
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise LogError(f"the file holds a {kind!r} that cannot be built: {error}") from error
+
+
+def _check_types(value: Value) -> None:
+    """Raise where a field is of another type than its class declares."""
+    hints = _hints(type(value))
+    with jaxtyped("context"):  # one size for each letter in the shapes of a class
+        for name in _fields(value):
+            got = getattr(value, name)
+            if not _is_a(got, hints[name]):
+                raise LogError(
+                    f"the file holds a {type(value).__name__!r} with {name}={_brief(got)}, which is of another type"
+                )
+
+
+@cache
+def _hints(cls: type[Value]) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _is_a(value: Any, hint: Any) -> bool:
+    """Return whether `value` is of the type that `hint` declares; an int passes for a float.
+
+    Types that stand in no file, such as callables and numpy's ArrayLike, are left to the constructors.
+    """
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_is_a(value, arg) for arg in args)
+    if origin is Literal:
+        return value in args
+    if origin is tuple and args[-1:] != (...,):
+        items = cast("Sequence[Any]", value)
+        return isinstance(value, tuple) and len(items) == len(args) and all(map(_is_a, items, args))
+    if origin in (tuple, Sequence):
+        return isinstance(value, tuple) and all(_is_a(item, args[0]) for item in cast("Sequence[Any]", value))
+    if origin in (dict, Mapping):
+        if not isinstance(value, Mapping):
+            return False
+        pairs = cast("Mapping[Any, Any]", value).items()
+        return all(_is_a(key, args[0]) and _is_a(item, args[1]) for key, item in pairs)
+    if hint is Any or not isinstance(hint, type) or origin is not None:
+        return True
+    return isinstance(value, (float, int) if hint is float else hint)
 
 
 def _brief(value: Any) -> str:

@@ -203,6 +203,37 @@ def test_a_hostile_tree_is_a_log_error(tree):
         from_data(tree, {"objects": np.array([object()], dtype=object), "array0": np.zeros(1)})
 
 
+def hostile(value, **fields):
+    return to_data(value) | fields
+
+
+STATE = to_data(km.State().bind(STATES))
+MODEL = km.LinearPredictor(np.eye(2), np.ones((2, 1)), np.eye(2), km.State(), 0.1, states=STATES, inputs=("u",))
+WRONG_TYPES = [
+    hostile(km.State() + km.Constant(), parts=[STATE, 2], bound=["a"]),
+    hostile(km.State() + km.Constant(), parts=STATE),
+    hostile(km.State() * km.State(), first=3),
+    hostile(km.State() * km.State(), second={"kind": "array", "dtype": "f8", "shape": [1], "values": [0]}),
+    hostile(km.Constant(), bound="theta"),
+    hostile(km.Constant(), bound=[1, 2]),
+    hostile(km.State(), states=[[1]]),
+    hostile(km.Delay(2), bound=[["a"]]),
+    hostile(MODEL, report=5),
+    hostile(MODEL, report=STATE),
+    hostile(MODEL, embedding=STATE),
+    hostile(km.control.Plan(np.zeros((2, 1)), np.zeros((1, 1))), U=[[1]]),
+    hostile(km.control.Plan(np.zeros((2, 1)), np.zeros((1, 1))), X=to_data(np.zeros(3))),
+    hostile(km.control.Plan(np.zeros((2, 1)), np.zeros((1, 1))), X=to_data(np.zeros((2, 1), int))),
+    hostile(Plans(np.zeros((2, 3, 1)), np.zeros((2, 2, 1))), U=to_data(np.zeros((3, 2, 1)))),
+]
+
+
+@pytest.mark.parametrize("tree", WRONG_TYPES, ids=lambda tree: f"{tree['kind']}")
+def test_a_field_of_another_type_than_the_class_declares_is_a_log_error(tree):
+    with pytest.raises(km.errors.LogError, match=r"the file holds a '\w+' (with \w+=.*, which is of|that cannot be)"):
+        from_data(json.loads(json.dumps(tree)))
+
+
 def test_each_name_is_one_class():
     """A file names classes by their bare names, so no two may share one."""
     for module in pkgutil.walk_packages(importlib.import_module("koopmpc").__path__, "koopmpc."):
