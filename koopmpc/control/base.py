@@ -1,4 +1,4 @@
-"""Receding: what every controller with a plan shares: its horizon, its deadline, and what a failed step returns."""
+"""MPCBase: what every controller with a plan shares: its horizon, its deadline, and what a failed step returns."""
 
 import copy
 from time import perf_counter
@@ -9,16 +9,16 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import Origin
-from koopmpc.control.limits import Box, Limits
+from koopmpc.control.initial_condition import InitialCondition
+from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.errors import DataError
-from koopmpc.estimate.observer import Observer
+from koopmpc.estimate.observer import StateObserver
 from koopmpc.lifting.buffered import HUGE
 
 
 def admitted(
-    u: Float[np.ndarray, " nu"], inputs: Box, rates: Box | None, last: Float[np.ndarray, " nu"]
+    u: Float[np.ndarray, " nu"], inputs: Interval, rates: Interval | None, last: Float[np.ndarray, " nu"]
 ) -> Float[np.ndarray, " nu"]:
     """Return the input inside its limits, and as far as they allow within a change inside `rates` from the last."""
     if rates is not None:
@@ -26,12 +26,12 @@ def admitted(
     return np.clip(u, *inputs)
 
 
-def hard(rates: Box | None, linear: Float[np.ndarray, " nu"]) -> Box | None:
+def hard(rates: Interval | None, linear: Float[np.ndarray, " nu"]) -> Interval | None:
     """Return the rate limits that are hard, whose `linear` slack weight is inf, ±inf in place of the others."""
     if rates is None or not np.isinf(linear).any():
         return None
     ends = zip(rates, (-np.inf, np.inf), strict=True)
-    return Box(*(np.where(np.isinf(linear), end, free) for end, free in ends))
+    return Interval(*(np.where(np.isinf(linear), end, free) for end, free in ends))
 
 
 class PlanMemory:
@@ -51,9 +51,9 @@ class PlanMemory:
 
     def __init__(
         self,
-        inputs: Box,
+        inputs: Interval,
         N: int,
-        rates: Box | None = None,
+        rates: Interval | None = None,
         move_of: Int[np.ndarray, " N"] | None = None,
     ) -> None:
         self._inputs, self._N, self._nu = inputs, N, len(inputs.low)
@@ -114,7 +114,7 @@ class PlanMemory:
         return self._given.copy(), how
 
 
-class Receding:
+class MPCBase:
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
     Parameters
@@ -131,7 +131,7 @@ class Receding:
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
     _memory: PlanMemory
-    _origin: Origin
+    _initial: InitialCondition
 
     def __init__(
         self,
@@ -152,7 +152,7 @@ class Receding:
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
         self._planned = False
 
-    def __copy__(self) -> "Receding":
+    def __copy__(self) -> "MPCBase":
         """Return a copy that shares nothing with this one that moves in a step."""
         return copy.deepcopy(self)
 
@@ -172,9 +172,9 @@ class Receding:
         return self._N + self._latency
 
     @property
-    def observer(self) -> Observer:
+    def observer(self) -> StateObserver:
         """The estimate now: its z, and its disturbance d."""
-        return self._origin.observer
+        return self._initial.observer
 
     def _move(
         self,
@@ -205,7 +205,7 @@ class Receding:
 
     def _known_input(self) -> Float[np.ndarray, " nu"]:
         """Return the input that rates count from: what was applied, where it can be used."""
-        u_prev = self._origin.u_prev
+        u_prev = self._initial.u_prev
         if not u_prev.size:
             return self._memory.last()
         if not (np.abs(u_prev) < HUGE).all():

@@ -1,4 +1,4 @@
-"""Origin: where a plan starts, from what is measured and through the inputs that are still to act."""
+"""InitialCondition: where a plan starts, from what is measured and through the inputs that are still to act."""
 
 from collections import deque
 from typing import Any, NamedTuple
@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.measured import Model
-from koopmpc.estimate.observer import Observer
+from koopmpc.estimate.observer import StateObserver
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.linear import LinearPredictor
 
 _VIEWS = ("z", "u_prev", "drive", "W", "d")
 
 
-class Lifted(NamedTuple):
+class LiftedModel(NamedTuple):
     """z⁺ = A z + B u + E w + d of a predictor."""
 
     predictor: LinearPredictor
@@ -43,7 +43,7 @@ class Sizes(NamedTuple):
     N: int
 
 
-class Origin:
+class InitialCondition:
     """known = [z; u_{−1}; w_0 … w_{N−1}; d; 1] of the step at which an input computed now acts, L steps from now.
 
     z is predicted over these L steps, z ← A z + B u + E w + d with the inputs that are still to act. u_{−1} is there
@@ -60,7 +60,7 @@ class Origin:
         Of z, u, w and the plan.
     latency
         L ≥ 0.
-    rated
+    with_rates
         Whether u_{−1} is needed.
     estimated
         Whether the observer finds d.
@@ -71,21 +71,21 @@ class Origin:
     def __init__(
         self,
         model: Model,
-        observer: Observer,
+        observer: StateObserver,
         sizes: Sizes,
         latency: int,
         *,
-        rated: bool,
+        with_rates: bool,
         estimated: bool,
         remembers: bool = False,
     ) -> None:
         self._model, self.observer, self._sizes, self._latency = model, observer, sizes, latency
-        self._rated, self._estimated = rated, estimated
-        self._signals = rated or sizes.nw > 0
+        self._with_rates, self._estimated = with_rates, estimated
+        self._signals = with_rates or sizes.nw > 0
         self._plain = not (estimated or latency or remembers)
         self._shape = (observer.ny,)
         nz, nu, nw, N = sizes
-        self.known = np.zeros(nz + nu * rated + N * nw + nz * estimated + 1)
+        self.known = np.zeros(nz + nu * with_rates + N * nw + nz * estimated + 1)
         self.known[-1] = 1.0
         self._ahead = np.zeros((latency + 1, nw))
         self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
@@ -95,7 +95,7 @@ class Origin:
     def _see(self) -> None:
         """Make the views; a copy makes its own."""
         nz, nu, nw, N = self._sizes
-        first = nz + nu * self._rated
+        first = nz + nu * self._with_rates
         self.z = self.known[:nz]
         self.u_prev = self.known[nz:first]
         self.drive = self.known[first:-1]
@@ -115,7 +115,7 @@ class Origin:
         self._sent.extend([last.copy()] * (self._latency + 1))
         self._w = np.zeros(self._sizes.nw)
 
-    def adopt(self, model: Model) -> None:
+    def update(self, model: Model) -> None:
         """Go on with another model of the same sizes; the observer is told by itself."""
         self._model = model
 
@@ -144,7 +144,7 @@ class Origin:
         if self._plain:
             if applied is not None and numbers(applied, "applied").shape != last.shape:
                 raise ShapeError(f"applied has shape {np.shape(applied)}, expected {last.shape}")
-            observer.update(measured, last, self._w)
+            observer.observe(measured, last, self._w)
             self.z[:] = observer.z
             return
         self._sent.append(last.copy())
@@ -154,7 +154,7 @@ class Origin:
             if got.shape != acted.shape:
                 raise ShapeError(f"applied has shape {got.shape}, expected {acted.shape}")
             acted = got if (np.abs(got) < HUGE).all() else acted
-        good = observer.update(measured, acted, self._w)
+        good = observer.observe(measured, acted, self._w)
         now = self._ahead[0]
         self._w = np.where(np.abs(now) < HUGE, now, self._w)  # not known: as it was
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
@@ -166,7 +166,7 @@ class Origin:
 
     def _note(self, last: Float[np.ndarray, " nu"], applied: ArrayLike | None, w: ArrayLike | None) -> None:
         """Write down the last input and the preview of disturbances."""
-        if self._rated:
+        if self._with_rates:
             before = last  # what acted before the plan's first input
             if applied is not None and not self._latency:
                 before = numbers(applied, "applied")

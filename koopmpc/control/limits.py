@@ -16,7 +16,7 @@ SOFTENED = 1e-4  # a slack above this share of 1 + |limit| is reported
 Slack = tuple[ArrayLike, ArrayLike]
 
 
-class Box(NamedTuple):
+class Interval(NamedTuple):
     """low ≤ v ≤ high, ±inf where there is no limit."""
 
     low: Float[np.ndarray, " n"]
@@ -30,11 +30,11 @@ class Softness(NamedTuple):
     quadratic: Float[np.ndarray, " n"]
 
 
-class Rows(NamedTuple):
+class LimitRows(NamedTuple):
     """The limited outputs [x; y] that have a limit: which they are, their limits, and how soft each is."""
 
     kept: Bool[np.ndarray, " n"]
-    box: Box
+    box: Interval
     softness: Softness
 
 
@@ -104,11 +104,11 @@ class Limits(Value):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _weights(getattr(self, name), name))
 
-    def inputs(self, nu: int) -> Box:
+    def inputs(self, nu: int) -> Interval:
         """Return the box of the inputs."""
         return _box(self.u_min, self.u_max, "u_min", "u_max", nu)
 
-    def rates(self, nu: int) -> Box | None:
+    def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
         low = -np.asarray(self.du_max) if self.du_min is None and self.du_max is not None else self.du_min
         box = _box(low, self.du_max, "du_min", "du_max", nu)
@@ -118,15 +118,15 @@ class Limits(Value):
         """Return how soft the rate limits of each input are."""
         return _softness(self.du_slack, "du_slack", nu, "one an input")
 
-    def states(self, nx: int) -> Box:
+    def states(self, nx: int) -> Interval:
         """Return the box of the states."""
         return _box(self.x_min, self.x_max, "x_min", "x_max", nx)
 
-    def outputs(self, ny: int) -> Box:
+    def outputs(self, ny: int) -> Interval:
         """Return the box of the observables `of`."""
         return _box(self.y_min, self.y_max, "y_min", "y_max", ny)
 
-    def rows(self, nx: int, ny: int) -> Rows:
+    def rows(self, nx: int, ny: int) -> LimitRows:
         """Return the limits of [x; of(x)], those rows alone that have one; ny is 0 without `of`."""
         (x_low, x_high), (y_low, y_high) = self.states(nx), self.outputs(ny) if ny else _NONE
         low, high = np.concatenate([x_low, y_low]), np.concatenate([x_high, y_high])
@@ -135,23 +135,23 @@ class Limits(Value):
         linear, quadratic = np.full(nx + ny, np.inf), np.zeros(nx + ny)
         linear[mine], quadratic[mine] = given
         kept = np.isfinite(low) | np.isfinite(high)
-        return Rows(kept, Box(low[kept], high[kept]), Softness(linear[kept], quadratic[kept]))
+        return LimitRows(kept, Interval(low[kept], high[kept]), Softness(linear[kept], quadratic[kept]))
 
 
-_NONE = Box(np.zeros(0), np.zeros(0))
+_NONE = Interval(np.zeros(0), np.zeros(0))
 
 
-def allowance(box: Box) -> Float[np.ndarray, " n"]:
+def allowance(box: Interval) -> Float[np.ndarray, " n"]:
     """Return the slack of each row up to which its limit counts as kept: 1e-4 (1 + |limit|)."""
     return SOFTENED * (1 + np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)))
 
 
-def softened(slacks: Float[np.ndarray, "N ng"], outputs: Box) -> float:
+def softened(slacks: Float[np.ndarray, "N ng"], outputs: Interval) -> float:
     """Return the largest slack of a soft limit that gives way by more than 1e-4 (1 + |limit|); 0 where none does."""
     return float(slacks[slacks > allowance(outputs)].max(initial=0.0)) if slacks.size else 0.0
 
 
-def beyond(value: Float[np.ndarray, " n"], box: Box) -> float:
+def beyond(value: Float[np.ndarray, " n"], box: Interval) -> float:
     """Return how far the value that is farthest outside its limits is outside; 0 where all are inside."""
     return float(np.maximum(box.low - value, value - box.high).max(initial=0.0))
 
@@ -209,8 +209,8 @@ def _require_room(
         raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
 
 
-def _box(low: ArrayLike | None, high: ArrayLike | None, low_name: str, high_name: str, n: int) -> Box:
-    return Box(
+def _box(low: ArrayLike | None, high: ArrayLike | None, low_name: str, high_name: str, n: int) -> Interval:
+    return Interval(
         checks.vector(-np.inf if low is None else low, low_name, n, infinite=True),
         checks.vector(np.inf if high is None else high, high_name, n, infinite=True),
     )

@@ -110,7 +110,7 @@ class LQR:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
             if (np.abs(got) < HUGE).all():
                 self._last = got
-        self._observer.update(x, self._last, _NOTHING)
+        self._observer.observe(x, self._last, _NOTHING)
         free = self._feedforward - self._K @ self._observer.z
         if self._K_rate.size:
             free -= self._K_rate @ self._last

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.osqp import OSQP
@@ -76,7 +76,7 @@ class Targets:
         for count in (len(self.rows), self.hard):
             solver = self._solver(count)
             solver.reset()
-            solver.update(low[:count] - moved[:count], high[:count] - moved[:count])
+            solver.set_bounds(low[:count] - moved[:count], high[:count] - moved[:count])
             solution = solver.solve(np.zeros(len(alpha)), np.zeros(count))
             if solution.status is Status.OPTIMAL:
                 return alpha + solution.v
@@ -99,9 +99,9 @@ def targets(
     B: Float[np.ndarray, "nz nu"],
     C: Float[np.ndarray, "nr nz"],
     Q: Float[np.ndarray, "nr nr"],
-    inputs: Box,
+    inputs: Interval,
     G: Float[np.ndarray, "ng nz"],
-    outputs: Box,
+    outputs: Interval,
     constant: int | None,
     *,
     hold: bool,

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Box, Limits, Softness
+from koopmpc.control.limits import Interval, Limits, Softness
 from koopmpc.control.target import Targets, targets
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import constant_index
@@ -31,10 +31,10 @@ class Tracking:
     Q: Float[np.ndarray, "nr nr"]
     R: Float[np.ndarray, "nu nu"]
     R_delta: Float[np.ndarray, "nu nu"] | None
-    inputs: Box
-    rates: Box | None
+    inputs: Interval
+    rates: Interval | None
     rate_softness: Softness
-    outputs: Box
+    outputs: Interval
     softness: Softness
     targets: Targets
 
@@ -106,15 +106,15 @@ class Outputs(NamedTuple):
     limited: ca.Function
     Q: Float[np.ndarray, "nr nr"]
     R: Float[np.ndarray, "nu nu"]
-    inputs: Box
-    box: Box
+    inputs: Interval
+    box: Interval
     softness: Softness
     R_delta: Float[np.ndarray, "nu nu"] | None
-    rates: Box | None
+    rates: Interval | None
     rate_softness: Softness
 
     @property
-    def rated(self) -> bool:
+    def with_rates(self) -> bool:
         """Whether the change of the inputs counts."""
         return self.R_delta is not None or self.rates is not None
 

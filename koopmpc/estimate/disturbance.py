@@ -71,11 +71,11 @@ class Relifted:
         if self._history is not None:
             self._history.reset()
 
-    def adopt(self, predictor: LinearPredictor) -> None:
+    def update(self, predictor: LinearPredictor) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
         self._predictor = predictor
 
-    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Lift y, and move d towards the misfit of the step that led here."""
         (x,), (lifted,), lift, _ = self._lift.slot()
         x[:] = y if self._history is None else self._history.take(y, u)

@@ -66,14 +66,14 @@ class Kalman:
     ) -> None:
         self._model, self._delay, self._patience = model, delay, patience
         self._inputs: deque[Float[np.ndarray, " nuw"]] = deque()
-        self.adopt(predictor)
+        self.update(predictor)
         system = self._system
         self.ny = len(system.M)
         self.z: Float[np.ndarray, " nz"] = np.zeros(len(system.one))
         self.d: Float[np.ndarray, " nz"] = np.zeros(len(system.one))
         self.reset()
 
-    def adopt(self, predictor: LinearPredictor) -> None:
+    def update(self, predictor: LinearPredictor) -> None:
         """Go on with another model, from the same state."""
         self._system, self._P, self._R = self._model(predictor)
         self._gains: dict[bytes, Float[np.ndarray, "n m"]] = {}
@@ -89,7 +89,7 @@ class Kalman:
         self._started = False
         self._missed = 0
 
-    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Correct the state of `delay` steps ago with y, and predict it to now through the inputs since."""
         if self._started:
             self._inputs.append(np.concatenate([u, w]))

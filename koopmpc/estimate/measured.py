@@ -28,10 +28,10 @@ class Measured:
         if self._history is not None:
             self._history.reset()
 
-    def adopt(self, predictor: LinearPredictor) -> None:
+    def update(self, predictor: LinearPredictor) -> None:
         """The lifting stays."""
 
-    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Lift y; a bad one makes all of z NaN, which shows in every plan."""
         (x,), (lifted,), lift, _ = self._lift.slot()
         x[:] = y if self._history is None else self._history.take(y, u)
@@ -89,10 +89,10 @@ class MeasuredState:
         if self._history is not None:
             self._history.reset()
 
-    def adopt(self, predictor: Any) -> None:
+    def update(self, predictor: Any) -> None:
         """Y is the state of any model."""
 
-    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y as it is; a bad one shows in the plan."""
         self.z = y if self._history is None else self._history.take(y, u)
         return True
@@ -116,11 +116,11 @@ class FilteredState:
         if self._history is not None:
             self._history.reset()
 
-    def adopt(self, predictor: Any) -> None:
+    def update(self, predictor: Any) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
         self._model = predictor
 
-    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and move d towards the misfit of the step that led here."""
         x = y if self._history is None else self._history.take(y, u)
         if not np.isfinite(x).all():

@@ -14,8 +14,8 @@ from koopmpc.predict.linear import LinearPredictor
 
 
 @runtime_checkable
-class Observer(Protocol):
-    """The estimate of one run: z and d hold until the next `update`."""
+class StateObserver(Protocol):
+    """The estimate of one run: z and d hold until the next `observe`."""
 
     @property
     def ny(self) -> int:
@@ -36,11 +36,11 @@ class Observer(Protocol):
         """Forget everything; the run starts at x0, where it is known."""
         ...
 
-    def adopt(self, predictor: Any) -> None:
+    def update(self, predictor: Any) -> None:
         """Go on with another model, of the kind and the lifting that it was started with."""
         ...
 
-    def update(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y; u and w acted since the last call. Return whether z and d can be used."""
         ...
 
@@ -49,7 +49,7 @@ class Observer(Protocol):
 class Estimator(Protocol):
     """A rule of estimation: `LiftedDisturbance`, `LiftedKalman`, or a user's own."""
 
-    def start(self, predictor: LinearPredictor) -> Observer:
+    def start(self, predictor: LinearPredictor) -> StateObserver:
         """Return the observer of one controller."""
         ...
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.errors import DataError
 from koopmpc.loop.injection import Fault, Injection, Wiring
 
@@ -122,7 +122,7 @@ class ActuatorLoss(_Windowed):
             limited = np.isfinite(limit)
             return np.where(limited, rest + kept * (np.where(limited, limit, rest) - rest), limit)
 
-        return _ActuatorLoss(self, Box(lost(low), lost(high)))
+        return _ActuatorLoss(self, Interval(lost(low), lost(high)))
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class _SensorDelay(Injection):
 
 
 class _ActuatorLoss(Injection):
-    def __init__(self, fault: ActuatorLoss, box: Box) -> None:
+    def __init__(self, fault: ActuatorLoss, box: Interval) -> None:
         self._fault, self._box = fault, box
 
     def applied(self, k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:

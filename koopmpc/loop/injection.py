@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Controller, Fallible, Move
 from koopmpc.errors import DataError
 
@@ -20,7 +20,7 @@ class Wiring(NamedTuple):
     """What a fault may know of the loop that it breaks: the number of measurements, and the input limits."""
 
     ny: int
-    inputs: Box
+    inputs: Interval
 
 
 class Injection:

@@ -20,8 +20,8 @@ class CheckedOSQP(OSQP):
         options = {**DEFAULTS, **(settings or {})}
         self.eps = options["eps_abs"], options["eps_rel"]
 
-    def adopt(self, qp):
-        super().adopt(qp)
+    def update(self, qp):
+        super().update(qp)
         self.qp = qp
 
     def solve(self, v, y, time_limit=None):

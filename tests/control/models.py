@@ -28,10 +28,10 @@ class Telling:
     def reset(self, x0=None):
         """d stays what it is."""
 
-    def adopt(self, predictor):
+    def update(self, predictor):
         self.predictor = predictor
 
-    def update(self, y, u, w):
+    def observe(self, y, u, w):
         if np.isfinite(y).all():
             self.z = self.predictor.lift(y)
         return bool(np.isfinite(y).all())

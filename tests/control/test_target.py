@@ -3,7 +3,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.target import targets
 from tests.control.models import equilibrium
 
@@ -33,7 +33,7 @@ def is_equilibrium(A, B, z, u, constant):
 def test_without_limits_it_is_the_nearest_equilibrium(seed, nz, nu, constant):
     rng, A, B, C, Q, pinned = system(seed, nz, nu, constant)
     nothing = np.zeros((0, len(A)))
-    free, no = Box(np.full(nu, -np.inf), np.full(nu, np.inf)), Box(np.zeros(0), np.zeros(0))
+    free, no = Interval(np.full(nu, -np.inf), np.full(nu, np.inf)), Interval(np.zeros(0), np.zeros(0))
     found = targets(A, B, C, Q, free, nothing, no, pinned, hold=True)
     R = rng.normal(size=(3, len(C)))
     for r, alpha in zip(R, found.coordinates(R), strict=True):
@@ -53,8 +53,8 @@ def test_with_limits_it_is_the_nearest_inside_them(seed, nz, nu, size):
     """The Q-distance equals CVXPY's; references far outside come back to the limits."""
     rng, A, B, C, Q, _ = system(seed, nz, nu, constant=False)
     G = rng.normal(size=(int(rng.integers(0, 3)), nz))
-    inputs = Box(-(high := rng.uniform(0.1, 1, nu)), high)
-    outputs = Box(-(high := rng.uniform(0.1, 2, len(G))), high)
+    inputs = Interval(-(high := rng.uniform(0.1, 1, nu)), high)
+    outputs = Interval(-(high := rng.uniform(0.1, 2, len(G))), high)
     found = targets(A, B, C, Q, inputs, G, outputs, None, hold=True)
     r = size * rng.normal(size=len(C))
     alpha = found.coordinates(r[None])[0]
@@ -77,8 +77,8 @@ def test_with_limits_it_is_the_nearest_inside_them(seed, nz, nu, size):
 def test_where_no_equilibrium_meets_the_state_limits_the_inputs_still_hold():
     """Rest at 4 ≤ x ≤ 5 would take |u| > 1: the target is the nearest that the inputs hold."""
     A, B = np.array([[0.5]]), np.array([[1.0]])
-    state = Box(np.array([4.0]), np.array([5.0]))  # x = 2 u at rest
-    found = targets(A, B, np.eye(1), np.eye(1), Box(-np.ones(1), np.ones(1)), np.eye(1), state, None, hold=True)
+    state = Interval(np.array([4.0]), np.array([5.0]))  # x = 2 u at rest
+    found = targets(A, B, np.eye(1), np.eye(1), Interval(-np.ones(1), np.ones(1)), np.eye(1), state, None, hold=True)
     alpha = found.coordinates(np.array([[4.5]]))[0]
     np.testing.assert_allclose(found.z0 + found.Z @ alpha, [2.0], atol=1e-6)
     np.testing.assert_allclose(found.u0 + found.W @ alpha, [1.0], atol=1e-6)

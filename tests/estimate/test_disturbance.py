@@ -26,7 +26,7 @@ def test_it_is_a_first_order_filter_of_the_misfit(gain, seed):
     X, U = rng.normal(size=(12, 2)), rng.normal(size=(12, 1))
     d = np.zeros(4)
     for k in range(12):
-        assert observer.update(X[k], U[k - 1], NO_W)
+        assert observer.observe(X[k], U[k - 1], NO_W)
         if k:
             misfit = model.lift(X[k]) - model.A @ model.lift(X[k - 1]) - model.B @ U[k - 1]
             d = (1 - gain) * d + gain * misfit
@@ -42,7 +42,7 @@ def test_at_rest_the_plant_is_an_equilibrium_of_the_model(seed):
     observer = km.LiftedDisturbance(0.5).start(model)
     x, u = rng.normal(size=2), rng.normal(size=1)
     for _ in range(60):
-        observer.update(x, u, NO_W)
+        observer.observe(x, u, NO_W)
     z = model.lift(x)
     rest = model.A @ z + model.B @ u + observer.d
     np.testing.assert_allclose(rest[:3], z[:3], atol=1e-12)
@@ -54,7 +54,7 @@ def test_a_true_model_has_no_disturbance_and_a_measured_one_is_no_news():
     rng = np.random.default_rng(0)
     x, u, w = np.zeros(2), np.zeros(1), np.zeros(1)
     for _ in range(10):
-        observer.update(x, u, w)
+        observer.observe(x, u, w)
         u, w = rng.normal(size=1), rng.normal(size=1)
         x = A @ x + B @ u + E @ w + [0.1, 0.2]
     np.testing.assert_allclose(observer.d, 0, atol=1e-14)
@@ -64,14 +64,14 @@ def test_a_missed_sample_leaves_the_disturbance_as_it_is():
     observer = km.LiftedDisturbance(0.5).start(linear(np.diag([0.5, 0.9]), np.ones((2, 1))))
     u = np.zeros(1)
     for x in ([1.0, 2.0], [2.0, 1.0]):
-        observer.update(np.array(x), u, NO_W)
+        observer.observe(np.array(x), u, NO_W)
     before = observer.d.copy()
     assert before.any()
-    assert not observer.update(np.array([np.nan, 1.0]), u, NO_W)
-    assert not observer.update(np.array([1e200, 1.0]), u, NO_W)
-    assert observer.update(np.array([5.0, 5.0]), u, NO_W)  # what came before is unknown
+    assert not observer.observe(np.array([np.nan, 1.0]), u, NO_W)
+    assert not observer.observe(np.array([1e200, 1.0]), u, NO_W)
+    assert observer.observe(np.array([5.0, 5.0]), u, NO_W)  # what came before is unknown
     np.testing.assert_array_equal(observer.d, before)
-    assert observer.update(np.array([5.0, 5.0]), u, NO_W)
+    assert observer.observe(np.array([5.0, 5.0]), u, NO_W)
     assert (observer.d != before).all()
     observer.reset()
     assert not observer.d.any()

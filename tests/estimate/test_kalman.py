@@ -64,7 +64,7 @@ def test_it_equals_the_textbook_filter(disturbance, affine, seed):
             book.P = held
         s = book.correct(y) if np.isfinite(y).any() else book.s
         book.P = held  # the stationary one throughout
-        assert mine.update(y, u, NO_W)
+        assert mine.observe(y, u, NO_W)
         x, d = s[:3], s[3:]
         np.testing.assert_allclose(mine.z[:3], x + shift @ d, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(mine.d[:3], Bd @ d + (np.eye(3) - A) @ shift @ d, rtol=1e-6, atol=1e-6)
@@ -91,7 +91,7 @@ def test_the_constant_is_known_whatever_a_fit_has_made_of_its_row():
         for one in (model, spoiled):
             observer = km.LiftedKalman("x0", disturbance).start(one)
             for k in range(20):
-                observer.update(np.array([np.sin(k)]), np.array([np.cos(k)]), NO_W)
+                observer.observe(np.array([np.sin(k)]), np.array([np.cos(k)]), NO_W)
             seen.append(np.r_[observer.z, observer.d])
         np.testing.assert_array_equal(*seen)
 
@@ -106,7 +106,7 @@ def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
     observer = km.LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model)
     y, u = rng.normal(size=2), rng.normal(size=1)
     for _ in range(150):
-        observer.update(y, u, NO_W)
+        observer.observe(y, u, NO_W)
     z, d = observer.z, observer.d
     np.testing.assert_allclose(model.A @ z + model.B @ u + d, z, atol=1e-8)
     np.testing.assert_allclose(z[:2], y, atol=1e-8)
@@ -120,10 +120,10 @@ def test_it_finds_a_load_on_the_input():
     x, u = np.array([0.3, 0.0]), np.zeros(1)
     observer.reset(np.zeros(2))
     for _ in range(300):
-        observer.update(x[:1].copy(), u, NO_W)
+        observer.observe(x[:1].copy(), u, NO_W)
         u = rng.normal(size=1)
         x = A @ x + B @ (u + 0.7)
-    observer.update(x[:1].copy(), u, NO_W)
+    observer.observe(x[:1].copy(), u, NO_W)
     np.testing.assert_allclose(observer.z, x, atol=1e-8)
     np.testing.assert_allclose(observer.d, B[:, 0] * 0.7, atol=1e-8)
 
@@ -143,9 +143,9 @@ def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inp
     estimates = []
     for k in range(20):
         u = U[k - 1]
-        prompt.update(Y[k], u, NO_W)
+        prompt.observe(Y[k], u, NO_W)
         estimates.append((prompt.z.copy(), prompt.d.copy()))
-        late.update(Y[max(k - delay, 0)], u, NO_W)
+        late.observe(Y[max(k - delay, 0)], u, NO_W)
         z, d = estimates[k - delay] if k >= delay else (model.lift(x0), np.zeros(4))
         for i in range(max(k - delay, 0), k):
             z = model.A @ z + model.B @ U[i] + d
@@ -160,7 +160,7 @@ def test_a_measured_disturbance_is_no_news():
     rng = np.random.default_rng(1)
     observer.reset(x)
     for _ in range(20):
-        observer.update(x[:1].copy(), u, w)
+        observer.observe(x[:1].copy(), u, w)
         u, w = rng.normal(size=1), rng.normal(size=1)
         x = A @ x + B @ u + E @ w + [0.1, 0.0]
     np.testing.assert_allclose(observer.d, 0, atol=1e-12)
@@ -177,7 +177,7 @@ def test_samples_are_bridged_for_a_while_and_reset_repeats_to_the_bit():
         observer.reset([0.1, 0.2])
         good, seen = [], []
         for k, y in enumerate(Y):
-            good.append(observer.update(y, np.array([float(k)]), NO_W))
+            good.append(observer.observe(y, np.array([float(k)]), NO_W))
             seen.append(np.r_[observer.z, observer.d])
         runs.append(np.array(seen))
         assert good == [True] * 7 + [False] * 2 + [True] * 3
@@ -189,7 +189,7 @@ def test_infinities_are_missed_samples():
     seen = []
     for bad in (np.nan, np.inf, -1e200):
         observer = km.LiftedKalman(("x0", "x1")).start(model)
-        observer.update(np.array([1.0, bad]), np.zeros(1), NO_W)
+        observer.observe(np.array([1.0, bad]), np.zeros(1), NO_W)
         seen.append(observer.z.copy())
     np.testing.assert_array_equal(seen[0], seen[1])
     np.testing.assert_array_equal(seen[0], seen[2])
@@ -264,7 +264,7 @@ def test_names_with_and_without_units_and_a_matrix_are_the_same():
     for outputs in ("x1", "x1 [m]", ("x1",), ["x1 [m]"], [[0.0, 1.0, 0.0]]):
         observer = km.LiftedKalman(outputs).start(model)
         for k in range(5):
-            observer.update(np.array([float(k)]), np.ones(1), NO_W)
+            observer.observe(np.array([float(k)]), np.ones(1), NO_W)
         seen.append(observer.z.copy())
     for other in seen[1:]:
         np.testing.assert_array_equal(seen[0], other)

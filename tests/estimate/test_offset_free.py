@@ -65,11 +65,11 @@ class Bad:
     def reset(self, x0=None):
         self.whole.reset(x0)
 
-    def adopt(self, predictor):
-        self.whole.adopt(predictor)
+    def update(self, predictor):
+        self.whole.update(predictor)
 
-    def update(self, y, u, w):
-        return self.whole.update(y, u, w)
+    def observe(self, y, u, w):
+        return self.whole.observe(y, u, w)
 
 
 def test_fewer_disturbances_than_lifted_coordinates_leave_an_offset_where_z_is_lifted_afresh():

@@ -51,7 +51,7 @@ class Loop:
                 v = F @ x
                 u = np.clip(v[0], -BOUNDS[0], BOUNDS[0])
                 if (np.abs(v) > self.limit).any():
-                    exact.update(-self.limit - v, self.limit - v)
+                    exact.set_bounds(-self.limit - v, self.limit - v)
                     found = exact.solve(np.zeros(D.shape[1]), np.zeros(len(D)))
                     if found.status is km.Status.OPTIMAL:
                         u = v[0] + D[0] @ found.v
@@ -77,7 +77,7 @@ def ours(name, loop):
     made = solver(name)(loop.qp, None)
 
     def step(low, high, v, y):
-        made.update(low, high)
+        made.set_bounds(low, high)
         solution = made.solve(v, y)
         return solution.v, solution.y
 
@@ -147,7 +147,7 @@ def test_a_millisecond_is_held_or_reported(benchmark, name):
 
     def solve():
         made.reset()
-        made.update(qp.low - 0.01 * rng.random(300), qp.high + 0.01 * rng.random(300))
+        made.set_bounds(qp.low - 0.01 * rng.random(300), qp.high + 0.01 * rng.random(300))
         start = time.perf_counter()
         seen.add(made.solve(np.zeros(100), np.zeros(300), time_limit=1e-3).status)
         times.append(time.perf_counter() - start)

@@ -68,7 +68,7 @@ def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordina
         np.dot(-law.K[j], X, out=u)
         u[:, nx : nx + nf] += law.v[j]
         u[:, nx + nf + j * nu : nx + nf + (j + 1) * nu] += spread[j]
-        if h.rated:
+        if h.with_rates:
             X[nz:] = u
         Bu = h.B @ u
         for _ in range(b):
@@ -113,7 +113,7 @@ def _asked(
         reference[:, h.N] = Z[-1].T @ h.CQ_N
     else:
         target[:, h.N] = Z[-1].T @ (h.P_N[:nz, :nz] @ targets.Z)
-        if h.rated:
+        if h.with_rates:
             both = h.P_N[:nz, nz:] @ targets.W
             target[:, h.N] += Z[-1].T @ both + U[-1].T @ (h.P_N[nz:, :nz] @ targets.Z + h.P_N[nz:, nz:] @ targets.W)
     return reference.reshape(nw, -1), target.reshape(nw, -1)

@@ -18,7 +18,7 @@ from koopmpc.control.target import Targets
 from koopmpc.errors import DataError
 
 
-class Signals(NamedTuple):
+class SignalLayout(NamedTuple):
     """Where the entries of f stand, for N steps and the sizes of w and d."""
 
     N: int
@@ -44,8 +44,8 @@ class Signals(NamedTuple):
 class Horizon:
     """z⁺ = A z + B u + E w + d over blocks of held inputs; tracked outputs C z, limited outputs G z, the weights.
 
-    `rated` puts the last input beside z, ξ = [z; u_{k−1}], as a weight or a limit of u_k − u_{k−1} needs it; `bounded`
-    says that there is such a limit. P_N weighs ξ_N − ξ_r, or x_N − r_N where CQ_N = CᵀQ_N is given.
+    `with_rates` puts the last input beside z, ξ = [z; u_{k−1}], as a weight or a limit of u_k − u_{k−1} needs it;
+    `bounded` says that there is such a limit. P_N weighs ξ_N − ξ_r, or x_N − r_N where CQ_N = CᵀQ_N is given.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -59,7 +59,7 @@ class Horizon:
     P_N: Float[np.ndarray, "nx nx"]
     CQ_N: Float[np.ndarray, "nz nr"] | None
     blocks: tuple[int, ...]
-    rated: bool
+    with_rates: bool
     bounded: bool
     disturbed: bool
 
@@ -71,12 +71,12 @@ class Horizon:
     @property
     def size(self) -> int:
         """Entries of ξ."""
-        return len(self.A) + self.B.shape[1] * self.rated
+        return len(self.A) + self.B.shape[1] * self.with_rates
 
     @property
-    def signals(self) -> Signals:
+    def signals(self) -> SignalLayout:
         """The places in f."""
-        return Signals(self.N, self.E.shape[1], len(self.A) if self.disturbed else 0)
+        return SignalLayout(self.N, self.E.shape[1], len(self.A) if self.disturbed else 0)
 
     def push(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
         """Return E w_k + d as a matrix on f; None where there is neither."""
@@ -163,7 +163,7 @@ def _stage(
             q[:nz] += Ai.T @ missed
             r = r + Bi.T @ missed
             e = h.A @ e + push
-    if h.rated:
+    if h.with_rates:
         A, B = _stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
         e = None if e is None else np.vstack([e, np.zeros((nu, h.signals.size))])
     return Stage(A, B, *_weights(h, powers[:-1]), e, q, r)
@@ -181,7 +181,7 @@ def end(horizon: Horizon, targets: Targets) -> Float[np.ndarray, "nx nf"]:
     if push is not None:
         z_r += targets.z_push @ push
     p -= h.P_N[:, :nz] @ z_r
-    if h.rated:
+    if h.with_rates:
         p -= h.P_N[:, nz:] @ _input(h, targets)
     return p
 
@@ -203,7 +203,7 @@ def _weights(
     Q, M, R = CQC.copy(), np.zeros((nz, nu)), len(powers) * h.R
     for Ai, Bi in powers[1:]:
         Q, M, R = Q + Ai.T @ CQC @ Ai, M + Ai.T @ CQC @ Bi, R + Bi.T @ CQC @ Bi
-    if not h.rated:
+    if not h.with_rates:
         return Q, M if len(powers) > 1 else None, R
     R_delta = np.zeros((nu, nu)) if h.R_delta is None else h.R_delta
     return _stacked(Q, R_delta), np.vstack([M, -R_delta]), R + R_delta

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import PlanMemory, Receding, admitted, hard
+from koopmpc.control.base import MPCBase, PlanMemory, admitted, hard
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import Lifted, Origin, Sizes, numbers
-from koopmpc.control.limits import Box, Limits
+from koopmpc.control.initial_condition import InitialCondition, LiftedModel, Sizes, numbers
+from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.horizon import blocked
 from koopmpc.control.linear.plan_map import PlanMap
@@ -28,7 +28,7 @@ from koopmpc.predict.linear import LinearPredictor
 _VIEWS = ("_met", "_met_low", "_met_high")
 
 
-class KoopmanMPC(Receding):
+class KoopmanMPC(MPCBase):
     """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
 
     The backward Riccati recursion gives the unconstrained plan as one matrix–vector product of [z, 1], or of
@@ -116,18 +116,18 @@ class KoopmanMPC(Receding):
         )
         track = self._map.track
         self._constrained = Constrained(self._map.hard, self._map.soft, solver, settings)
-        self._rated = self._map.horizon.rated
+        self._with_rates = self._map.horizon.with_rates
         self._hard_rates = hard(track.rates, track.rate_softness.linear)
         self._move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
         self._memory = PlanMemory(track.inputs, self._N, track.rates, self._move_of)
 
         observer = Measured(predictor) if estimator is None else estimator.start(predictor)
-        self._origin = Origin(
-            Lifted(predictor),
+        self._initial = InitialCondition(
+            LiftedModel(predictor),
             observer,
             Sizes(predictor.nz, self._nu, predictor.nw, self._N),
             self._latency,
-            rated=self._rated,
+            with_rates=self._with_rates,
             estimated=self._disturbed,
             remembers=predictor.embedding is not None,
         )
@@ -166,7 +166,7 @@ class KoopmanMPC(Receding):
         self._memory.reset(u_prev)
         self._constrained.reset()
         self._planned = False
-        self._origin.reset(x0, self._memory.last())
+        self._initial.reset(x0, self._memory.last())
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
@@ -190,10 +190,10 @@ class KoopmanMPC(Receding):
             coordinates="plain" if self.coordinates == "plain" else "riccati",
         )
         self.predictor = predictor
-        self._constrained.adopt(self._map.hard, self._map.soft)
+        self._constrained.update(self._map.hard, self._map.soft)
         self._reference_key = None
-        self._origin.adopt(Lifted(predictor))
-        self.observer.adopt(predictor)
+        self._initial.update(LiftedModel(predictor))
+        self.observer.update(predictor)
 
     def __call__(
         self,
@@ -217,7 +217,7 @@ class KoopmanMPC(Receding):
             w_{k+N+latency−1} with latency; by default zero.
         """
         start = perf_counter()
-        origin = self._origin
+        origin = self._initial
         origin.take(y, self._memory.last(), applied, w)
         target = numbers(reference, "reference")
         key = target.tobytes()
@@ -240,11 +240,11 @@ class KoopmanMPC(Receding):
         A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
         moves = self._plan[: len(self._blocks) * self._nu].reshape(-1, self._nu)
         U = moves[self._move_of]
-        push = self._origin.W @ E.T
+        push = self._initial.W @ E.T
         if self._disturbed:
-            push = push + self._origin.d
+            push = push + self._initial.d
         Z = np.empty((self._N + 1, self.predictor.nz))
-        Z[0] = self._origin.z
+        Z[0] = self._initial.z
         for k in range(self._N):
             Z[k + 1] = A @ Z[k] + B @ U[k] + push[k]
         return Plan(Z @ C.T, U)
@@ -267,9 +267,9 @@ class KoopmanMPC(Receding):
 
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Go on where the plan breaks a limit, its target does, or something is not finite."""
-        plan, origin = self._map, self._origin
+        plan, origin = self._map, self._initial
         u_prev = origin.u_prev
-        changed = self._rated and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
+        changed = self._with_rates and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
         if changed:
             u_prev[:] = self._memory.last()
             np.dot(plan.matrix, origin.known, out=t)
@@ -284,7 +284,7 @@ class KoopmanMPC(Receding):
             return self._unconstrained(t, start)
         inputs, room = plan.track.inputs, None
         if self._hard_rates is not None:
-            room = Box(inputs.low - u_prev, inputs.high - u_prev)
+            room = Interval(inputs.low - u_prev, inputs.high - u_prev)
         deadline = None if np.isinf(self._allowed) else start + self._allowed
         found, gave_way = self._constrained.solve(v, room, deadline)
         status = Status.FAILED if self.solver_fails else found.status

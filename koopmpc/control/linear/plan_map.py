@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Box, Limits, Softness
+from koopmpc.control.limits import Interval, Limits, Softness
 from koopmpc.control.linear.condense import Condensed, Coordinates, condense
 from koopmpc.control.linear.horizon import Horizon, end, one_step, stages
 from koopmpc.control.linear.qp import Group, Program, Units, program, units
@@ -81,7 +81,7 @@ class PlanMap:
         self._checked = checked
         self.planned = nv
         self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
-        self.box = Box(self.low[: self.moves], self.high[: self.moves])
+        self.box = Interval(self.low[: self.moves], self.high[: self.moves])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = self.maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
@@ -112,8 +112,8 @@ def _horizon(
 ) -> Horizon:
     """Return the horizon with the terminal weight that the cost asks for."""
     A, B, C, nz, nx = predictor.A, predictor.B, track.C, predictor.nz, predictor.nx
-    rated = track.R_delta is not None or track.rates is not None
-    size = nz + predictor.nu * rated
+    with_rates = track.R_delta is not None or track.rates is not None
+    size = nz + predictor.nu * with_rates
     bounded = track.rates is not None
     CQ_N = None
     if cost.Q_N is None:
@@ -147,7 +147,7 @@ def _horizon(
         P_N=P_N,
         CQ_N=CQ_N,
         blocks=blocks,
-        rated=rated,
+        with_rates=with_rates,
         bounded=bounded,
         disturbed=disturbed,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.control.limits import Box, Softness, allowance
+from koopmpc.control.limits import Interval, Softness, allowance
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution
 from koopmpc.control.solvers.choose import SOFT_SETTINGS
@@ -23,7 +23,9 @@ class Units(NamedTuple):
     curvature: float
 
 
-def units(hessian: Float[np.ndarray, "nw nw"], moved: Float[np.ndarray, "nw nw"], inputs: Box, stages: int) -> Units:
+def units(
+    hessian: Float[np.ndarray, "nw nw"], moved: Float[np.ndarray, "nw nw"], inputs: Interval, stages: int
+) -> Units:
     """Return the units of w; `moved` tells how w moves the inputs of each stage, `inputs` their limits."""
     curvature = np.diag(hessian).reshape(stages, -1).mean(axis=0)
     columns = np.tile(1 / np.sqrt(curvature), stages)
@@ -46,7 +48,7 @@ class Group(NamedTuple):
     `next` is len(next) past the end: a plan ends unconstrained.
     """
 
-    box: Box
+    box: Interval
     softness: Softness
     next: Int[np.ndarray, " n"]
 
@@ -126,7 +128,7 @@ def program(
         width, N = len(given.low), len(following)
         size = row_sizes(deviation[first : first + width * N], N)
         sizes[first : first + width * N] = np.tile(size, N)
-        box = Box(given.low / size, given.high / size)
+        box = Interval(given.low / size, given.high / size)
         softness = Softness(weight.linear * size, weight.quadratic * size**2)
         limited = np.isfinite(box.low) | np.isfinite(box.high)
         gives = np.isfinite(softness.linear) & soft_rows
@@ -230,11 +232,11 @@ class Constrained:
         self._hard = Solve(hard, solver, settings or {})
         self._soft = None if soft is None else Solve(soft, solver, {**SOFT_SETTINGS[solver], **(settings or {})})
 
-    def adopt(self, hard: Program, soft: Program | None) -> None:
+    def update(self, hard: Program, soft: Program | None) -> None:
         """Go on with new matrices of the same size; the warm starts are kept."""
-        self._hard.adopt(hard)
+        self._hard.update(hard)
         if self._soft is not None and soft is not None:
-            self._soft.adopt(soft)
+            self._soft.update(soft)
 
     def cool(self) -> None:
         """Forget the warm starts."""
@@ -249,7 +251,9 @@ class Constrained:
             if solve is not None:
                 solve.reset()
 
-    def solve(self, v: Float[np.ndarray, " nv"], room: Box | None, deadline: float | None) -> tuple[QPSolution, float]:
+    def solve(
+        self, v: Float[np.ndarray, " nv"], room: Interval | None, deadline: float | None
+    ) -> tuple[QPSolution, float]:
         """Return the least deviation from the plan v, w of D w, and how far a soft limit gave way, 0 where none did.
 
         Parameters
@@ -293,16 +297,18 @@ class Solve:
         self._moved = np.zeros(m)  # rows of slacks stay
         self._tail = 0.0  # by how much solves outlast the time they are given [s]
 
-    def adopt(self, program: Program) -> None:
+    def update(self, program: Program) -> None:
         """Go on with new matrices of the same size."""
         self.program = program
-        self._solver.adopt(program.qp)
+        self._solver.update(program.qp)
 
     def reset(self) -> None:
         """Forget what earlier solves left behind in the solver."""
         self._solver.reset()
 
-    def solve(self, v: Float[np.ndarray, " nv"], room: Box | None, deadline: float | None) -> tuple[QPSolution, float]:
+    def solve(
+        self, v: Float[np.ndarray, " nv"], room: Interval | None, deadline: float | None
+    ) -> tuple[QPSolution, float]:
         """Return the solution, and how far the input limits are out of the hard rates' reach."""
         program, solver, conflict = self.program, self._solver, 0.0
         moved = self._moved
@@ -320,7 +326,7 @@ class Solve:
             past += np.where(above, highest, 0.0) - np.where(above, high[rows], 0.0)
             conflict = float((past / scale)[past > 1e-9].max(initial=0.0))
             low[rows], high[rows] = lowest, highest
-            solver.update(low - moved, high - moved)
+            solver.set_bounds(low - moved, high - moved)
         start = self._cold
         if self.warm and not solver.goes_on:
             start = self._primal[program.shift_primal], self._dual[program.shift_dual]

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import PlanMemory, Receding, admitted, hard
+from koopmpc.control.base import MPCBase, PlanMemory, admitted, hard
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import Origin, Sizes, numbers
+from koopmpc.control.initial_condition import InitialCondition, Sizes, numbers
 from koopmpc.control.limits import Limits, beyond, softened
 from koopmpc.control.linear.horizon import blocked
 from koopmpc.control.move import Move, Plan, Status
@@ -40,10 +40,10 @@ class Ahead(NamedTuple):
     goal: Goal
 
 
-_HELD = ("_origin", "_memory", "_planned", "_warm", "_moved")  # what a copy takes over, with the plan
+_HELD = ("_initial", "_memory", "_planned", "_warm", "_moved")  # what a copy takes over, with the plan
 
 
-class BilinearMPC(Receding):
+class BilinearMPC(MPCBase):
     """Minimise the Cost over N steps of x⁺ = F(x, u) within the Limits, one linearisation a step.
 
     F is the predictor's re-lifted map x⁺ = C(A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), so whatever the dictionary the problem
@@ -107,8 +107,8 @@ class BilinearMPC(Receding):
         self._passes = checks.count(passes, "passes")
         self._blocks = blocked(moves, self._N)
         self._outputs = o = outputs(predictor.states, model.nu, self.cost, self.limits, model.nx)
-        self._rated = o.rated or len(self._blocks) < self._N
-        self._staged = Changes(model.F, o, self._blocks) if self._rated else Direct(model.F, o, self._blocks)
+        self._with_rates = o.with_rates or len(self._blocks) < self._N
+        self._staged = Changes(model.F, o, self._blocks) if self._with_rates else Direct(model.F, o, self._blocks)
         self._equilibria = Equilibria(model, self.cost, o, 10 * self._N)
         self._iteration = RealTimeIteration(self._staged.problem)
         self._iteration.theta[:] = model.theta
@@ -119,12 +119,12 @@ class BilinearMPC(Receding):
             advice = "LiftedKalman filters a linear predictor's z; here y is the whole state"
             checks.kind(estimator, "estimator", LiftedDisturbance, advice)
         self._disturbed = estimator is not None or model.nw > 0
-        self._origin = Origin(
+        self._initial = InitialCondition(
             model,
             MeasuredState(model) if estimator is None else estimator.watch(model),
             Sizes(model.nx, model.nu, model.nw, self._N),
             self._latency,
-            rated=self._rated,
+            with_rates=self._with_rates,
             estimated=estimator is not None,
             remembers=model.embedding is not None,
         )
@@ -168,7 +168,7 @@ class BilinearMPC(Receding):
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         self._memory.reset(u_prev)
-        self._origin.reset(x0, self._memory.last())
+        self._initial.reset(x0, self._memory.last())
         self._planned = self._warm = self._moved = False
         self._goal, self._reference_key = None, None
         self._iteration.e[:] = 0.0
@@ -183,9 +183,9 @@ class BilinearMPC(Receding):
         """
         self._map = self._map.updated(predictor)
         self._iteration.theta[:] = self._map.theta
-        self._equilibria.adopt(self._map)
-        self._origin.adopt(self._map)
-        self._origin.observer.adopt(self._map)
+        self._equilibria.update(self._map)
+        self._initial.update(self._map)
+        self._initial.observer.update(self._map)
         self._reference_key = self._goal = None
 
     def plan(self) -> Plan | None:
@@ -204,7 +204,7 @@ class BilinearMPC(Receding):
     ) -> Move:
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
-        origin = self._origin
+        origin = self._initial
         origin.take(y, self._memory.last(), applied, w)
         x, u_prev = origin.z, self._known_input()
         target = numbers(reference, "reference")
@@ -214,7 +214,7 @@ class BilinearMPC(Receding):
         if not (known and self._aim(target)):
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
         s, conflict = self._staged.start(x, u_prev), False
-        if self._rated:
+        if self._with_rates:
             first, conflict = self._staged.first(u_prev)
             self._iteration.low[0, : self._nu], self._iteration.high[0, : self._nu] = first
         deadline = start + self._allowed
@@ -229,7 +229,7 @@ class BilinearMPC(Receding):
         if self.solver_fails:
             status = Status.FAILED
         if status not in GOOD:
-            free = self._iteration.without_limits + (u_prev if self._rated else 0.0)
+            free = self._iteration.without_limits + (u_prev if self._with_rates else 0.0)
             return self._lose(applied, status, iterations, start, free)
         self._planned = self._warm = True
         U = self._staged.plan(self._iteration.X, self._iteration.U)[1].copy()
@@ -275,7 +275,7 @@ class BilinearMPC(Receding):
 
     def _guess(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]) -> None:
         """Start a plan: rest at x. The free motion of a learned model may leave its data, and lead to a plan there."""
-        u = np.clip(u_prev if self._rated else np.zeros(self._nu), *self._outputs.inputs)
+        u = np.clip(u_prev if self._with_rates else np.zeros(self._nu), *self._outputs.inputs)
         self._enter(np.tile(x, (self._N + 1, 1)), np.tile(u, (self._N, 1)), u_prev)
 
     def _move_on(self, u_prev: Float[np.ndarray, " nu"]) -> None:
@@ -287,7 +287,7 @@ class BilinearMPC(Receding):
 
     def _push(self) -> bool:
         """Hand e_k = E w_k + d to the iteration; False where it is not finite."""
-        origin, e = self._origin, self._iteration.e[:, : self._map.nx]
+        origin, e = self._initial, self._iteration.e[:, : self._map.nx]
         pushed = origin.W @ self._map.push.T
         if origin.d.size:
             pushed = pushed + origin.d

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.model import LearnedMap
 from koopmpc.control.target import TOLERANCE, root
 from koopmpc.control.tracking import Outputs
@@ -154,7 +154,7 @@ class Rests:
         free = np.full(len(box.low), np.inf)
         good = _MISSED * float(row @ self._outputs.Q @ row)
         best = guesses[0]
-        for limits in (box, Box(-free, free)):
+        for limits in (box, Interval(-free, free)):
             found, least = None, np.inf
             for guess in guesses:
                 solved = cast(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.stages import Aim, Problem
 from koopmpc.control.nonlinear.stagewise import (
@@ -59,7 +59,7 @@ class RealTimeIteration:
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides = sides(problem)
-        self._limits = Box(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
+        self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
         self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)
         self._free_stages = problem.free
         ns, nsoft = len(self._sides.row), self._sides.soft
@@ -90,10 +90,10 @@ class RealTimeIteration:
         self._interior = interior and Routine(interior, [*stages, self._G, self._d, *state], [*after, self._measures])
 
     @property
-    def soft_box(self) -> Box:
+    def soft_box(self) -> Interval:
         """The limit of each soft side, below and above."""
         rows = self._sides.row[len(self._sides.row) - self._sides.soft :]
-        return Box(*(end[rows] for end in self._limits))
+        return Interval(*(end[rows] for end in self._limits))
 
     @property
     def compiled(self) -> bool:

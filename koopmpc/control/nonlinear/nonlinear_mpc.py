@@ -10,10 +10,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import PlanMemory, Receding, admitted, hard
+from koopmpc.control.base import MPCBase, PlanMemory, admitted, hard
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import Origin, Sizes, numbers
-from koopmpc.control.limits import Box, Limits, beyond, softened
+from koopmpc.control.initial_condition import InitialCondition, Sizes, numbers
+from koopmpc.control.limits import Interval, Limits, beyond, softened
 from koopmpc.control.linear.horizon import blocked
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.nonlinear.model import Source, learned_map
@@ -30,7 +30,7 @@ _HELD = 5  # steps for which a random guess holds an input
 _WIDE = 1.0  # what stands for an input limit where there is none
 
 
-class NonlinearMPC(Receding):
+class NonlinearMPC(MPCBase):
     """Minimise the Cost over N steps of x⁺ = F(x, u) within the Limits, by multiple shooting.
 
     The states x_1 … x_N and the inputs u_0 … u_{N−1} are the variables and F the constraints; where changes of the
@@ -93,11 +93,11 @@ class NonlinearMPC(Receding):
         self.step_map = step_map if isinstance(step_map, StepMap) else step_map.step_map()
         self._ny, blocks = model.ny, blocked(moves, self._N)
         self._outputs = o = outputs(step_map.states, model.nu, self.cost, self.limits, model.nx)
-        rated = o.rated or len(blocks) < self._N
-        self._staged = Changes(model.F, o, blocks) if rated else Direct(model.F, o, blocks)
+        with_rates = o.with_rates or len(blocks) < self._N
+        self._staged = Changes(model.F, o, blocks) if with_rates else Direct(model.F, o, blocks)
         problem = self._staged.problem
         soft = np.isfinite(problem.softness.linear)
-        self._soft = Box(*(end[soft] for end in problem.box))
+        self._soft = Interval(*(end[soft] for end in problem.box))
         self._equilibria = Equilibria(model, self.cost, o, 10 * self._N)
         given = dict(settings or {})
         if solver == "ipopt" and time_limit is not None:
@@ -107,12 +107,12 @@ class NonlinearMPC(Receding):
         self._memory = PlanMemory(o.inputs, self._N, o.rates)
         self._hard_rates = hard(o.rates, o.rate_softness.linear)
         observer, sizes = MeasuredState(model), Sizes(model.nx, self._nu, 0, self._N)
-        self._origin = Origin(
+        self._initial = InitialCondition(
             model,
             observer,
             sizes,
             self._latency,
-            rated=rated,
+            with_rates=with_rates,
             estimated=False,
             remembers=model.embedding is not None,
         )
@@ -126,7 +126,7 @@ class NonlinearMPC(Receding):
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget the last plan; rates count from `u_prev`, which is held if the first step fails."""
         self._memory.reset(u_prev)
-        self._origin.reset(x0, self._memory.last())
+        self._initial.reset(x0, self._memory.last())
         self._warm = self._plan = None
 
     def plan(self) -> Plan | None:
@@ -136,8 +136,8 @@ class NonlinearMPC(Receding):
     def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
-        self._origin.take(y, self._memory.last(), applied, None)
-        x0, u_prev = self._origin.z, self._known_input()
+        self._initial.take(y, self._memory.last(), applied, None)
+        x0, u_prev = self._initial.z, self._known_input()
         target = self._previewed(numbers(reference, "reference"))
         R = reference_rows(target, self._N, len(self._outputs.Q))
         self._plan = None

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.equilibrium import flat
 from koopmpc.control.nonlinear.stages import Aim, Problem
@@ -170,7 +170,7 @@ class Shooting:
         W[:, : self._split[0]], W[:, self._split[0] : self._split[1]] = U, X
         return Start(W.ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
 
-    def solve(self, x0: Float[np.ndarray, " nx"], aim: Aim, start: Start, first: Box) -> tuple[Horizon, Start]:
+    def solve(self, x0: Float[np.ndarray, " nx"], aim: Aim, start: Start, first: Interval) -> tuple[Horizon, Start]:
         """Solve from `start` with u_0 inside `first`; return the solution, and the start that it leaves."""
         nu = self._split[0]
         self._bounds["lbx"][:nu], self._bounds["ubx"][:nu] = first

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Float
 
-from koopmpc.control.limits import Box, Softness
+from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.nonlinear.terminal import Goal
 from koopmpc.control.target import root
 from koopmpc.control.tracking import Outputs
@@ -25,8 +25,8 @@ class Problem(NamedTuple):
     limited: ca.Function
     Q: Float[np.ndarray, "nr nr"]
     R: Float[np.ndarray, "nu nu"]
-    inputs: Box
-    box: Box
+    inputs: Interval
+    box: Interval
     softness: Softness
     free: Bool[np.ndarray, " N"]
 
@@ -77,7 +77,7 @@ class Direct:
         """Return the states and inputs of a plan."""
         return S, V
 
-    def first(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Box, bool]:
+    def first(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, bool]:
         """Return the limits of v_0, and whether they had to be widened."""
         return self.problem.inputs, False
 
@@ -89,7 +89,7 @@ class Changes:
         o = outputs
         nx, nu, N = F.size1_in(0), F.size1_in(1), sum(blocks)
         self._nx, self._nu, self._outputs = nx, nu, o
-        unlimited = Box(np.full(nu, -np.inf), np.full(nu, np.inf))
+        unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
         rates = unlimited if o.rates is None else o.rates
         given = np.isfinite(rates.low) | np.isfinite(rates.high)
         soft = np.flatnonzero(given & np.isfinite(o.rate_softness.linear))
@@ -116,8 +116,8 @@ class Changes:
             ca.Function("limited", [s], [limited]),
             _diagonal(o.Q, o.R),
             np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
-            Box(low, high),
-            Box(*(np.concatenate([o.inputs[i], rates[i][soft], o.box[i]]) for i in (0, 1))),
+            Interval(low, high),
+            Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.box[i]]) for i in (0, 1))),
             Softness(*(np.concatenate([never[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1))),
             self._free,
         )
@@ -158,11 +158,11 @@ class Changes:
         U = S[0, self._nx : self._nx + self._nu] + np.cumsum(V * self._free[:, None], axis=0)
         return S[:, : self._nx], np.clip(U, *self._outputs.inputs)
 
-    def first(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Box, bool]:
+    def first(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, bool]:
         """Return the limits of v_0: where they do not reach the limits of u, these win."""
         low, high = self.problem.inputs
         inputs = self._outputs.inputs
-        widened = Box(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
+        widened = Interval(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
         conflict = (widened.low < low - 1e-9).any() or (widened.high > high + 1e-9).any()
         return widened, bool(conflict)
 

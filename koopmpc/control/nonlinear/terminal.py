@@ -66,7 +66,7 @@ class Equilibria:
         self.rests = Rests(model, outputs, of_state=of_state)
         self._known: dict[bytes, Goal] = {}
 
-    def adopt(self, model: LearnedMap) -> None:
+    def update(self, model: LearnedMap) -> None:
         """Go on with another θ: what is known is found anew, from where it was."""
         self._model = self.rests.model = model
         old, self._known = self._known, {}

@@ -65,11 +65,11 @@ class QPSolver(Protocol):
         """Set the limits to those of the QP less `by`."""
         ...
 
-    def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
+    def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits."""
         ...
 
-    def adopt(self, qp: QP) -> None:
+    def update(self, qp: QP) -> None:
         """Go on with another QP of the same size."""
         ...
 

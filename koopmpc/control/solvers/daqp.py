@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, Bounds, QPSolution, check_start
 from koopmpc.errors import DataError
@@ -75,14 +75,14 @@ class DAQP:
         self._bounds = Bounds(qp)
         self._cold = True
 
-    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], Box]:
-        return type(self), (self._qp, self._settings), Box(self._bounds.low, self._bounds.high)
+    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], Interval]:
+        return type(self), (self._qp, self._settings), Interval(self._bounds.low, self._bounds.high)
 
-    def __setstate__(self, limits: Box) -> None:
+    def __setstate__(self, limits: Interval) -> None:
         """Take over the limits that the original had."""
-        self.update(*limits)
+        self.set_bounds(*limits)
 
-    def adopt(self, qp: QP) -> None:
+    def update(self, qp: QP) -> None:
         """Go on with another QP of the same size: DAQP's setup is one factorisation."""
         self.__init__(qp, self._settings)
 
@@ -103,7 +103,7 @@ class DAQP:
         self._bounds.shift(by)
         self._send()
 
-    def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
+    def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits; ±inf where there is none.
 
         Raises

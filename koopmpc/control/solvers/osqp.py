@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from koopmpc.control.limits import Box
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, Bounds, QPSolution, check_start
 from koopmpc.errors import DataError
@@ -141,17 +141,17 @@ class OSQP:
         self._moved = True
         prepare()
 
-    def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Box, float]]:
-        limits = Box(self._bounds.low, self._bounds.high)
+    def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Interval, float]]:
+        limits = Interval(self._bounds.low, self._bounds.high)
         return type(self), (self._qp, self._settings), (limits, self._solver.get_settings().rho)
 
-    def __setstate__(self, state: tuple[Box, float]) -> None:
+    def __setstate__(self, state: tuple[Interval, float]) -> None:
         """Take over the limits, and the step size ρ that the original had adapted: a copy has the same iterates."""
         limits, rho = state
-        self.update(*limits)
+        self.set_bounds(*limits)
         self._solver.update_rho(rho)
 
-    def adopt(self, qp: QP) -> None:
+    def update(self, qp: QP) -> None:
         """Go on with another QP of the same size; where its zeros stand elsewhere it is set up anew.
 
         Raises
@@ -187,7 +187,7 @@ class OSQP:
         self._solver.update_data_vec(q=None, l=self._bounds.low, u=self._bounds.high)
         self._moved = True
 
-    def update(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
+    def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits; ±inf where there is none.
 
         Raises

@@ -53,7 +53,7 @@ def answers(name, rng, count):
             assert kind != "infeasible"
         seen[kind, solution.status.name] += 1
         moved = QP(qp.P, qp.q, qp.A, qp.low - rng.choice([0.0, 0.1]), qp.high + rng.choice([0.0, 0.1]))
-        made.update(moved.low, moved.high)
+        made.set_bounds(moved.low, moved.high)
         solved = solution.status is km.Status.OPTIMAL
         again = made.solve(solution.v, solution.y) if solved else made.solve(*start(qp))
         if again.status is km.Status.OPTIMAL:
@@ -128,7 +128,7 @@ def test_warm_starts_save_iterations(name):
     made, solution, spent = solver(name)(at, None), None, np.zeros(2)
     for k in range(30):
         at = QP(at.P, at.q, A, -ones - wish - k * drift, ones - wish - k * drift)
-        made.update(at.low, at.high)
+        made.set_bounds(at.low, at.high)
         cold = solver(name)(at, None).solve(*start(at))
         solution = made.solve(*start(at)) if solution is None else made.solve(solution.v, solution.y)
         assert solution.status is cold.status is km.Status.OPTIMAL
@@ -158,7 +158,7 @@ def test_copies_and_pickles_solve_the_same(name):
     rng = np.random.default_rng(0)
     qp = random_qp(rng, "soft", 6)
     made = solver(name)(qp, TIGHT[name])
-    made.update(qp.low - 0.1, qp.high + 0.2)
+    made.set_bounds(qp.low - 0.1, qp.high + 0.2)
     fresh = solver(name)(QP(qp.P, qp.q, qp.A, qp.low - 0.1, qp.high + 0.2), TIGHT[name]).solve(*start(qp))
     made.solve(*start(qp))
     for other in (copy.copy(made), copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
@@ -175,7 +175,7 @@ def test_reset_repeats_to_the_bit(name):
     first = []
     for _ in range(2):
         made.reset()
-        made.update(qp.low - 0.05, qp.high)
+        made.set_bounds(qp.low - 0.05, qp.high)
         first.append(made.solve(*start(qp)))
     np.testing.assert_array_equal(first[0].v, first[1].v)
     np.testing.assert_array_equal(first[0].y, first[1].y)
@@ -200,17 +200,17 @@ def test_what_the_solvers_would_swallow_is_refused(name):
     three = np.ones(3)
     made = solver(name)(QP(np.eye(3), 2 * three, np.eye(3), -three, three), TIGHT[name])
     with pytest.raises(km.errors.ShapeError, match=r"the limits have shapes \(2,\) and \(2,\), the QP has 3 rows"):
-        made.update(-np.ones(2), np.ones(2))
+        made.set_bounds(-np.ones(2), np.ones(2))
     with pytest.raises(km.errors.ShapeError, match=r"the warm start has shapes \(3,\) and \(2,\), the QP is \(3,\), "):
         made.solve(three, np.ones(2))
     nan, wide = np.full(3, np.nan), np.full(3, np.inf)
     for low, high in ((three, -three), (nan, three), (-three, nan), (wide, wide), (-wide, -wide)):
         with pytest.raises(km.errors.DataError, match=r"the limits of the QP cross, hold NaN, or are beyond 1e30"):
-            made.update(low, high)
+            made.set_bounds(low, high)
         solution = made.solve(0 * three, 0 * three)  # the old limits stand
         np.testing.assert_allclose(solution.v, -three, atol=1e-8)
     strided = np.array([-0.1, 9, -0.2, 9, -0.3, 9])[::2]
-    made.update(strided, three)
+    made.set_bounds(strided, three)
     np.testing.assert_allclose(made.solve(strided, strided).v, strided, atol=1e-8)
 
 

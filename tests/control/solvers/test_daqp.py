@@ -58,7 +58,7 @@ def test_rows_close_to_equal_are_not_contradictory():
 def test_equalities_come_and_go():
     solver = box()
     for low, high, v in ((0.5, 0.5, 0.5), (-1, 1, 1), (-np.inf, np.inf, 3), (2, 2, 2), (-4, -3.5, -3.5)):
-        solver.update(low * ONE, high * ONE)
+        solver.set_bounds(low * ONE, high * ONE)
         np.testing.assert_allclose(solved(solver).v, v * ONE, atol=1e-12)
 
 
@@ -66,9 +66,9 @@ def test_empty_rows():
     qp = QP(EYE, -3 * ONE, np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([-1.0, -1.0]), ONE)
     solver = DAQP(qp)
     np.testing.assert_allclose(solved(solver).v, [1, 3], atol=1e-12)
-    solver.update(np.array([0.5, -1.0]), ONE)
+    solver.set_bounds(np.array([0.5, -1.0]), ONE)
     assert solved(solver).status is km.Status.INFEASIBLE
-    solver.update(qp.low, qp.high)
+    solver.set_bounds(qp.low, qp.high)
     np.testing.assert_allclose(solved(solver).v, [1, 3], atol=1e-12)
     np.testing.assert_allclose(solved(DAQP(QP(EYE, ONE, EYE[:0], ONE[:0], ONE[:0])), 2, 0).v, -ONE)
 
@@ -82,7 +82,7 @@ def test_linear_slacks_solve_warm_as_they_do_cold():
         solver = DAQP(qp)
         for wider in (0.0, 0.1, 0.0):
             moved = QP(qp.P, qp.q, qp.A, qp.low - wider, qp.high + wider)
-            solver.update(moved.low, moved.high)
+            solver.set_bounds(moved.low, moved.high)
             solution = solver.solve(*start)
             assert solution.status is km.Status.OPTIMAL
             assert exactness(moved, solution.v, solution.y) < 1e-6
@@ -91,10 +91,10 @@ def test_linear_slacks_solve_warm_as_they_do_cold():
 def test_limits_are_as_they_were_after_the_wider_second_solve():
     apart = np.vstack([EYE, EYE[:1]])
     solver = DAQP(QP(EYE, -3 * ONE, apart, -np.ones(3), np.ones(3)))
-    solver.update(np.array([-1.0, -1.0, 2.0]), np.array([1.0, 1.0, 3.0]))
+    solver.set_bounds(np.array([-1.0, -1.0, 2.0]), np.array([1.0, 1.0, 3.0]))
     for _ in range(3):
         assert solved(solver, 2, 3).status is km.Status.INFEASIBLE
-    solver.update(-np.ones(3), np.ones(3))
+    solver.set_bounds(-np.ones(3), np.ones(3))
     np.testing.assert_array_equal(solved(solver, 2, 3).v, ONE)
 
 

@@ -23,12 +23,12 @@ def qp(seed, holes=0):
 
 
 @pytest.mark.parametrize("name", ["osqp", "daqp"])
-def test_adopting_a_qp_is_setting_it_up(name):
+def test_updating_a_qp_is_setting_it_up(name):
     make = SOLVERS[name]
     solver, cold = make(qp(0), TIGHT[name]), (np.zeros(6), np.zeros(15))
     for other in (qp(1), qp(2), qp(3, holes=4), qp(4)):
         solver.solve(*cold)
-        solver.adopt(other)
+        solver.update(other)
         found, fresh = solver.solve(*cold), make(other, TIGHT[name]).solve(*cold)
         assert found.status is fresh.status is km.Status.OPTIMAL
         np.testing.assert_allclose(found.v, fresh.v, atol=1e-7)
@@ -41,14 +41,14 @@ def test_a_copy_has_the_answers_of_its_original(name, copied):
     solver, start = SOLVERS[name](qp(5), None), (np.zeros(6), np.zeros(15))
     for _ in range(30):
         high = rng.uniform(0.01, 2.0, 15)
-        solver.update(-high[::-1].copy(), high)
+        solver.set_bounds(-high[::-1].copy(), high)
         found = solver.solve(*start)
         start = found.v, found.y
     twin = copied(solver)
     for _ in range(10):
         high = rng.uniform(0.01, 2.0, 15)
         for each in (solver, twin):
-            each.update(-high[::-1].copy(), high)
+            each.set_bounds(-high[::-1].copy(), high)
         mine, its = solver.solve(*start), twin.solve(*start)
         if name == "osqp":  # DAQP's active rows stay behind: the same answer by another way
             np.testing.assert_array_equal(mine.v, its.v)
