@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:  # the same table for type checkers and editors; a test compares the two
+    import koopmpc.figures
     from koopmpc import bench as bench
     from koopmpc import control as control
     from koopmpc import data as data
@@ -57,7 +58,6 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
-    from koopmpc.figures import plot as plot
     from koopmpc.identify import moments as moments
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
     from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
@@ -103,6 +103,8 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.synthesis.select import select as select
     from koopmpc.validate.report import trust as trust
     from koopmpc.validate.scoring import score as score
+
+    plot = koopmpc.figures
 else:
     __getattr__, __dir__, __all__ = attach(
         __name__,
@@ -176,7 +178,7 @@ else:
             "errors": "errors",
             "faults": "loop.faults",
             "moments": "identify.moments",
-            "plot": "figures.plot",
+            "plot": "figures",
             "scene": "scene",
             "spectrum": "predict.spectrum",
             "validate": "validate",

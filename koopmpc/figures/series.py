@@ -1,16 +1,26 @@
 # pyright: basic
-"""plot_rollout and plot_run: states and inputs over time, a panel each, the time below."""
+"""One forecast or one closed loop over time: a panel for each state and each input, the time below."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from koopmpc.control.move import Fallback
 from koopmpc.data.episodes import Episode
-from koopmpc.errors import DataError
-from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, Width, band, figure, line, styled
-from koopmpc.lifting.base import Chosen, indices
+from koopmpc.figures.style import (
+    LIMIT,
+    REFERENCE,
+    TRUTH,
+    Width,
+    band,
+    chosen_states,
+    figure,
+    interval,
+    legend,
+    line,
+    styled,
+)
+from koopmpc.lifting.base import Chosen
 from koopmpc.loop.run import Run
 from koopmpc.validate.forecast import Bands, forecast
 from koopmpc.validate.scoring import Predictor
@@ -18,13 +28,12 @@ from koopmpc.validate.scoring import Predictor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST = 12  # panels of states in one figure
-_BEYOND = 1.0  # spans of the truth that a prediction may leave it by and stay in the picture
+_BEYOND = 1.0  # spans of the truth that a prediction is followed beyond it
 _STATE, _INPUT = 1.05, 0.75  # heights of a panel [in]
 
 
 @styled
-def plot_rollout(
+def rollout(
     predictor: Predictor,
     episode: Episode,
     horizon: int | None = None,
@@ -40,9 +49,10 @@ def plot_rollout(
     Parameters
     ----------
     predictor, episode, horizon, bands, start, relift
-        As in `forecast`: bands are a conformal band, a score, or half-widths (horizon, nx) in the state's unit.
+        As in `koopmpc.validate.forecast`: bands are a conformal band, a score, or half-widths (horizon, nx) in the
+        state's unit.
     states
-        Which to draw, by index or name; all by default.
+        States to draw, by index or name; all by default.
     width
         "one column" or "two columns".
 
@@ -54,32 +64,32 @@ def plot_rollout(
         The episode ends before the horizon; there are too many states for one figure.
     """
     ahead = forecast(predictor, episode, horizon, bands=bands, start=start, relift=relift)
-    chosen, nu, t = _chosen(states, ahead.states), len(ahead.inputs), ahead.time
+    chosen, nu, t = chosen_states(states, ahead.states), len(ahead.inputs), ahead.time
     made, axes = _panels(len(chosen), nu, 0, width)
     for panel, i in zip(axes, chosen, strict=False):
         if ahead.band:
             band(panel, t, *_within(ahead.low[:, i], ahead.high[:, i]), 0, ahead.band)
         panel.plot(t, ahead.truth[:, i], **TRUTH, label="truth")
         panel.plot(t, ahead.predicted[:, i], **line(0, len(t)), label="prediction")
-        panel.set(ylabel=ahead.states[i], ylim=_room(ahead.truth[:, i], ahead.predicted[:, i]))
+        panel.set(ylabel=ahead.states[i], ylim=_followed(ahead.truth[:, i], ahead.predicted[:, i]))
     for panel, name, u in zip(axes[len(chosen) :], ahead.inputs, ahead.U.T, strict=True):
         panel.stairs(u, t, baseline=None, **TRUTH)
         panel.set_ylabel(name)
     axes[-1].set(xlabel="time ahead [s]", xlim=(0, t[-1]))
-    _legend(made, axes[0])
+    legend(made, axes[:1], 3)
     return made
 
 
 @styled
-def plot_run(run: Run, *, states: Chosen | None = None, width: Width = "one column") -> "Figure":
+def run(run: Run, *, states: Chosen | None = None, width: Width = "one column") -> "Figure":
     """Draw a closed loop: states with reference and limits, inputs with limits, and how each step ended.
 
     Parameters
     ----------
     run
-        Of `simulate` or `load_run`.
+        A run of `simulate` or `load_run`.
     states
-        Which to draw, by index or name; all by default.
+        States to draw, by index or name; all by default.
     width
         "one column" or "two columns".
 
@@ -88,7 +98,7 @@ def plot_run(run: Run, *, states: Chosen | None = None, width: Width = "one colu
     DataError
         There are too many states for one figure.
     """
-    chosen, nu, t = _chosen(states, run.states), len(run.inputs), run.time
+    chosen, nu, t = chosen_states(states, run.states), len(run.inputs), run.time
     made, axes = _panels(len(chosen), nu, 1, width)
     tracked = run.states if run.cost is None else run.cost.of.bind(run.states).names
     low, high = _box(run, "states", len(run.states))
@@ -105,15 +115,8 @@ def plot_run(run: Run, *, states: Chosen | None = None, width: Width = "one colu
         panel.set_ylabel(run.inputs[j])
     _statuses(axes[-1], run)
     axes[-1].set(xlabel="time [s]", xlim=(0, t[-1]))
-    _legend(made, *axes[:-1])
+    legend(made, axes[:-1], 3)
     return made
-
-
-def _chosen(states: Chosen | None, names: Sequence[str]) -> list[int]:
-    chosen = indices(states, names, "the figure")
-    if not 1 <= len(chosen) <= _MOST:
-        raise DataError(f"the figure is asked for {len(chosen)} states; choose 1 to {_MOST} with states=…")
-    return chosen
 
 
 def _panels(nx: int, nu: int, more: int, width: Width) -> "tuple[Figure, list[Any]]":
@@ -129,18 +132,15 @@ def _within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(finite, low, np.nan), np.where(finite, high, np.nan)
 
 
-def _room(truth: np.ndarray, predicted: np.ndarray) -> tuple[float, float]:
+def _followed(truth: np.ndarray, predicted: np.ndarray) -> tuple[float, float]:
     """Return an axis that shows the truth, and a prediction that does not run away from it."""
     low, high = float(truth.min()), float(truth.max())
-    span = (high - low) or max(abs(high), 1.0)
     shown = predicted[np.isfinite(predicted)]
-    bottom = max(min(low, shown.min(initial=low)), low - _BEYOND * span)
-    top = min(max(high, shown.max(initial=high)), high + _BEYOND * span)
-    margin = 0.06 * ((top - bottom) or span)
-    return bottom - margin, top + margin
+    return interval(low, high, float(shown.min(initial=low)), float(shown.max(initial=high)), _BEYOND)
 
 
 def _box(run: Run, what: str, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the limits of "states" or "inputs", infinite where there are none."""
     if run.limits is None:
         return np.full(n, -np.inf), np.full(n, np.inf)
     return getattr(run.limits, what)(n)
@@ -153,7 +153,7 @@ def _limits(axes: Any, low: float, high: float) -> None:
 
 
 def _statuses(axes: Any, run: Run) -> None:
-    """Draw one row a status that occurs, a tick a step, and a cross where a fallback stood in."""
+    """Draw one row for each status that occurs, a tick for each step, and a cross where a fallback was applied."""
     kinds = sorted(set(run.status), key=lambda status: status.value)
     t, row = run.time[:-1], np.array([kinds.index(status) for status in run.status])
     failed = np.array([fallback is not Fallback.NONE for fallback in run.fallback], dtype=bool)
@@ -162,12 +162,3 @@ def _statuses(axes: Any, run: Run) -> None:
     names = [kind.name.lower().replace("_", " ") for kind in kinds]
     axes.set_yticks(range(len(kinds)), labels=names, fontsize=6)
     axes.set_ylim(len(kinds) - 0.5, -0.5)
-
-
-def _legend(made: Any, *axes: Any) -> None:
-    """Write every label once, above all panels."""
-    found: dict[str, Any] = {}
-    for panel in axes:
-        handles, labels = panel.get_legend_handles_labels()
-        found |= dict(zip(labels, handles, strict=True))
-    made.legend(list(found.values()), list(found), loc="outside upper center", ncols=min(len(found), 3))

@@ -5,7 +5,7 @@ A figure is a `matplotlib.figure.Figure` of its own: nothing of pyplot, so no di
 stays when it is let go. matplotlib is imported where it is used.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from io import BytesIO
@@ -17,6 +17,7 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.lifting.base import Chosen, indices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,16 +32,10 @@ TRUTH: dict[str, Any] = {"color": "#000000", "linestyle": "-", "linewidth": 1.4}
 REFERENCE: dict[str, Any] = {"color": "#000000", "linestyle": ":", "linewidth": 1.1}
 LIMIT: dict[str, Any] = {"color": "#8c1d18", "linestyle": (0, (6, 2)), "linewidth": 0.9}
 SEQUENTIAL = "viridis"  # its lightness grows evenly, so it reads in grey
-_COLORS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#7b3294",
-    "#c28e00",
-    "#5a5a5a",
-)  # told apart by colour-blind readers
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # colour-blind readers can tell them
 _DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "x")
+_MOST = 12  # states that one figure has panels for
 _SUFFIXES = (".png", ".pdf", ".svg")
 _RC: dict[str, Any] = {
     "font.size": 8.0,
@@ -145,6 +140,34 @@ def band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = 
     axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0, label=label)
     for edge in (low, high):
         axes.plot(x, edge, color=look["color"], linestyle=look["linestyle"], linewidth=0.6)
+
+
+def legend(made: "Figure", axes: "Iterable[Axes]", columns: int) -> None:
+    """Write every label of these axes once, above all panels, in at most so many columns."""
+    found: dict[str, Any] = {}
+    for panel in axes:
+        handles, labels = panel.get_legend_handles_labels()
+        found |= dict(zip(labels, handles, strict=True))
+    made.legend(list(found.values()), list(found), loc="outside upper center", ncols=min(len(found), columns))
+
+
+def interval(low: float, high: float, lowest: float, highest: float, beyond: float) -> tuple[float, float]:
+    """Return an axis for all of low … high, and for lowest … highest up to `beyond` such spans outside of it.
+
+    So a curve that runs away cannot flatten those that the picture is about.
+    """
+    span = (high - low) or max(abs(high), 1.0)
+    bottom, top = max(min(low, lowest), low - beyond * span), min(max(high, highest), high + beyond * span)
+    margin = 0.06 * ((top - bottom) or span)
+    return bottom - margin, top + margin
+
+
+def chosen_states(states: Chosen | None, names: Sequence[str]) -> list[int]:
+    """Return the indices of the states to draw, all by default; raise where they are none or too many."""
+    chosen = indices(states, names, "the figure")
+    if not 1 <= len(chosen) <= _MOST:
+        raise DataError(f"the figure is asked for {len(chosen)} states; choose 1 to {_MOST} with states=…")
+    return chosen
 
 
 @styled

@@ -10,9 +10,9 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
-from koopmpc.figures.error import plot_error
-from koopmpc.figures.series import plot_rollout
-from koopmpc.figures.spectrum import plot_spectrum
+from koopmpc.figures.comparisons import error
+from koopmpc.figures.eigenvalues import spectrum
+from koopmpc.figures.series import rollout
 from koopmpc.figures.style import save
 from koopmpc.synthesis.selection import Selection
 from koopmpc.validate.report import TrustReport
@@ -53,7 +53,7 @@ def drawn(
         if selection.linear is not None and selection.linear is not predictor:
             named["best linear"] = score(selection.linear, held_out, horizon)
         named["plain linear"] = plain
-        return plot_error(named, width="two columns")
+        return error(named, width="two columns")
 
     plots: list[tuple[str, str, Callable[[], Any]]] = [
         (
@@ -67,14 +67,14 @@ def drawn(
             (
                 f"rollout-{i}.png",
                 f"Forecast of held-out episode {i} from its start, and the {around}.",
-                partial(plot_rollout, predictor, episode, horizon, bands),
+                partial(rollout, predictor, episode, horizon, bands),
             )
         )
     plots.append(
         (
             "spectrum.png",
             "Eigenvalues of A and the unit circle; crosses are spurious on the held-out episodes.",
-            partial(plot_spectrum, predictor, report.residuals),
+            partial(spectrum, predictor, report.residuals),
         )
     )
     made: Pictures = []
@@ -82,8 +82,8 @@ def drawn(
         try:
             save(plot(), folder / name)
             made.append((name, caption))
-        except Exception as error:  # a picture that cannot be drawn must not cost the model
-            failures.append(f"{name}: {type(error).__name__}: {error}")
+        except Exception as failure:  # a picture that cannot be drawn must not cost the model
+            failures.append(f"{name}: {type(failure).__name__}: {failure}")
     return made
 
 

@@ -243,7 +243,7 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
         raise RuntimeError("no ink")
 
     monkeypatch.setattr(koopmpc.fitting.fit, "record_model", fails)
-    monkeypatch.setattr(koopmpc.fitting.report, "plot_spectrum", fails)
+    monkeypatch.setattr(koopmpc.fitting.report, "spectrum", fails)
     write_csv(cart_pole(16), tmp_path / "csv")
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["fit", "csv", "--horizon", "10", "--linear"])

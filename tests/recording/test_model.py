@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.predict.plane import eigenfunctions_on, plane_through
+from koopmpc.figures.plane import eigenfunctions_on, plane_through
 from koopmpc.recording.format.columns import Columns, read_columns
 from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from koopmpc.recording.views.eigenvalues import circle, sequence

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from koopmpc.bench.page import Page
-from koopmpc.figures.reconstruction import plot_reconstruction
-from koopmpc.figures.runs import plot_runs
+from koopmpc.figures import comparisons
 from koopmpc.lifting.state import Constant, State
 from koopmpc.loop.run import Run
 from koopmpc.papers.contest import ORACLE, Contest, Prediction, centred, costs
@@ -60,7 +59,7 @@ def why(page: Page, scene: Scene, causes: Mapping[str, Reconstruction]) -> None:
         name: causes[name].X + (np.asarray(TARGET) if "x_ref" in name else 0.0)
         for name in ("DMD", "DMD with a constant", "DMD on x − x_ref", "EDMD monomials 2")
     }
-    made = plot_reconstruction({scene.title: (truth, curves)}, scene.dt, scene.dynamics.states)
+    made = comparisons.reconstruction({scene.title: (truth, curves)}, scene.dt, scene.dynamics.states)
     page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation", made)
     page.curve("why cart-pole", scene.dt, scene.dynamics.states, {"truth": truth, **curves})
 
@@ -157,7 +156,7 @@ def control(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int)
             if title.startswith(plant)
         }
         caption = f"{plant.capitalize()}: closed loops with limited inputs"
-        page.picture(f"control-{plant}", caption, plot_runs(shown))
+        page.picture(f"control-{plant}", caption, comparisons.runs(shown))
         for title, each in shown.items():
             first = next(iter(each.values()))
             values = {name: np.hstack([run.X[:-1], run.U]) for name, run in each.items()}

@@ -8,8 +8,8 @@ import numpy as np
 from koopmpc.bench.page import Page
 from koopmpc.data.collect import collect
 from koopmpc.data.excitation import Noise
-from koopmpc.figures.eigenfunctions import plot_eigenfunctions
-from koopmpc.figures.reconstruction import plot_reconstruction
+from koopmpc.figures.comparisons import reconstruction
+from koopmpc.figures.plane import eigenfunctions
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.papers.plants import Pendulum, frequency, inputs_of, trajectories
 from koopmpc.papers.reconstruction import Reconstruction, Scene, percent, relative, unwarned
@@ -99,7 +99,7 @@ def draw(
 ) -> None:
     """Draw reconstructions, a column a case, and put the curves into the recording, a tab a case."""
     states = scene.dynamics.states
-    page.picture(name, caption, plot_reconstruction(cases, scene.dt, states))
+    page.picture(name, caption, reconstruction(cases, scene.dt, states))
     for title, (truth, curves) in cases.items():
         size = float(np.linalg.norm(truth, axis=1).max())
         table = {"truth": np.hstack([truth, np.full((len(truth), 1), np.nan)])}
@@ -194,7 +194,7 @@ def theory(page: Page, scene: Scene, fits: Fits) -> None:
     left, right = sides(scene.trajectory, OBSERVABLES["EDMD monomials 3"])
     page.text(words.SIDES.format(left=percent(left), right=percent(right)))
     fit = fits["pendulum"]["EDMD monomials 3", True]
-    made = plot_eigenfunctions(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
+    made = eigenfunctions(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
     page.picture("pendulum-eigenfunctions", "Pendulum, monomials 3: the leading eigenfunction", made)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.predict.plane import eigenfunctions_on, plane_through
+from koopmpc.figures.plane import eigenfunctions_on, plane_through
 
 NAMES = ("a [m]", "b [m/s]", "c [A]")
 

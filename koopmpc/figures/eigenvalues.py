@@ -1,5 +1,5 @@
 # pyright: basic
-"""plot_spectrum: the eigenvalues of A over the unit circle, and how far each can be trusted."""
+"""The eigenvalues of A over the unit circle, and how far each can be trusted."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ _CROWDED = 0.35  # share of the picture below which the eigenvalues get one of t
 
 
 @styled
-def plot_spectrum(predictor: Predictor, residuals: Residuals | None = None) -> "Figure":
+def spectrum(predictor: Predictor, residuals: Residuals | None = None) -> "Figure":
     """Draw the eigenvalues λ of A in the complex plane with |λ| = 1, and the residual of each eigenpair.
 
     The darker and larger a point the smaller its residual; an eigenvalue with a residual above the tolerance is a
