@@ -93,9 +93,9 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
     from koopmpc.predict import spectrum as spectrum
-    from koopmpc.predict.bilinear import BilinearPredictor as BilinearPredictor
-    from koopmpc.predict.bilinear import load_model as load_model
-    from koopmpc.predict.linear import LinearPredictor as LinearPredictor
+    from koopmpc.predict.predictors import BilinearPredictor as BilinearPredictor
+    from koopmpc.predict.predictors import LinearPredictor as LinearPredictor
+    from koopmpc.predict.predictors import load_model as load_model
     from koopmpc.recording.format.reader import load_run as load_run
     from koopmpc.recording.recorder import Recorder as Recorder
     from koopmpc.recording.recorder import record as record
@@ -155,8 +155,7 @@ else:
             "plants.integrators": "CVODES RK4 Collocation Euler ImplicitMidpoint",
             "plants.simulated": "Plant",
             "plants.step_map": "StepMap discretize",
-            "predict.bilinear": "BilinearPredictor load_model",
-            "predict.linear": "LinearPredictor",
+            "predict.predictors": "BilinearPredictor LinearPredictor load_model",
             "recording.format.reader": "load_run",
             "recording.recorder": "Recorder record",
             "recording.viewer": "view",

@@ -28,8 +28,7 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.simulated import Plant, SimulatedPlant
 from koopmpc.plants.step_map import StepMap, discretize
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 
 class Prepared:

@@ -12,7 +12,7 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.measured import Model
 from koopmpc.estimate.observer import StateObserver
 from koopmpc.lifting.buffered import HUGE
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 _VIEWS = ("z", "u_prev", "drive", "W", "d")
 

@@ -17,7 +17,7 @@ from koopmpc.control.tracking import reference_rows, tracking
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.measured import Measured
 from koopmpc.lifting.buffered import HUGE
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 ITERATIONS = 10_000
 _NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here

@@ -16,7 +16,7 @@ from koopmpc.estimate.observer import constant_index
 from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 @dataclass(frozen=True)

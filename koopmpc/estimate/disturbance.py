@@ -11,7 +11,7 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.measured import FilteredState, Map
 from koopmpc.estimate.observer import constant_index, history_of
 from koopmpc.lifting.buffered import buffered
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
 

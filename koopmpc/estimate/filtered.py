@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.lifting.buffered import HUGE
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class Augmented:

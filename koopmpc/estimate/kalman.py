@@ -13,7 +13,7 @@ from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.filtered import Augmented, Kalman, Model
 from koopmpc.estimate.observer import constant_index, places
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
 TOLERANCE = 1e-6  # singular values below this share of the largest, or of |λ|; |λ| as near to 1 does not die out

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from koopmpc.data.delay import Delay
 from koopmpc.estimate.observer import history_of
 from koopmpc.lifting.buffered import buffered
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class Measured:

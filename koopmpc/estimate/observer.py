@@ -10,7 +10,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.errors import ObservableError
 from koopmpc.lifting.base import Lifting, short
 from koopmpc.lifting.state import Constant
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 @runtime_checkable

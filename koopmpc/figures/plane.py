@@ -14,7 +14,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.figures.style import SEQUENTIAL, Width, figure, styled
 from koopmpc.lifting.base import index
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from koopmpc.fitting.repair import noted, shortened
 from koopmpc.fitting.report import Page, drawn, write_page
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
-from koopmpc.predict.bilinear import BilinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
 from koopmpc.synthesis.select import Progress, select
 from koopmpc.synthesis.selection import Selection

@@ -17,8 +17,7 @@ from koopmpc.identify.moments.read import How, second_moments
 from koopmpc.identify.solve import Rows, scaled_rank, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import FitReport
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.reconstruction import relative
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 ORACLE = "nonlinear MPC"
 _LOST = 1e3  # a cost so many times the best: the loop diverged

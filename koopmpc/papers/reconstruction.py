@@ -15,7 +15,7 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.papers.plants import trajectories
 from koopmpc.plants.dynamics import Dynamics
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
 from koopmpc.values import Value
 

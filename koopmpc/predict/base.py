@@ -1,24 +1,22 @@
-"""What all lifted predictors share: x ≈ C z, z₀ = ψ(x₀), names, an embedding, and files."""
+"""What all lifted predictors share: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, and the report of their fit."""
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TypeVar, cast
 
-import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.files.npz import read_arrays
-from koopmpc.errors import DataError, LogError, ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.plants.step_map import StepMap
-from koopmpc.values import Arrays, Value, from_data, to_data
+from koopmpc.predict.files import save_value
+from koopmpc.values import Value
+
+_DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,60 +61,29 @@ class FitReport(Value):
     changes: tuple[str, ...] = ()
 
 
-V = TypeVar("V", bound=Value)
-_FORMAT = "koopmpc-1"
-
-
-def save_value(value: Value, path: str | Path) -> None:
-    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled.
-
-    Raises
-    ------
-    LogError
-        The path cannot be written.
-    """
-    arrays: Arrays = {}
-    tree = {"format": _FORMAT, "value": to_data(value, arrays)}
-    text = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
-    with checks.writing(path) as file:
-        np.savez_compressed(file, allow_pickle=False, tree=text, **arrays)
-
-
-def load_value(path: str | Path, *kinds: type[V]) -> V:
-    """Read a Value of one of these kinds that `save_value` wrote.
-
-    Raises
-    ------
-    LogError
-        The file is missing, a folder, damaged, or holds something else.
-    """
-    wanted = " or ".join(kind.__name__ for kind in kinds)
-    advice = f"pass the .npz of a saved {wanted}"
-    source = checks.existing(path, advice)
-    try:
-        arrays = read_arrays(source, ("tree",))
-        tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise LogError(f"{path} is damaged: the text in it cannot be read; {advice}") from error
-    except (OSError, ValueError) as error:
-        raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}; {advice}") from error
-    node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
-    if node.get("format") != _FORMAT:
-        raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")
-    try:
-        value = from_data(node.get("value"), arrays)
-    except LogError as error:
-        raise LogError(f"{path}: {error}") from error
-    except Exception as error:  # a class met something that it was never meant to hold
-        raise LogError(f"{path} is damaged, or was made by hand: {error}") from error
-    if not isinstance(value, kinds):
-        raise LogError(f"{path} holds a {type(value).__name__}, not a {wanted}")
-    return value
-
-
 @dataclass(frozen=True, eq=False, init=False)
 class Predictor(Value):
-    """z = ψ(x), or z = ψ(ζ) where an embedding makes ζ of x and its past; x ≈ C z, and A and B move z."""
+    """A model on lifted coordinates: z = ψ(x), x ≈ C z, and A z is the motion without input.
+
+    Attributes
+    ----------
+    A
+        (nz, nz), one step of `dt`.
+    B
+        (nz, nu); (nz, 0) for an autonomous system.
+    C
+        (nx, nz), back to the state.
+    lifting
+        ψ, bound to `states`, or to the names of ζ under an embedding.
+    dt
+        Sampling time [s].
+    states, inputs
+        Names with units.
+    report
+        How it was fitted; None for a model that was not.
+    embedding
+        Makes ζ of x and its past; then z₀ = ψ(ζ₀).
+    """
 
     A: Float[np.ndarray, "nz nz"]
     B: Float[np.ndarray, "nz nu"]
@@ -127,43 +94,6 @@ class Predictor(Value):
     inputs: tuple[str, ...]
     report: FitReport | None
     embedding: Delay | None
-
-    def __init__(
-        self,
-        A: ArrayLike,
-        B: ArrayLike,
-        C: ArrayLike,
-        lifting: Lifting,
-        dt: float,
-        states: Sequence[str],
-        inputs: Sequence[str],
-        report: FitReport | None = None,
-        embedding: Delay | None = None,
-    ) -> None:
-        embedded = None if embedding is None else embedding.bind(states, inputs)
-        bound = lifting.bind(tuple(states) if embedded is None else embedded.names)
-        nz, nx, nu = bound.nz, len(states), len(inputs)
-        transition = checks.array(A, "A")
-        if transition.shape != (nz, nz):
-            raise ShapeError(
-                f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
-                "pass the lifting used in the fit"
-            )
-        self._set(
-            A=transition,
-            B=checks.array(B, "B", (nz, nu)),
-            C=checks.array(C, "C", (nx, nz)),
-            lifting=bound,
-            dt=checks.positive(dt, "dt", "s"),
-            states=tuple(states),
-            inputs=tuple(inputs),
-            report=report,
-            embedding=embedded,
-        )
-
-    def _set(self, **values: object) -> None:
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
 
     @property
     def nx(self) -> int:
@@ -212,7 +142,7 @@ class Predictor(Value):
         return episodes if self.embedding is None else self.embedding(episodes)
 
     def save(self, path: str | Path) -> None:
-        """Write the predictor as data (.npz: arrays and one JSON text); its load function reads it."""
+        """Write the predictor as data (.npz: arrays and one JSON text); `load_model` reads it."""
         save_value(self, path)
 
     def start(self, x0: ArrayLike, history: Episode | None = None) -> Float[np.ndarray, " npoint"]:
@@ -220,11 +150,46 @@ class Predictor(Value):
         point = self._point(checks.array(x0, "x0"), history)
         return checks.array(point, "x0", (len(self.point_names),))
 
-    def as_step_map(self, x: ca.SX, u: ca.SX, x_next: ca.SX) -> StepMap:
-        """Return x⁺, on symbols of the point x and of u, as a StepMap of the point."""
-        moved = x_next if self.embedding is None else self.embedding.symbolic(x, u, x_next)
-        F = ca.Function("F", [x, u], [ca.densify(moved)], ["x", "u"], ["x_next"], {"cse": True})
-        return StepMap(F, self.dt, states=self.point_names, inputs=self.inputs)
+    @cached_property
+    def eigenvalues(self) -> Complex[np.ndarray, " nz"]:
+        """Eigenvalues of A, the motion without input, the largest magnitude first."""
+        return self._eigen[0]
+
+    @property
+    def eigenvectors(self) -> Complex[np.ndarray, "nz nz"]:
+        """Right eigenvectors v_j of A, one a column, of length 1, in the order of `eigenvalues`."""
+        return self._eigen[1]
+
+    @cached_property
+    def left_eigenvectors(self) -> Complex[np.ndarray, "nz nz"]:
+        """Left eigenvectors ξ_jᴴ of A, one a row: ξ_jᴴ A = λ_j ξ_jᴴ, scaled so that ξ_jᴴ v_j = 1.
+
+        Raises
+        ------
+        DataError
+            A is defective: its eigenvectors do not span the lifted space.
+        """
+        if np.linalg.cond(self.eigenvectors) > _DEFECTIVE:
+            raise DataError(
+                "A is defective: its eigenvectors do not span the lifted space, so it has no complete set of "
+                "eigenfunctions; perturb A or lift to other observables"
+            )
+        return np.linalg.inv(self.eigenvectors)
+
+    def eigenfunctions(self, X: ArrayLike) -> Complex[np.ndarray, "M nz"]:
+        """Return φ_j(x) = ξ_jᴴ ψ(x) at rows of states (M, nx), or of ζ: φ_j(x⁺) = λ_j φ_j(x) without input.
+
+        Raises
+        ------
+        DataError
+            A is defective.
+        """
+        Z = self.lifting(checks.array(X, "X", (None, len(self.point_names))))
+        return Z @ self.left_eigenvectors.T
+
+    @cached_property
+    def _eigen(self) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
+        return eigen(self.A)
 
     def _point(self, x: Float[np.ndarray, "..."], history: Episode | None) -> Float[np.ndarray, "..."]:
         if self.embedding is None:
@@ -241,3 +206,13 @@ class Predictor(Value):
                 "or predictor.held(x) for a plant at rest there"
             )
         return x
+
+
+def eigen(
+    A: Float[np.ndarray, "nz nz"],
+) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
+    """Return eigenvalues of A, the largest magnitude first, and its right eigenvectors, one a column."""
+    result = np.linalg.eig(A)
+    values, vectors = np.asarray(result.eigenvalues, complex), np.asarray(result.eigenvectors, complex)
+    order = np.lexsort((np.imag(values), -np.abs(values)))
+    return values[order], vectors[:, order]

@@ -16,8 +16,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _ROUNDING = float(np.finfo(float).eps)
 _ROWS = 4096  # states whose eigenfunctions are held at once

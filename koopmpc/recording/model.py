@@ -14,7 +14,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.figures.plane import Axes, Plane, plane_through
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.views.blueprint import PALETTE
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view

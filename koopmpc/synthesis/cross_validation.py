@@ -14,8 +14,7 @@ from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
 from koopmpc.identify.regression import regression
 from koopmpc.identify.solve import Rows, path
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.validate.scoring import Predictor, forecast_errors
 from koopmpc.values import Value

@@ -15,7 +15,7 @@ from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import map_tasks
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.candidates import Candidate, expanded, jumps, usual
 from koopmpc.synthesis.cross_validation import Trial, ridges_of, tried
 from koopmpc.synthesis.folds import folded, sampled, usual_horizon

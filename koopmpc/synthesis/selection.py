@@ -7,7 +7,7 @@ import numpy as np
 
 from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.cross_validation import EXACT, Tried
 from koopmpc.validate.scoring import Predictor
 from koopmpc.values import Value

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.bands import ConformalBand
 from koopmpc.validate.scoring import Predictor, Score
 from koopmpc.values import Value

@@ -12,8 +12,7 @@ from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
 from koopmpc.lifting.state import State
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.bands import conformal
 from koopmpc.validate.excitation import feedback_share, persistency
 from koopmpc.validate.regions import Coverage, coverage

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments, both_sides
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import eigen
+from koopmpc.predict.base import eigen
+from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.validate.scoring import Predictor
 from koopmpc.values import Value
 

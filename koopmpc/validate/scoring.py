@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.predict.spectrum import same_names
 from koopmpc.values import Value
 

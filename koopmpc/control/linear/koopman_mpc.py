@@ -23,7 +23,7 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.measured import Measured
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 _VIEWS = ("_met", "_met_low", "_met_high")
 

@@ -12,7 +12,7 @@ from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.estimate.observer import Estimator
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class LinearMPC(KoopmanMPC):

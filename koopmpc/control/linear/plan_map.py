@@ -15,7 +15,7 @@ from koopmpc.control.tracking import Tracking, tracking
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class PlanMap:

@@ -15,8 +15,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plants.buffered import Buffered
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 Source = BilinearPredictor | LinearPredictor | StepMap
 _KEPT = ("lifting", "embedding", "dt", "states", "inputs", "disturbances")

@@ -19,7 +19,7 @@ from koopmpc.identify.regression import Found, regression, report, warned
 from koopmpc.identify.solve import Ridge, Rows, ridge_of, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
-from koopmpc.predict.bilinear import BilinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor
 
 
 def bilinear_edmd(

@@ -18,7 +18,7 @@ from koopmpc.identify.rank import doubts
 from koopmpc.identify.regression import assembled, growth, read, warned
 from koopmpc.identify.solve import Ridge, Rows, norms, ridge_of, solve
 from koopmpc.lifting.base import Lifting
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 def optimum(

@@ -17,7 +17,7 @@ from koopmpc.identify.rank import Rank
 from koopmpc.identify.regression import Regression, warned
 from koopmpc.identify.solve import Rows
 from koopmpc.lifting.state import State
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 def dmd(

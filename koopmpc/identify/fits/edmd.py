@@ -16,7 +16,8 @@ from koopmpc.identify.solve import Ridge, Rows, cutoff, ridge_of, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.lifting.state import Constant
-from koopmpc.predict.linear import LinearPredictor, eigen
+from koopmpc.predict.base import eigen
+from koopmpc.predict.predictors import LinearPredictor
 
 Method = Literal["ls", "tls", "fb"]
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}

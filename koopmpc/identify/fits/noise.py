@@ -6,7 +6,7 @@ from scipy.linalg import sqrtm
 
 from koopmpc.errors import DataError
 from koopmpc.identify.solve import Rows, Solution, solve
-from koopmpc.predict.linear import eigen
+from koopmpc.predict.base import eigen
 
 
 def denoised(rows: Rows, exact: Int[np.ndarray, " e"], nz: int, directions: int, *, scaled: bool) -> Rows:

@@ -17,7 +17,7 @@ from koopmpc.identify.regression import assembled, regression
 from koopmpc.identify.solve import Ridge, ridge_of, solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.buffered import buffered
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 _BLOCK = 32  # rows that the factor takes in at once
 

@@ -12,7 +12,7 @@ from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import Constant, State
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 try:
     from sklearn.base import BaseEstimator, RegressorMixin

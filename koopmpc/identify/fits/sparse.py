@@ -20,7 +20,7 @@ from koopmpc.identify.solve import Rows, norms, onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Picked
 from koopmpc.lifting.state import Constant
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 _STEPS = 20_000
 

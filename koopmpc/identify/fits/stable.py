@@ -19,7 +19,7 @@ from koopmpc.identify.regression import Regression, assembled, growth, read, rel
 from koopmpc.identify.solve import Ridge, Rows, norms, onto, ridge_of, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import Constant
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 _LEAST = 1e-3  # of the mean eigenvalue of P
 

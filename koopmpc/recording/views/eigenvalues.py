@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from koopmpc.figures.plane import Plane, eigenfunctions_on
-from koopmpc.predict.bilinear import BilinearPredictor
-from koopmpc.predict.linear import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.views.scenes import BACKGROUND
 from koopmpc.validate.residuals import ResidualDMD

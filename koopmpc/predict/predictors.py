@@ -1,0 +1,285 @@
+"""The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z; x ≈ C z, z₀ = ψ(x₀)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Complex, Float
+from numpy.typing import ArrayLike
+from scipy.linalg.blas import dgemv
+
+from koopmpc import checks
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episode
+from koopmpc.errors import ShapeError
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.state import Constant, State
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.base import FitReport, Predictor
+from koopmpc.predict.files import load_value
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class LinearPredictor(Predictor):
+    """A lifted linear predictor z⁺ = A z + B u + E w, x ≈ C z, z₀ = ψ(x₀), w disturbances that are measured.
+
+    Attributes
+    ----------
+    A, B, C, lifting, dt, states, inputs, report, embedding
+        Those of every `Predictor`: A is (nz, nz), B (nz, nu), C (nx, nz), names have units, dt is in seconds.
+    exact_modes
+        (nl, nz) exact DMD modes X′ V Σ⁻¹ W in the observables of the unreduced lifting, one a column, where a
+        rank-truncated fit computed them; its `lifting` is then a Projected one.
+    E
+        (nz, nw); (nz, 0) without measured disturbances.
+    disturbances
+        Names of w with units; ``w0, w1, …`` by default.
+
+    Raises
+    ------
+    ShapeError
+        A, B, C, E, the lifting and the names do not fit together.
+
+    References
+    ----------
+    Korda & Mezić, "Linear predictors for nonlinear dynamical systems: Koopman operator meets model predictive
+    control", Automatica 93, 2018.
+    """
+
+    exact_modes: Complex[np.ndarray, "nl nz"] | None
+    E: Float[np.ndarray, "nz nw"]
+    disturbances: tuple[str, ...]
+
+    def __init__(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike,
+        lifting: Lifting,
+        dt: float,
+        states: Sequence[str],
+        inputs: Sequence[str],
+        report: FitReport | None = None,
+        exact_modes: Complex[np.ndarray, "nl nz"] | None = None,
+        E: ArrayLike | None = None,
+        disturbances: Sequence[str] | None = None,
+        embedding: Delay | None = None,
+    ) -> None:
+        bound, nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding)
+        modes = exact_modes
+        if modes is not None:
+            if not isinstance(bound, Projected) or modes.shape != bound.basis.shape:
+                raise ShapeError(
+                    f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
+                )
+            modes = np.array(modes, dtype=np.complex128, order="C")
+        drift = np.zeros((nz, 0)) if E is None else checks.array(E, "E", (nz, None))
+        nw = drift.shape[1]
+        names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
+        if len(names) != nw:
+            raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
+        for name, value in (("exact_modes", modes), ("E", drift), ("disturbances", names)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def nw(self) -> int:
+        """Number of measured disturbances."""
+        return self.E.shape[1]
+
+    def rollout(
+        self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
+    ) -> Float[np.ndarray, "steps nx"]:
+        """Return x_k ≈ C z_k of z_{k+1} = A z_k + B u_k + E w_k, z_0 = ψ(x0), lifted once at the start.
+
+        Parameters
+        ----------
+        x0
+            (nx,) initial state; with an embedding and no history the point ζ_0.
+        U
+            (T, nu) inputs; (T, 0) for an autonomous predictor.
+        W
+            (T, nw) measured disturbances; zero by default.
+        history
+            The steps that led to x0, its last row x0 itself; only with an embedding.
+        """
+        inputs = checks.array(U, "U", (None, self.nu))
+        start = self.start(x0, history)
+        Z = np.empty((len(inputs) + 1, self.nz))
+        Z[0] = self.lifting(start)
+        Z[1:] = inputs @ self.B.T
+        if W is not None:
+            Z[1:] += checks.array(W, "W", (len(inputs), self.nw)) @ self.E.T
+        transposed, rows = self.A.T, list(Z)
+        for z, z_next in pairwise(rows):  # z_next += A z in place: BLAS has no faster way for one vector
+            dgemv(1.0, transposed, z, 1.0, z_next, 0, 1, 0, 1, 1, 1)
+        X = Z @ self.C.T
+        X[0] = start[: self.nx]
+        return X
+
+    def step_map(self) -> StepMap:
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC; w is 0.
+
+        With an embedding it is a map of ζ: ζ⁺ = [C (A ψ(ζ) + B u), u, ζ without its oldest step].
+        """
+        return _re_lifted(self, ())
+
+    @cached_property
+    def modes(self) -> Complex[np.ndarray, "nx nz"]:
+        """Modes in the state's coordinates, one a column: exact DMD modes, or C times A's eigenvectors."""
+        if self.exact_modes is None or not isinstance(self.lifting, Projected):
+            return self.C @ self.eigenvectors
+        whole = self.lifting.lifting
+        place = {name: i for i, name in enumerate(whole.names)}
+        if set(self.states) <= set(place):
+            return self.exact_modes[[place[name] for name in self.states]]
+        return self.C @ (self.lifting.basis.T @ self.exact_modes)
+
+    @classmethod
+    def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike) -> "LinearPredictor":
+        """Return the linearisation x⁺ = A x + B u + c at (x, u) as a predictor on State() + Constant().
+
+        Exact Jacobians of `step_map`; c = F(x, u) − A x − B u, so (x, u) need not be an equilibrium.
+        """
+        affine = step_map.linearize(x, u)
+        nx, nu = affine.B.shape
+        A = np.eye(nx + 1)
+        A[:nx, :nx], A[:nx, nx] = affine.A, affine.c
+        B = np.vstack([affine.B, np.zeros((1, nu))])
+        C = np.eye(nx, nx + 1)
+        return cls(A, B, C, State() + Constant(), step_map.dt, step_map.states, step_map.inputs)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class BilinearPredictor(Predictor):
+    """A lifted bilinear predictor z⁺ = A z + B u + Σ uᵢ Nᵢ z, x ≈ C z, z₀ = ψ(x₀).
+
+    What an input does may depend on the state, as it does wherever a force turns with the body that it acts on;
+    a linear predictor has one B for all states.
+
+    Attributes
+    ----------
+    A, B, C, lifting, dt, states, inputs, report, embedding
+        Those of every `Predictor`: A is (nz, nz), B (nz, nu), C (nx, nz), names have units, dt is in seconds.
+    N
+        (nu, nz, nz), one matrix for each input.
+
+    Raises
+    ------
+    ShapeError
+        A, B, N, C, the lifting and the names do not fit together.
+
+    References
+    ----------
+    Bruder, Fu & Vasudevan, "Advantages of bilinear Koopman realizations for the modeling and control of systems
+    with unknown dynamics", IEEE Robot. Autom. Lett. 6, 2021.
+    """
+
+    N: Float[np.ndarray, "nu nz nz"]
+
+    def __init__(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        N: ArrayLike,
+        C: ArrayLike,
+        lifting: Lifting,
+        dt: float,
+        states: Sequence[str],
+        inputs: Sequence[str],
+        report: FitReport | None = None,
+        embedding: Delay | None = None,
+    ) -> None:
+        nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding)[1]
+        object.__setattr__(self, "N", checks.array(N, "N", (len(inputs), nz, nz)))
+
+    def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
+        """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
+
+        Parameters
+        ----------
+        x0
+            (nx,) initial state; with an embedding and no history the point ζ_0.
+        U
+            (T, nu) inputs.
+        history
+            The steps that led to x0, its last row x0 itself; only with an embedding.
+        """
+        inputs = checks.array(U, "U", (None, self.nu))
+        start = self.start(x0, history)
+        Z = np.empty((len(inputs) + 1, self.nz))
+        Z[0] = self.lifting(start)
+        for k, u in enumerate(inputs):
+            Z[k + 1] = self.A @ Z[k] + self.B @ u + u @ (self.N @ Z[k])
+        X = Z @ self.C.T
+        X[0] = start[: self.nx]
+        return X
+
+    def step_map(self) -> StepMap:
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap; with an embedding, of ζ."""
+        return _re_lifted(self, self.N)
+
+
+def load_model(path: str | Path) -> LinearPredictor | BilinearPredictor:
+    """Read a predictor that its `save` wrote, of whichever kind; runs no code of the file.
+
+    Raises
+    ------
+    LogError
+        The file is missing, damaged, or no predictor.
+    """
+    return load_value(path, LinearPredictor, BilinearPredictor)
+
+
+def _store(
+    predictor: Predictor,
+    A: ArrayLike,
+    B: ArrayLike,
+    C: ArrayLike,
+    lifting: Lifting,
+    dt: float,
+    states: Sequence[str],
+    inputs: Sequence[str],
+    report: FitReport | None,
+    embedding: Delay | None,
+) -> tuple[Lifting, int]:
+    """Check the fields that all predictors share and store them; return the bound lifting and nz."""
+    embedded = None if embedding is None else embedding.bind(states, inputs)
+    bound = lifting.bind(tuple(states) if embedded is None else embedded.names)
+    nz, nx, nu = bound.nz, len(states), len(inputs)
+    transition = checks.array(A, "A")
+    if transition.shape != (nz, nz):
+        raise ShapeError(
+            f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
+            "pass the lifting used in the fit"
+        )
+    fields = {
+        "A": transition,
+        "B": checks.array(B, "B", (nz, nu)),
+        "C": checks.array(C, "C", (nx, nz)),
+        "lifting": bound,
+        "dt": checks.positive(dt, "dt", "s"),
+        "states": tuple(states),
+        "inputs": tuple(inputs),
+        "report": report,
+        "embedding": embedded,
+    }
+    for name, value in fields.items():
+        object.__setattr__(predictor, name, value)
+    return bound, nz
+
+
+def _re_lifted(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray) -> StepMap:
+    """Return x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap of the point that ψ acts on."""
+    x, u = ca.SX.sym("x", len(predictor.point_names)), ca.SX.sym("u", predictor.nu)
+    C, z = predictor.C, predictor.lifting.symbolic(x)
+    x_next = ca.DM(C @ predictor.A) @ z + ca.DM(C @ predictor.B) @ u
+    for i, Ni in enumerate(N):
+        x_next += u[i] * (ca.DM(C @ Ni) @ z)
+    moved = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)
+    F = ca.Function("F", [x, u], [ca.densify(moved)], ["x", "u"], ["x_next"], {"cse": True})
+    return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs)
