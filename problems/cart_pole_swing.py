@@ -86,10 +86,7 @@ problem = km.Problem(
         of=km.Expressions(lambda x: [x[0], x[1], ca.sin(x[2]), ca.cos(x[2]), x[3]], tracked).bind(CartPole.states),
     ),
     limits=km.Limits(
-        u_min=-12.0,
-        u_max=12.0,
-        x_min=[-2.4, -np.inf, -np.inf, -np.inf],
-        x_max=[2.4, np.inf, np.inf, np.inf],
+        u_min=-12.0, u_max=12.0, x_min=[-2.4, -np.inf, -np.inf, -np.inf], x_max=[2.4, np.inf, np.inf, np.inf]
     ),
     horizon=40,
     cases={

@@ -65,10 +65,7 @@ problem = km.Problem(
     dt=0.05,
     equilibrium=([0.0, 0.0], [0.0]),
     training=km.Training(
-        x0=km.Uniform([-np.pi, -6.0], [np.pi, 6.0]),
-        excitation=km.Noise(-10.0, 10.0),
-        episodes=2000,
-        steps=10,
+        x0=km.Uniform([-np.pi, -6.0], [np.pi, 6.0]), excitation=km.Noise(-10.0, 10.0), episodes=2000, steps=10
     ),
     lifting=km.State() + km.Fourier(2, states="theta") + km.Expressions(products, [*names, "omega^2"]) + km.Constant(),
     cost=km.Cost(

@@ -43,8 +43,8 @@ class Page:
         self.parts.extend(" ".join(paragraph.split()) for paragraph in paragraphs)
 
     def items(self, lines: Iterable[str]) -> None:
-        """Add a list with one item for each line."""
-        self.parts.append("\n".join(f"- {line}" for line in lines))
+        """Add a list with one item for each line; line breaks inside one become blanks."""
+        self.parts.append("\n".join(f"- {' '.join(line.split())}" for line in lines))
 
     def code(self, text: str, language: str = "text") -> None:
         """Add a block that is shown as it stands."""

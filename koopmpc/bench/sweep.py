@@ -78,11 +78,7 @@ def sweep(
     folder.mkdir(parents=True, exist_ok=True)
     if live and find_viewer() is None:
         live = False
-        warnings.warn(
-            f"{why_none()}; the runs are recorded all the same",
-            UserWarning,
-            stacklevel=2,
-        )
+        warnings.warn(f"{why_none()}; the runs are recorded all the same", UserWarning, stacklevel=2)
     tasks = [
         (problem, _Task(case, name, fault))
         for problem in problems
@@ -177,12 +173,7 @@ def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]
 
     if not live:
         return closed_loop(), drawn
-    names: dict[str, Any] = {
-        "dt": plant.dt,
-        "states": plant.states,
-        "inputs": plant.inputs,
-        "outputs": plant.outputs,
-    }
+    names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
     with Recorder(live=True, **names, **about, **drawn) as viewer:
         return closed_loop(viewer), drawn
 

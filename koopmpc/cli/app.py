@@ -20,20 +20,14 @@ from koopmpc.errors import FitWarning, KoopmpcError, LogError
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
 
-app = typer.Typer(
-    name="koopmpc",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(name="koopmpc", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
 Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
 Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
 Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
 Controllers = Annotated[
-    list[str] | None,
-    typer.Option("--controller", "-c", help="One of the seven; may be repeated. Default: all."),
+    list[str] | None, typer.Option("--controller", "-c", help="One of the seven; may be repeated. Default: all.")
 ]
 
 
@@ -181,10 +175,7 @@ def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrot
 
 
 @app.command()
-def reproduce(
-    paper: Annotated[str, typer.Argument(help="The paper: snyder.")],
-    logs: Logs = Path("logs"),
-) -> None:
+def reproduce(paper: Annotated[str, typer.Argument(help="The paper: snyder.")], logs: Logs = Path("logs")) -> None:
     """Do a paper again: its figures, its numbers, and a verdict on each of its claims."""
     from time import perf_counter
 
@@ -204,12 +195,7 @@ def reproduce(
 
 
 def _sweep(
-    problems: Sequence["Problem"],
-    controllers: list[str] | None,
-    faults: bool,
-    live: bool,
-    logs: Path,
-    what: str,
+    problems: Sequence["Problem"], controllers: list[str] | None, faults: bool, live: bool, logs: Path, what: str
 ) -> None:
     """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
     from koopmpc.bench.controllers import chosen
@@ -220,14 +206,7 @@ def _sweep(
     chosen(controllers)
     folder = _new_folder(logs, what)
     with _bar("") as progress:
-        rows = sweep(
-            problems,
-            controllers,
-            folder=folder,
-            faults=faults,
-            live=live,
-            progress=progress,
-        )
+        rows = sweep(problems, controllers, folder=folder, faults=faults, live=live, progress=progress)
     out = _console()
     out.print(table(rows))
     out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)

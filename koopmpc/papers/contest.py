@@ -1,4 +1,4 @@
-"""Controllers of one plant under one cost: what a lifted model is worth beside a linearisation, and beside the best."""
+"""Controllers of one plant under one cost: what a lifted model is worth beside a linearisation and nonlinear MPC."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
 
 ORACLE = "nonlinear MPC"
-_LOST = 1e3  # a cost so many times the best: the loop diverged
+_LOST = 1e3  # a loop whose cost is so many times the best has diverged
 
 
 @dataclass(frozen=True, eq=False)
 class Contest:
-    """One start, one reference, one cost, with and without input limits.
+    """Controllers that start from one state, track one reference and share one cost, with and without input limits.
 
     Attributes
     ----------
@@ -37,15 +37,17 @@ class Contest:
     plant
         x⁺ = F(x, u).
     x_eq
-        (nx,) where the linearisation is taken, u = 0.
+        (nx,), the equilibrium at u = 0 where the plant is linearised.
     models
         Lifted or identified models by name.
     cost, limits
-        The same for all; each controller runs once without the limits, and once within them.
+        The same for all controllers; each runs once without the limits and once within them.
     x0, reference
         (nx,) each.
-    steps, horizon
-        Of the run, and of the model predictive controllers.
+    steps
+        Length of each run.
+    horizon
+        Horizon of the model predictive controllers, in steps.
     """
 
     title: str
@@ -60,7 +62,7 @@ class Contest:
     horizon: int
 
     def runs(self) -> "dict[tuple[str, bool], Run]":
-        """Return the run of each controller, by its name and whether the inputs are limited."""
+        """Return the run of each controller by its name and by whether the inputs are limited."""
         return {
             (name, limited): simulate(
                 self.plant,
@@ -77,7 +79,7 @@ class Contest:
         }
 
     def _controllers(self, limited: bool) -> dict[str, Controller]:
-        """Return LQR by model, with limits the predictive ones too, and the oracle."""
+        """Return LQR on each model, MPC on each model where inputs are limited, and nonlinear MPC on the plant."""
         limits = self.limits if limited else Limits()
         local = LinearPredictor.local(self.plant, self.x_eq, np.zeros(self.plant.nu))
         models = {"linearisation": local, **self.models}
@@ -99,20 +101,20 @@ def costs(runs: "Mapping[tuple[str, bool], Run]", limited: bool) -> dict[str, fl
 
 @dataclass(frozen=True)
 class Prediction:
-    """One model on two kinds of data that it was not fitted to: medians of ‖x̂ − x‖ / ‖x‖ over the episodes.
+    """Errors of one model on two kinds of held-out data: medians of ‖x̂ − x‖ / ‖x‖ over the episodes.
 
     Attributes
     ----------
     name
         The model and its data.
     feedback
-        Under the feedback of the paper, from other starts.
+        Error under the feedback of the paper, from other starts.
     excited
-        Under that feedback and noise on top, as a control model would meet.
+        Error under that feedback with noise on top.
     b
-        Entry of B that the input acts through most, over its true value; NaN for a model without B.
+        The entry of B whose true value is largest, divided by that value; NaN for a model without B.
     warned
-        What the fit said of itself, in short.
+        The warning of the fit, in short.
     """
 
     name: str
@@ -130,18 +132,14 @@ def centred(episodes: Episodes, x_ref: ArrayLike) -> Episodes:
 
 
 def prediction(
-    name: str,
-    model: LinearPredictor,
-    feedback: Episodes,
-    excited: Episodes,
-    B: Float[np.ndarray, "nx nu"],
+    name: str, model: LinearPredictor, feedback: Episodes, excited: Episodes, B: Float[np.ndarray, "nx nu"]
 ) -> Prediction:
-    """Return the errors of `model` over whole episodes; one without inputs is not told them.
+    """Return the errors of `model` over whole episodes; a model without inputs predicts without them.
 
     Parameters
     ----------
     name, model
-        What is judged.
+        The model and how the table calls it.
     feedback, excited
         Held-out episodes with inputs.
     B

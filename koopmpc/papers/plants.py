@@ -19,7 +19,7 @@ from koopmpc.plants.dynamics import Dynamics, right_side
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import StepMap
 
-SUBSTEPS = 8  # of a sample of 0.01 s: the error of RK4 is then below 1e-12
+SUBSTEPS = 8  # of RK4 in a sample of 0.01 s, for an error below 1e-12
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def gain(dynamics: Dynamics, x: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
 
 
 def printed_gain(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> Gain:
-    """Return the LQR of the matrix as the databook prints it: the sign of ∂v̇/∂θ at θ = π is wrong. Legacy."""
+    """Return the LQR of the Jacobian as the databook prints it, with the wrong sign of ∂v̇/∂θ at θ = π."""
     A, B = jacobians(plant, [0.0, 0.0, np.pi, 0.0])
     A[1, 2] = -A[1, 2]
     return lqr(A, B, Q, R)
@@ -116,9 +116,9 @@ def trajectories(
     K
         (nu, nx), or (nx,) where nu is 1; no input by default.
     x_ref
-        Scalar or (nx,), where the feedback leads.
+        Scalar or (nx,), the target of the feedback.
     held
-        Hold u = −K (x_k − x_ref) for a sample; by default the feedback is continuous, inside of the integration.
+        Whether u = −K (x_k − x_ref) is held over a sample; by default the feedback is continuous.
     """
     nx, nu = dynamics.nx, dynamics.nu
     rows = np.atleast_2d(checks.array(starts, "starts"))

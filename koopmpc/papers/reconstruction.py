@@ -1,4 +1,4 @@
-"""One line of a table of reconstructions: fit a trajectory, rebuild it from its first state, and look elsewhere."""
+"""A reconstruction: fit one trajectory, rebuild it from its first state, and predict held-out trajectories."""
 
 import warnings
 from collections.abc import Generator, Mapping, Sequence
@@ -19,15 +19,15 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
 from koopmpc.values import Value
 
-CUT = 1e-10  # singular values below this share of the largest are left out: "full rank" of a table
-LINEAR = 0.05  # an eigenfunction that is off by less than this over a whole run is one
+CUT = 1e-10  # "full rank" keeps the singular values above this share of the largest
+LINEAR = 0.05  # relative error over a whole run below which an eigenfunction counts as one
 _HUGE = 100.0  # a relative error beyond it has no digits worth reading
-_STEADY = 1e-4  # |λ − 1| below it: a constant, which every lifting has and which says nothing
+_STEADY = 1e-4  # an eigenfunction with |λ − 1| below it is a constant
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction(Value):
-    """How well z⁺ = A z on z = ψ(x) tells a trajectory from its first state, x(t) = Re Φ exp(Ωt) b.
+    """How well z⁺ = A z with z = ψ(x) rebuilds a trajectory from its first state, x(t) = Re Φ exp(Ωt) b.
 
     Attributes
     ----------
@@ -38,18 +38,18 @@ class Reconstruction(Value):
     truth
         (T+1, nx), the trajectory that it was fitted to.
     rank, width
-        Singular values kept, and observables in ψ.
+        Number of singular values kept, and of observables in ψ.
     condition
-        σ₁ / σ_rank of the unscaled snapshots ψ(x_k): of what is kept.
+        σ₁ / σ_rank of the unscaled snapshots ψ(x_k).
     error
         ‖X − truth‖ / ‖truth‖ in the Frobenius norm.
     held_out
-        The median of the same over trajectories that were not fitted.
+        Median of the same error over held-out trajectories.
     evolution
         (rank,) ‖φ(x_k) − λᵏ φ(x₀)‖ / ‖φ‖ of each eigenfunction, on the fitted trajectory.
     leading
-        The eigenfunction with the largest share |b_j| ‖Φ_j‖ of the first state, of a pair that with Im λ > 0;
-        constants are left out.
+        Index of the eigenfunction with the largest share |b_j| ‖Φ_j‖ of the first state. Of a complex pair it is the
+        one with Im λ > 0; constants are left out.
     """
 
     model: LinearPredictor
@@ -65,7 +65,7 @@ class Reconstruction(Value):
 
     @property
     def linear(self) -> int:
-        """How many eigenfunctions are within `LINEAR`."""
+        """Number of eigenfunctions whose error is below `LINEAR`."""
         return int(np.sum(self.evolution < LINEAR))
 
 
@@ -81,7 +81,7 @@ def rebuilt(trajectory: Episodes, lifting: Lifting, held_out: Episodes, rank: in
     held_out
         Trajectories of the same system from other starts.
     rank
-        Keep so many singular values; by default all above `CUT` times the largest.
+        Number of singular values to keep; by default all above `CUT` times the largest.
     """
     (episode,) = trajectory
     bound = lifting.bind(trajectory.states)
@@ -131,34 +131,34 @@ def percent(error: float) -> str:
 
 @contextmanager
 def unwarned() -> Generator[None]:
-    """Show no FitWarning: rank, condition and what a report says are in the tables."""
+    """Show no FitWarning, because the tables hold the rank, the condition and the warnings of each fit."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)
         yield
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """One trajectory of one plant.
+class Setting:
+    """One trajectory of one plant, and others of it that are held out.
 
     Attributes
     ----------
     title
-        Plant and data, in words.
+        Plant and data in words.
     dynamics
         ẋ = f(x, u).
     x0
-        Where the trajectory starts.
+        Start of the trajectory.
     spread
         Held-out trajectories start uniformly in x0 ± spread.
     K, x_ref
-        u = −K (x − x_ref), continuous; none by default.
+        The feedback u = −K (x − x_ref); none by default.
     held
-        Hold u over a sample.
+        Whether u is held over a sample; by default the feedback is continuous.
     dt, steps
-        Sample time [s] and length.
+        Sample time [s] and length of a trajectory.
     others
-        How many held-out trajectories.
+        Number of held-out trajectories.
     """
 
     title: str
@@ -174,19 +174,19 @@ class Scene:
 
     @cached_property
     def trajectory(self) -> Episodes:
-        """The one that is fitted."""
+        """The trajectory that is fitted."""
         return self._run(np.asarray([self.x0]))
 
     @cached_property
     def held_out(self) -> Episodes:
-        """Those that are not; the same starts each time."""
+        """The held-out trajectories, from the same starts each time."""
         away = np.random.default_rng(0).uniform(-1.0, 1.0, (self.others, len(self.x0)))
         return self._run(np.asarray(self.x0) + away * np.asarray(self.spread))
 
     def rebuilt(self, liftings: Mapping[str, Lifting], rank: int) -> dict[tuple[str, bool], Reconstruction]:
-        """Return each lifting's reconstruction, by its name and whether all singular values were kept.
+        """Return the reconstructions of each lifting by its name and by whether all singular values were kept.
 
-        A lifting of `rank` observables has one of them alone: nothing is left out of it.
+        A lifting with no more than `rank` observables is fitted at full rank alone.
         """
         found: dict[tuple[str, bool], Reconstruction] = {}
         for name, lifting in liftings.items():

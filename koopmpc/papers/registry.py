@@ -1,6 +1,7 @@
-"""The papers that are done again, by name: each a folder of its name here, whose paper.py defines `paper`.
+"""The papers that can be reproduced, and how their claims are judged.
 
-docs/<name>.md is the report.md of such a run, and docs/<name>/ its pictures: copy both after a change.
+A paper is a folder here whose paper.py defines `paper`. docs/<name>.md is the report.md of its reproduction, and
+docs/<name>/ holds the pictures: copy both after a change.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ from koopmpc.errors import ProblemError
 
 
 class Verdict(Enum):
-    """What measurements say of a claim."""
+    """How a claim fares against our measurements."""
 
     HOLDS = "holds"
     IN_PART = "holds in part"
@@ -26,7 +27,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim: where it stands, in our words; the verdict, and why."""
+    """One claim of a paper in our words: where it stands, the verdict, and the reason for it."""
 
     where: str
     says: str
@@ -35,13 +36,13 @@ class Claim:
 
 
 def judged(where: str, says: str, *, holds: bool, why: str, in_part: bool = False) -> Claim:
-    """Return the claim with its verdict: holds, else in part, else not."""
+    """Return the claim with its verdict: it holds, else it holds in part, else it does not hold."""
     verdict = Verdict.HOLDS if holds else Verdict.IN_PART if in_part else Verdict.FAILS
     return Claim(where, says, verdict, why)
 
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
-    """Return one line a claim."""
+    """Return a table with one line for each claim."""
     lines = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading in ("where", "claim", "verdict", "why"):
         lines.add_column(heading)
@@ -51,12 +52,11 @@ def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
 
 
 PAPERS = ("snyder",)
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a paper: each claim with its verdict, and the files that say it all."""
+    """The result of a reproduction: each claim with its verdict, and the paths of the report and of the recording."""
 
     claims: tuple[Claim, ...]
     report: Path
@@ -65,24 +65,24 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper: its name and title, and the function that does it again.
+    """A paper: its name and title, and the function that reproduces it.
 
     `reproduce(folder, quick, progress)` writes report.md, the figures in the folder of the paper's name and one .rrd.
-    `quick` keeps every part but shortens what takes long: for tests.
+    `quick` keeps every part but shortens what takes long; the tests use it. `progress` is called with what runs now.
     """
 
     name: str
     title: str
-    reproduce: Callable[[Path, bool, Progress], Outcome]
+    reproduce: Callable[[Path, bool, Callable[[str], None]], Outcome]
 
 
 def find_paper(name: str) -> Paper:
-    """Return the paper of this name.
+    """Return the paper with this name.
 
     Raises
     ------
     ProblemError
-        There is none; the message names the nearest.
+        There is no such paper; the message names the nearest.
     """
     if name not in PAPERS:
         raise ProblemError(f"there is no paper {name!r}{nearest(name, PAPERS)}; there are {', '.join(PAPERS)}")

@@ -13,8 +13,8 @@ from koopmpc.papers import registry
 from koopmpc.papers.contest import ORACLE, costs
 from koopmpc.papers.reconstruction import percent
 from koopmpc.papers.registry import Claim, Outcome, Paper, Verdict, find_paper, judged
-from koopmpc.papers.snyder.control import SHAKINGS, contest, predictions
-from koopmpc.papers.snyder.settings import scenes
+from koopmpc.papers.snyder.control import contest, predictions
+from koopmpc.papers.snyder.settings import SHAKINGS, all_settings
 
 
 @pytest.mark.slow
@@ -34,7 +34,7 @@ def test_the_shortened_paper_writes_all_its_files(tmp_path):
 
 
 def test_data_that_excite_find_B_and_feedback_data_do_not():
-    each = predictions(scenes()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
+    each = predictions(all_settings()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
     assert each["DMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["EDMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["DMDc, feedback data"].warned == "A and B inseparable"

@@ -13,16 +13,13 @@ from koopmpc.bench.page import Page
 from koopmpc.papers.contest import ORACLE, Prediction
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict
-from koopmpc.papers.snyder import text as snyder_appendix
-from koopmpc.papers.snyder import text as snyder_text
-from koopmpc.papers.snyder.beyond import origin
+from koopmpc.papers.snyder import report, theory
 from koopmpc.papers.snyder.claims import of_figures, of_text
-from koopmpc.papers.snyder.equations import equations, sides
 from koopmpc.papers.snyder.paper import held_change, rebuilt
-from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, gains, scenes
+from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains
 
 PAGE = Path(__file__).parents[2] / "docs" / "snyder.md"
-# Relative reconstruction errors in %, computed independently: (scene, observables, full rank).
+# Relative reconstruction errors in %, computed independently: (setting, observables, full rank).
 KNOWN = {
     ("pendulum", "DMD", True): 1.11,
     ("pendulum", "EDMD monomials 2", True): 1.14,
@@ -54,20 +51,20 @@ def spread(percent):
 
 
 @pytest.fixture(scope="module")
-def stage():
-    found = scenes()
+def settings():
+    found = all_settings()
     return {name: found[name] for name in ("pendulum", "pendulum-lqr", "upright", "cart-pole", "cart-pole-lqr")}
 
 
 @pytest.fixture(scope="module")
-def fits(stage):
-    return {name: rebuilt(scene) for name, scene in stage.items()}
+def fits(settings):
+    return {name: rebuilt(setting) for name, setting in settings.items()}
 
 
 @pytest.mark.parametrize("key", KNOWN)
 def test_errors_of_reconstruction(fits, key):
-    scene, method, full = key
-    got, known = 100 * fits[scene][method, full].error, KNOWN[key]
+    setting, method, full = key
+    got, known = 100 * fits[setting][method, full].error, KNOWN[key]
     assert known / spread(known) < got < known * spread(known)
 
 
@@ -91,8 +88,8 @@ def test_gains_to_the_digits():
         np.testing.assert_allclose(got[name], known, rtol=0, atol=0.51 * 10.0**-digits)
 
 
-def test_the_shift_stays_upright(stage):
-    X = stage["cart-pole-lqr"].trajectory[0].X
+def test_the_shift_stays_upright(settings):
+    X = settings["cart-pole-lqr"].trajectory[0].X
     assert np.abs(X[:, 2] - np.pi).max() == pytest.approx(0.032, abs=6e-4)
     u = -(X - [1.0, 0.0, np.pi, 0.0]) @ gains()["cart-pole"].ravel()
     assert np.abs(u).max() == pytest.approx(4.47, abs=6e-3)
@@ -117,8 +114,8 @@ def test_eigenvalues_are_those_of_the_amplitude_and_not_of_small_angles(fits):
 
 def test_leading_eigenfunctions_evolve_by_powers_of_their_eigenvalue(fits):
     led = {
-        (scene, method): fit.evolution[fit.leading]
-        for scene, each in fits.items()
+        (setting, method): fit.evolution[fit.leading]
+        for setting, each in fits.items()
         for (method, full), fit in each.items()
         if full
     }
@@ -128,36 +125,36 @@ def test_leading_eigenfunctions_evolve_by_powers_of_their_eigenvalue(fits):
     assert led["cart-pole", "DMD"] > 0.5
 
 
-def test_the_origin_and_truncation_explain_the_cart_pole(stage):
-    causes = origin(stage["cart-pole-lqr"])
+def test_the_origin_and_truncation_explain_the_cart_pole(settings):
+    causes = theory.causes(settings["cart-pole-lqr"])
     assert 2e-5 < causes["DMD on x − x_ref"].error < 5e-5
     assert causes["DMD with a constant"].error < 1e-4 * 4
     assert causes["DMD"].error > 1000 * causes["DMD on x − x_ref"].error
     assert causes["EDMD monomials 2"].error < 1e-6 * causes["EDMD monomials 2, rank 4"].error
 
 
-def test_a_held_input_changes_little(stage, fits):
-    assert 1e-4 < held_change(stage, fits) < 0.02
+def test_a_held_input_changes_little(settings, fits):
+    assert 1e-4 < held_change(settings, fits) < 0.02
 
 
 @pytest.mark.parametrize(("method", "rank"), [("DMD", 2), ("EDMD monomials 3", 10), ("EDMD Fourier 1", 4)])
-def test_each_equation_is_its_function(stage, method, rank):
+def test_each_equation_is_its_function(settings, method, rank):
     lifting = OBSERVABLES[method]
-    trajectory = stage["pendulum"].trajectory
-    checked = equations(trajectory, lifting, rank)
+    trajectory = settings["pendulum"].trajectory
+    checked = theory.equations(trajectory, lifting, rank)
     assert {e.number for e in checked} == {"10–12", "14–17", "18–23", "24–26", "27–31"}
     for equation in checked:
         assert equation.residual < 1e-8, equation
 
 
-def test_eigenfunctions_are_left_eigenvectors(stage):
-    left, right = sides(stage["pendulum"].trajectory, OBSERVABLES["EDMD monomials 3"])
+def test_eigenfunctions_are_left_eigenvectors(settings):
+    left, right = theory.sides(settings["pendulum"].trajectory, OBSERVABLES["EDMD monomials 3"])
     assert left < 0.05 * right
 
 
 def test_verdicts_of_the_figures(fits):
     found = {claim.where: claim.verdict for claim in of_figures(fits)}
-    assert len(found) == sum(len(shown.scenes) for shown in FIGURES)
+    assert len(found) == sum(len(shown.settings) for shown in FIGURES)
     for where, verdict in {
         "pendulum-dmd, pendulum": Verdict.HOLDS,
         "pendulum-monomials-3, pendulum": Verdict.HOLDS,
@@ -169,22 +166,22 @@ def test_verdicts_of_the_figures(fits):
         assert found[where] is verdict
 
 
-def test_the_page_holds_these_numbers_and_verdicts(stage, fits):
+def test_the_page_holds_these_numbers_and_verdicts(settings, fits):
     text = PAGE.read_text(encoding="utf-8")
-    titles = {scene.title: name for name, scene in stage.items()}
+    titles = {setting.title: name for name, setting in settings.items()}
     verdicts = {claim.where: claim.verdict.value for claim in of_figures(fits)}
     seen = 0
     for line in text.split("## The figures, in numbers")[1].split("## The figures\n")[0].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         if len(cells) != 12 or cells[1] not in titles:
             continue
-        figure, scene, method, rank = cells[0], titles[cells[1]], cells[2], int(cells[3].split()[0])
-        fit = next(f for (m, _), f in fits[scene].items() if m == method and f.rank == rank)
+        figure, setting, method, rank = cells[0], titles[cells[1]], cells[2], int(cells[3].split()[0])
+        fit = next(f for (m, _), f in fits[setting].items() if m == method and f.rank == rank)
         for cell, value in ((cells[5], fit.error), (cells[6], fit.held_out)):
             written = float(cell)
             assert written / spread(written) < 100 * value < written * spread(written)
         if cells[10]:
-            assert cells[10] == f"**{verdicts[f'{figure}, {scene}']}**"
+            assert cells[10] == f"**{verdicts[f'{figure}, {setting}']}**"
         seen += 1
     assert seen == 28
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
@@ -238,18 +235,18 @@ def test_verdicts_of_the_text_follow_the_numbers(fits):
     assert verdict("EDMD finds the leading Koopman eigenfunctions") is Verdict.IN_PART
 
 
-def test_the_parts_of_the_report(stage, fits, tmp_path, monkeypatch):
+def test_the_parts_of_the_report(settings, fits, tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(pages, "save", lambda made, path: saved.append(path.stem))
     page = Page(tmp_path, beside="snyder")
     claims = of_figures(fits)
-    snyder_text.settings(page, claims, 0.01, 10)
-    snyder_text.verdicts(page, claims)
-    snyder_text.numbers(page, stage, fits, claims)
-    snyder_text.gains_table(page)
-    snyder_text.frequencies(page, fits)
-    snyder_text.theory(page, stage["pendulum"], fits)
-    snyder_appendix.appendix_dmdc(page, stage["pendulum"], stage["pendulum-lqr"])
+    report.opening(page, claims, 0.01, 10)
+    report.verdicts(page, claims)
+    report.numbers(page, settings, fits, claims)
+    report.feedbacks(page)
+    theory.frequencies(page, fits)
+    theory.formulas(page, settings["pendulum"], fits)
+    report.appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
     gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
     assert gains_of_page.strip() in page.markdown
     assert saved == ["pendulum-eigenfunctions", "appendix-pendulum-dmdc"]

@@ -9,7 +9,7 @@ from koopmpc.papers.reconstruction import Reconstruction, percent
 from koopmpc.papers.registry import Claim, judged
 from koopmpc.papers.snyder.settings import FIGURES, Shown
 
-Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by scene, then by method and whether at full rank
+Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by setting, then by method and whether at full rank
 
 SMALL = 0.05  # relative: two curves that a reader takes for one
 SAME = 1.25  # errors within this factor are no change in a picture
@@ -20,12 +20,12 @@ GOOD = 1.1  # a cost below this factor of the best is control
 GENERAL = 0.05  # on trajectories that were not fitted
 
 
-def of_figure(shown: Shown, scene: str, says: str, fits: Fits) -> Claim:
+def of_figure(shown: Shown, setting: str, says: str, fits: Fits) -> Claim:
     """Return the claim of one picture of the paper."""
-    own, base = fits[scene][shown.method, True], fits[scene]["DMD", True]
-    cut = fits[scene].get((shown.method, False), own)
+    own, base = fits[setting][shown.method, True], fits[setting]["DMD", True]
+    cut = fits[setting].get((shown.method, False), own)
     gain, cut_gain = base.error / own.error, base.error / cut.error
-    where = f"{shown.name}, {scene}"
+    where = f"{shown.name}, {setting}"
     errors = f"{percent(own.error)} % against {percent(base.error)} % of DMD"
     if says == "small error":
         return judged(where, says, holds=own.error < SMALL, why=f"{percent(own.error)} %")
@@ -43,7 +43,7 @@ def of_figure(shown: Shown, scene: str, says: str, fits: Fits) -> Claim:
     if says.startswith("better"):
         return judged(where, says, holds=gain > BETTER, in_part=gain > 1, why=errors)
     if says == "no gain on Fourier 1":
-        first = fits[scene]["EDMD Fourier 1", True].error
+        first = fits[setting]["EDMD Fourier 1", True].error
         factor = first / own.error
         why = f"{percent(own.error)} % against {percent(first)} %: better by a factor of {factor:.2g}"
         why += ", at errors that a picture hardly shows" if first < SMALL else ""
@@ -55,9 +55,9 @@ def of_figure(shown: Shown, scene: str, says: str, fits: Fits) -> Claim:
 def of_figures(fits: Fits) -> list[Claim]:
     """Return the claims of all pictures, in the order of `FIGURES`."""
     return [
-        of_figure(shown, scene, says, fits)
+        of_figure(shown, setting, says, fits)
         for shown in FIGURES
-        for scene, says in zip(shown.scenes, shown.says, strict=True)
+        for setting, says in zip(shown.settings, shown.says, strict=True)
     ]
 
 
@@ -67,24 +67,21 @@ def of_text(
     predictions: Mapping[str, Mapping[str, Prediction]],
     ratios: Mapping[str, Mapping[str, float]],
 ) -> list[Claim]:
-    """Return the claims of abstract and discussion, in our words.
+    """Return the claims of abstract, results and discussion, in our words.
 
     Parameters
     ----------
     fits
         All reconstructions.
     centred
-        Relative error of DMD on x − x_ref, cart-pole under LQR.
+        Relative error of DMD on x − x_ref of the cart-pole under LQR.
     predictions
-        What models predict of data that they were not fitted to, by plant and model.
+        Errors on held-out data by plant and model.
     ratios
-        Closed-loop costs over that of nonlinear MPC, by task and controller.
+        Closed-loop costs divided by that of nonlinear MPC, by task and controller.
     """
     cubic, box = fits["pendulum"]["EDMD monomials 3", True], fits["cart-pole"]["EDMD Fourier 1", True]
-    shift, cut = (
-        fits["cart-pole-lqr"]["EDMD monomials 2", True],
-        fits["cart-pole-lqr"]["EDMD monomials 2", False],
-    )
+    shift, cut = (fits["cart-pole-lqr"]["EDMD monomials 2", True], fits["cart-pole-lqr"]["EDMD monomials 2", False])
     raw, small = fits["cart-pole-lqr"]["DMD", True], fits["pendulum"]["EDMD monomials 3", False]
     hanging, upright = fits["pendulum"]["DMD", True], fits["upright"]["DMD", True]
     squares, cubes = (fits["cart-pole"][f"EDMD monomials {degree}", True] for degree in (2, 3))

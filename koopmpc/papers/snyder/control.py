@@ -1,113 +1,123 @@
 """Past Snyder & Song (2021): data that show what the input does, and control on models of them."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost
+from koopmpc.bench.page import Page
 from koopmpc.control.limits import Limits
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.excitation import Feedback, Noise
+from koopmpc.figures.comparisons import runs as plot_runs
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import Constant, State
-from koopmpc.papers.contest import Contest, Prediction, centred, prediction
-from koopmpc.papers.plants import CartPole, Pendulum
-from koopmpc.papers.reconstruction import Scene, unwarned
-from koopmpc.papers.snyder.settings import CART_POLE_WEIGHTS, PENDULUM_WEIGHTS, TARGET, UP, gains
-from koopmpc.plants.dynamics import Dynamics
+from koopmpc.loop.run import Run
+from koopmpc.papers.contest import ORACLE, Contest, Prediction, centred, costs, prediction
+from koopmpc.papers.reconstruction import Setting, percent, unwarned
+from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Shaking, gains
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import StepMap, discretize
 
-DT = 0.05  # of the controllers [s]
-LASTING = 3.0  # an exciting episode [s]
+Runs = Mapping[str, Mapping[tuple[str, bool], Run]]  # by title of the task, then as `Contest.runs`
+DRAWN = ("LQR, linearisation", "MPC, Fourier 1", "MPC, monomials 3", ORACLE)
+DT = 0.05  # sample time of the controllers [s]
+LASTING = 3.0  # length of an exciting episode [s]
 LIFTINGS: Mapping[str, Lifting] = {
     "DMDc": State() + Constant(),
     "Fourier 1": State() + Fourier(1) + Constant(),
     "monomials 3": State() + Monomials(3) + Constant(),
 }
 
+INPUTS = """\
+Under u = −K x the input is a function of the state: a fit without B tells the closed loop, and a fit with B
+cannot tell A and B apart. Noise on top of the feedback shows both. *Feedback data* are the one trajectory of the
+figures, with its input held over each sample; *exciting data* are {episodes} episodes of {lasting:g} s under the
+same feedback and uniform noise of ±{pendulum:g} N m or ±{cart_pole:g} N. Medians over ten episodes of 2 s that were
+not fitted, relative to ‖x − x_ref‖, each lifted once at its start."""
 
-@dataclass(frozen=True)
-class Shaking:
-    """How a plant is excited for data: it starts in x ± spread, and u is shaken by ± noise."""
+CONTROL = """\
+LQR and MPC on lifted models identified from exciting data, under the paper's weights (pendulum Q = diag(0, 10),
+R = 1; cart-pole Q = diag(5, 10, 0, 0), R = 1), sampled at 0.05 s; the observables are the paper's and a
+constant. The data of each task are {episodes} episodes of {lasting:g} s under uniform noise, on top of LQR where the
+plant would fall: {noise}, in N m or N. Costs are 0.05 Σ (‖x − r‖²_Q + ‖u‖²_R) over {seconds:g} s, and in brackets
+their ratio to nonlinear MPC on the true model with a horizon of {ahead:g} s."""
 
-    spread: Sequence[float]
-    noise: float
+LESSONS = (
+    """\
+Hanging, with these weights, no limit, and time that is not sampled, u = −√10 ω is optimal for the nonlinear
+pendulum too: 2√10 times its energy solves the Hamilton–Jacobi–Bellman equation. There no lifted model can do better
+than LQR on the linearisation.""",
+    """\
+Monomials of degree 3 rebuild the hanging pendulum best, and steer it at {cubic:.2f} times the best cost: a
+small reconstruction error does not make a control model.""",
+    """\
+Upright, from π/4, LQR on Fourier observables takes {lifted:.4f} times the best cost and LQR on the
+linearisation {local:.4f}: there the lifted model does see what the linearisation does not.""",
+    """\
+In the shift of the cart-pole, which stays within 0.04 rad of upright, all models are alike.""",
+)
 
 
-SHAKINGS: Mapping[str, Shaking] = {
-    "pendulum": Shaking((1.0, 1.0), 4.0),
-    "cart-pole": Shaking((1.0, 0.5, 0.1, 0.1), 10.0),
-}
+def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, Prediction]:
+    """Return how well models predict that were fitted to one trajectory under feedback, or to exciting data.
 
+    Inputs are held over a sample, and the coordinates are x − x_ref.
 
-@dataclass(frozen=True)
-class Task:
-    """What a controller has to do, and how the plant is shaken for the data of its model.
-
-    Attributes
+    Parameters
     ----------
-    dynamics, x_eq, K
-        The plant; where it rests; the feedback that holds it while data are taken, None where it needs none.
+    setting
+        The plant, its feedback and its start.
     shaking
-        Of the data, about x_eq.
-    cost, limit
-        The paper's weights; |u| in the runs with limits, below what LQR would take.
-    x0, reference
-        From where to where.
+        Excitation about x_ref, of the exciting data and of the held-out ones.
+    episodes
+        Number of exciting episodes to fit.
     """
+    plant = discretize(setting.dynamics, setting.dt, RK4(2))
+    K = setting.K
+    assert K is not None
+    x_ref = np.broadcast_to(setting.x_ref, plant.nx)
+    law = Feedback(K, x_ref=x_ref)
+    one = centred(collect(plant, setting.x0, law, episodes=1, steps=setting.steps), x_ref)
+    steps = round(LASTING / setting.dt)
+    rich = centred(_excited(plant, x_ref, K, shaking, episodes=episodes, steps=steps), x_ref)
+    starts = Uniform(x_ref - shaking.spread, x_ref + shaking.spread)
+    feedback = centred(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
+    excited = centred(_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
+    B = plant.linearize(x_ref, np.zeros(plant.nu)).B
+    with unwarned():
+        models = {
+            "DMD, feedback data": dmd(one),
+            "DMDc, feedback data": dmdc(one),
+            "DMDc, exciting data": dmdc(rich),
+            "EDMDc, exciting data": edmd(rich, State() + Fourier(1)),
+        }
+    return {name: prediction(name, model, feedback, excited, B) for name, model in models.items()}
 
-    dynamics: Dynamics
-    x_eq: Sequence[float]
-    K: str | None
-    shaking: Shaking
-    cost: Cost
-    limit: float
-    x0: Sequence[float]
-    reference: Sequence[float]
 
-
-_DRIVEN, _CARRIED = Cost(*PENDULUM_WEIGHTS), Cost(*CART_POLE_WEIGHTS)
-_REST, _START = (0.0, 0.0), (np.pi / 4, 0.0)
-TASKS: Mapping[str, Task] = {
-    "pendulum, hanging, π/4": Task(Pendulum(), _REST, None, Shaking((1.2, 2.0), 4.0), _DRIVEN, 2.0, _START, _REST),
-    "pendulum, upright, π/4": Task(
-        Pendulum(upright=True), _REST, "upright", Shaking((1.0, 1.0), 10.0), _DRIVEN, 20.0, _START, _REST
-    ),
-    "cart-pole, 2 m shift": Task(
-        CartPole(),
-        UP,
-        "cart-pole",
-        Shaking((2.0, 1.0, 0.1, 0.1), 5.0),
-        _CARRIED,
-        3.0,
-        (-1.0, 0.0, np.pi, 0.0),
-        TARGET,
-    ),
-    "cart-pole, 0.3 rad off": Task(
-        CartPole(),
-        UP,
-        "cart-pole",
-        Shaking((2.0, 1.0, 0.4, 0.4), 10.0),
-        _CARRIED,
-        40.0,
-        (0.0, 0.0, np.pi + 0.3, 0.0),
-        UP,
-    ),
-}
+def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
+    """Add a table of these predictions; the exciting data have so many episodes."""
+    noise = {name.replace("-", "_"): shaking.noise for name, shaking in SHAKINGS.items()}
+    page.text("## Data that show what the input does", INPUTS.format(episodes=episodes, lasting=LASTING, **noise))
+    page.table(
+        ("plant", "model", "under feedback [%]", "feedback and noise [%]", "B, of the true one", "the fit says"),
+        [
+            (plant, p.name, percent(p.feedback), percent(p.excited), "–" if np.isnan(p.b) else f"{p.b:.4f}", p.warned)
+            for plant, each in predicted.items()
+            for p in each.values()
+        ],
+    )
 
 
 def contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
-    """Return one of `TASKS` with its models, fitted to so many exciting episodes."""
+    """Return one of `TASKS` as a contest, its models fitted to so many exciting episodes."""
     task = TASKS[title]
     plant = discretize(task.dynamics, DT, RK4(4))
     K = None if task.K is None else gains()[task.K]
@@ -128,40 +138,68 @@ def contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
     )
 
 
-def predictions(scene: Scene, shaking: Shaking, episodes: int) -> dict[str, Prediction]:
-    """Return what is predicted by fits of one trajectory under feedback, and by fits of exciting data, with inputs.
+def ratios(runs: Runs) -> dict[str, dict[str, float]]:
+    """Return each controller's cost divided by that of nonlinear MPC, for each task with and without limits."""
+    found: dict[str, dict[str, float]] = {}
+    for title, each in runs.items():
+        for limited in (False, True):
+            table = costs(each, limited)
+            name = f"{title}, {'limited' if limited else 'without limits'}"
+            found[name] = {controller: cost / table[ORACLE] for controller, cost in table.items()}
+    return found
 
-    Inputs are held over a sample; coordinates are x − x_ref, so that no origin is in the way.
+
+def loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -> None:
+    """Add a table of the closed-loop costs with and without limits, the lessons, and a figure for each plant.
 
     Parameters
     ----------
-    scene
-        The plant, its feedback and its start.
-    shaking
-        Of the exciting data, and of what is predicted, about x_ref.
+    page
+        The report.
+    tasks, runs
+        By the title of the task.
     episodes
-        How many exciting ones.
+        Number of episodes that each model was fitted to.
     """
-    plant = discretize(scene.dynamics, scene.dt, RK4(2))
-    K = scene.K
-    assert K is not None
-    x_ref = np.broadcast_to(scene.x_ref, plant.nx)
-    law = Feedback(K, x_ref=x_ref)
-    one = centred(collect(plant, scene.x0, law, episodes=1, steps=scene.steps), x_ref)
-    steps = round(LASTING / scene.dt)
-    rich = centred(_excited(plant, x_ref, K, shaking, episodes=episodes, steps=steps), x_ref)
-    starts = Uniform(x_ref - shaking.spread, x_ref + shaking.spread)
-    feedback = centred(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
-    excited = centred(_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
-    B = plant.linearize(x_ref, np.zeros(plant.nu)).B
-    with unwarned():
-        models = {
-            "DMD, feedback data": dmd(one),
-            "DMDc, feedback data": dmdc(one),
-            "DMDc, exciting data": dmdc(rich),
-            "EDMDc, exciting data": edmd(rich, State() + Fourier(1)),
+    one = next(iter(tasks.values()))
+    page.text(
+        "## Control, which the paper left as future work",
+        CONTROL.format(
+            episodes=episodes,
+            lasting=LASTING,
+            noise=", ".join(f"±{TASKS[title].shaking.noise:g} for “{title}”" for title in tasks),
+            seconds=one.steps * one.plant.dt,
+            ahead=one.horizon * one.plant.dt,
+        ),
+    )
+    for limited in (False, True):
+        table = {title: costs(each, limited) for title, each in runs.items()}
+        limits = {title: f"|u| ≤ {float(np.max(task.limits.inputs(1)[1])):g}" for title, task in tasks.items()}
+        page.text("Inputs limited:" if limited else "Inputs without limits:")
+        page.table(
+            ("controller", *(f"{title}, {limits[title]}" if limited else title for title in table)),
+            [(name, *(_cost(by[name], by[ORACLE]) for by in table.values())) for name in next(iter(table.values()))],
+        )
+    ratio = ratios(runs)
+    hanging, upright = (ratio[f"pendulum, {what}, π/4, without limits"] for what in ("hanging", "upright"))
+    page.items(
+        lesson.format(
+            cubic=hanging["LQR, monomials 3"], lifted=upright["LQR, Fourier 1"], local=upright["LQR, linearisation"]
+        )
+        for lesson in LESSONS
+    )
+    for plant in ("pendulum", "cart-pole"):
+        shown = {
+            title.removeprefix(f"{plant}, "): {name: each[name, True] for name in DRAWN}
+            for title, each in runs.items()
+            if title.startswith(plant)
         }
-    return {name: prediction(name, model, feedback, excited, B) for name, model in models.items()}
+        caption = f"{plant.capitalize()}: closed loops with limited inputs"
+        page.picture(f"control-{plant}", caption, plot_runs(shown))
+        for title, each in shown.items():
+            first = next(iter(each.values()))
+            values = {name: np.hstack([run.X[:-1], run.U]) for name, run in each.items()}
+            page.curve(f"control, {plant}, {title}", first.dt, (*first.states, *first.inputs), values)
 
 
 def _excited(
@@ -174,9 +212,13 @@ def _excited(
     steps: int,
     seed: int = 0,
 ) -> Episodes:
-    """Return episodes from x_ref ± spread under noise, on top of feedback where there is K."""
+    """Collect episodes that start in x_ref ± spread under noise, on top of the feedback where there is K."""
     middle = checks.vector(x_ref, "x_ref", plant.nx)
     shaken = Noise(-shaking.noise, shaking.noise, hold=max(1, round(0.05 / plant.dt)))
     excitation = shaken if K is None else Feedback(K, shaken, x_ref=middle)
     starts = Uniform(middle - shaking.spread, middle + shaking.spread)
     return collect(plant, starts, excitation, episodes=episodes, steps=steps, rng=seed)
+
+
+def _cost(value: float, best: float) -> str:
+    return f"{value:.2f} ({value / best:.4f})" if np.isfinite(value) else "diverges"

@@ -1,15 +1,17 @@
-"""The settings of Snyder & Song (2021): plants, weights, starts, observables, and what its figures show."""
+"""The settings of Snyder & Song (2021): plants, weights, starts, observables, what its figures show, and our tasks."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from koopmpc.control.cost import Cost
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.monomials import Monomials
 from koopmpc.lifting.state import Constant, State
 from koopmpc.papers.plants import CartPole, Pendulum, gain, printed_gain
-from koopmpc.papers.reconstruction import Scene
+from koopmpc.papers.reconstruction import Setting
 from koopmpc.plants.dynamics import Dynamics
 
 PENDULUM_WEIGHTS: tuple[list[float], float] = ([0.0, 10.0], 1.0)  # Q and R of the paper
@@ -29,14 +31,14 @@ OBSERVABLES: dict[str, Lifting] = {
 
 @dataclass(frozen=True)
 class Shown:
-    """One figure of the paper: its name, the observables, the scenes side by side, and what the paper says of each.
+    """One figure of the paper: its name, the observables, the settings side by side, and what the paper says of each.
 
-    `says` is in our words; one entry for each scene.
+    `says` is in our words and has one entry for each setting.
     """
 
     name: str
     method: str
-    scenes: tuple[str, ...]
+    settings: tuple[str, ...]
     says: tuple[str, ...]
     appendix: bool = False
 
@@ -65,61 +67,38 @@ FIGURES = (
     Shown("cart-pole-dmd", "DMD", ("cart-pole", "cart-pole-lqr"), ("fails", "partly captured")),
     Shown("cart-pole-monomials-2", "EDMD monomials 2", ("cart-pole-lqr",), ("no gain on DMD",)),
     Shown("cart-pole-fourier-1", "EDMD Fourier 1", ("cart-pole-lqr",), ("no gain on DMD",)),
-    Shown(
-        "appendix-cart-pole-monomials-2",
-        "EDMD monomials 2",
-        ("cart-pole",),
-        ("no gain on DMD",),
-        appendix=True,
-    ),
+    Shown("appendix-cart-pole-monomials-2", "EDMD monomials 2", ("cart-pole",), ("no gain on DMD",), appendix=True),
     Shown("appendix-cart-pole-fourier-1", "EDMD Fourier 1", ("cart-pole",), ("no gain on DMD",), appendix=True),
 )
 VARIANTS = ("upright", "upright-lqr", "cart-pole-g10", "databook", "databook-legacy")
 
 
-def scenes(others: int = 10) -> dict[str, Scene]:
-    """Return every trajectory that is fitted, with so many held-out ones beside each."""
+def all_settings(others: int = 10) -> dict[str, Setting]:
+    """Return every trajectory that is fitted, by name, with `others` held-out trajectories beside each."""
     pendulum, upright = Pendulum(), Pendulum(upright=True)
     cart_pole, databook = CartPole(), CartPole(g=10.0, d=1.0)
-    swing, tilt, near = (np.pi / 6, 0.5), (0.5, 0.2, 0.1, 0.1), (1.0, 0.2, 0.02, 0.02)
-    off = (-1.0, 0.0, np.pi + 0.1, 0.0)
-    start = (np.pi / 4, 0.0)
-
-    def scene(
-        title: str,
-        dynamics: Dynamics,
-        x0: tuple[float, ...],
-        spread: tuple[float, ...],
-        K: np.ndarray | None = None,
-        x_ref: tuple[float, ...] | float = 0.0,
-    ) -> Scene:
-        return Scene(title, dynamics, x0, spread, K, x_ref, others=others)
-
-    shift = (-1.0, 0.0, np.pi, 0.0)
-    return {
-        "pendulum": scene("Pendulum, hanging, uncontrolled", pendulum, start, swing),
-        "pendulum-lqr": scene("Pendulum, hanging, LQR", pendulum, start, swing, gains()["pendulum"]),
-        "upright": scene("Pendulum, upright, uncontrolled", upright, start, swing),
-        "upright-lqr": scene("Pendulum, upright, LQR", upright, start, swing, gains()["upright"]),
-        "cart-pole": scene("Cart-pole, uncontrolled", cart_pole, off, tilt),
-        "cart-pole-lqr": scene("Cart-pole, LQR", cart_pole, shift, near, gains()["cart-pole"], TARGET),
-        "cart-pole-g10": scene(
-            "Cart-pole, LQR, g = 10", CartPole(g=10.0), shift, near, gains()["cart-pole-g10"], TARGET
-        ),
-        "databook": scene("Databook's cart-pole, LQR", databook, off, tilt, gains()["databook"], TARGET),
-        "databook-legacy": scene(
-            "Databook's cart-pole, LQR as printed (legacy)",
-            databook,
-            off,
-            tilt,
-            gains()["databook-legacy"],
-            TARGET,
+    start, swing = (np.pi / 4, 0.0), (np.pi / 6, 0.5)
+    off, tilt = (-1.0, 0.0, np.pi + 0.1, 0.0), (0.5, 0.2, 0.1, 0.1)
+    shift, near = (-1.0, 0.0, np.pi, 0.0), (1.0, 0.2, 0.02, 0.02)
+    K = gains()
+    found = {
+        "pendulum": Setting("Pendulum, hanging, uncontrolled", pendulum, start, swing),
+        "pendulum-lqr": Setting("Pendulum, hanging, LQR", pendulum, start, swing, K["pendulum"]),
+        "upright": Setting("Pendulum, upright, uncontrolled", upright, start, swing),
+        "upright-lqr": Setting("Pendulum, upright, LQR", upright, start, swing, K["upright"]),
+        "cart-pole": Setting("Cart-pole, uncontrolled", cart_pole, off, tilt),
+        "cart-pole-lqr": Setting("Cart-pole, LQR", cart_pole, shift, near, K["cart-pole"], TARGET),
+        "cart-pole-g10": Setting("Cart-pole, LQR, g = 10", CartPole(g=10.0), shift, near, K["cart-pole-g10"], TARGET),
+        "databook": Setting("Databook's cart-pole, LQR", databook, off, tilt, K["databook"], TARGET),
+        "databook-legacy": Setting(
+            "Databook's cart-pole, LQR as printed (legacy)", databook, off, tilt, K["databook-legacy"], TARGET
         ),
     }
+    return {name: replace(setting, others=others) for name, setting in found.items()}
 
 
 def gains() -> dict[str, np.ndarray]:
-    """Return K of each feedback by the name of its scene, without "-lqr"."""
+    """Return K of each feedback by the name of its setting without "-lqr"."""
     databook = CartPole(g=10.0, d=1.0)
     return {
         "pendulum": gain(Pendulum(), [0.0, 0.0], *PENDULUM_WEIGHTS).K,
@@ -129,3 +108,70 @@ def gains() -> dict[str, np.ndarray]:
         "databook": gain(databook, UP, *DATABOOK_WEIGHTS).K,
         "databook-legacy": printed_gain(databook, *DATABOOK_WEIGHTS).K,
     }
+
+
+@dataclass(frozen=True)
+class Shaking:
+    """How a plant is excited for data: episodes start in x ± spread, and uniform noise of ± `noise` is added to u."""
+
+    spread: Sequence[float]
+    noise: float
+
+
+SHAKINGS: Mapping[str, Shaking] = {
+    "pendulum": Shaking((1.0, 1.0), 4.0),
+    "cart-pole": Shaking((1.0, 0.5, 0.1, 0.1), 10.0),
+}
+
+
+@dataclass(frozen=True)
+class ControlTask:
+    """What a controller has to do, and how the plant is excited for the data of its model.
+
+    Attributes
+    ----------
+    dynamics, x_eq
+        The plant and its equilibrium.
+    K
+        Name of the feedback that holds the plant while data are collected; None where it needs none.
+    shaking
+        Excitation of the data about x_eq.
+    cost, limit
+        The paper's weights, and the bound on |u| in the runs with limits, which is below what LQR would take.
+    x0, reference
+        Where the run starts, and where it has to go.
+    """
+
+    dynamics: Dynamics
+    x_eq: Sequence[float]
+    K: str | None
+    shaking: Shaking
+    cost: Cost
+    limit: float
+    x0: Sequence[float]
+    reference: Sequence[float]
+
+
+_DRIVEN, _CARRIED = Cost(*PENDULUM_WEIGHTS), Cost(*CART_POLE_WEIGHTS)
+_REST, _START = (0.0, 0.0), (np.pi / 4, 0.0)
+TASKS: Mapping[str, ControlTask] = {
+    "pendulum, hanging, π/4": ControlTask(
+        Pendulum(), _REST, None, Shaking((1.2, 2.0), 4.0), _DRIVEN, 2.0, _START, _REST
+    ),
+    "pendulum, upright, π/4": ControlTask(
+        Pendulum(upright=True), _REST, "upright", Shaking((1.0, 1.0), 10.0), _DRIVEN, 20.0, _START, _REST
+    ),
+    "cart-pole, 2 m shift": ControlTask(
+        CartPole(), UP, "cart-pole", Shaking((2.0, 1.0, 0.1, 0.1), 5.0), _CARRIED, 3.0, (-1.0, 0.0, np.pi, 0.0), TARGET
+    ),
+    "cart-pole, 0.3 rad off": ControlTask(
+        CartPole(),
+        UP,
+        "cart-pole",
+        Shaking((2.0, 1.0, 0.4, 0.4), 10.0),
+        _CARRIED,
+        40.0,
+        (0.0, 0.0, np.pi + 0.3, 0.0),
+        UP,
+    ),
+}
