@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from functools import cache
+from importlib import import_module
 from math import copysign
 from types import UnionType
 from typing import Any, ClassVar, Literal, Union, cast, get_args, get_origin, get_type_hints
@@ -23,6 +24,24 @@ from koopmpc.errors import DataError, LogError
 Array = NDArray[Any]
 Arrays = dict[str, Array]
 _SHOWN, _LONG = 4, 80  # items and characters that a repr shows of a field
+
+ALIASES: dict[str, str] = {}
+"""Old name of a class → its name now: files of earlier versions name classes as they were called then."""
+
+_HOMES = (
+    "recording.description",
+    "validate.report",
+    "synthesis.selection",
+    "identify.fits.prior",
+    "estimate.kalman",
+    "estimate.disturbance",
+    "control.move",
+    "data.collect",
+    "predict.plane",
+    "validate.forecast",
+    "papers.reconstruction",
+)
+"""Modules below koopmpc that, with what they import, define every Value."""
 
 
 class Value:
@@ -125,9 +144,10 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
         for enum in enums:
             if enum.__name__ == kind:
                 return enum[node["name"]]
-        if kind not in Value._kinds:
+        cls = class_of(kind) if isinstance(kind, str) else None
+        if cls is None:
             raise LogError(f"the file holds a {kind!r}, which this version of koopmpc does not know")
-        build = cast("Callable[..., Any]", Value._kinds[kind])
+        build = cast("Callable[..., Any]", cls)
         value = build(**{key: from_data(item, arrays, enums) for key, item in node.items() if key != "kind"})
         _check_types(value)
         return value
@@ -135,6 +155,19 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
         raise
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise LogError(f"the file holds a {kind!r} that cannot be built: {error}") from error
+
+
+def class_of(name: str) -> type[Value] | None:
+    """Return the Value of koopmpc that has this name, or had it once; None where there is none.
+
+    Rooms are imported when they are first asked for, so those that define Values are imported here where the name is
+    not known yet. The name only chooses among classes of koopmpc; nothing is imported because a file names it.
+    """
+    name = ALIASES.get(name, name)
+    if name not in Value._kinds:
+        for home in _HOMES:
+            import_module(f"koopmpc.{home}")
+    return Value._kinds.get(name)
 
 
 def _check_types(value: Value) -> None:

@@ -1,0 +1,115 @@
+"""Files that the first edition wrote still read, each in a process that has imported nothing but koopmpc before."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from koopmpc.values import ALIASES, Value, from_data
+
+FOLDER = Path(__file__).parent / "fixtures" / "first_edition"
+MODELS = ("linear_delay", "bilinear", "thin_plate_fourier", "traced", "families", "reduced")
+
+OPENED = """
+import json
+from pathlib import Path
+import koopmpc as km
+folder = Path({folder!r})
+expected = json.loads((folder / "expected.json").read_text())
+def near(a, b):
+    import numpy as np
+    np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+"""
+
+MODEL = """
+model, told = km.load_model(folder / "{name}.npz"), expected["{name}"]
+assert type(model).__name__ == told["class"], type(model)
+history = None
+x0 = [0.4, -0.3]
+if model.embedding is not None:
+    X, U = expected["episodes"]["X"][0], expected["episodes"]["U"][0]
+    history, x0 = km.Episode(X=X[:3], U=U[:2]), X[2]
+near(model.rollout(x0, [[-1 + 2 * k / 9] for k in range(10)], history=history), told["rollout"])
+assert model.report.samples > 0
+"""
+
+LOG = """
+run, told = km.load_run(folder / "{name}.rrd"), expected["run {name}"]
+assert run.X.tolist() == told["X"] and run.U.tolist() == told["U"]
+assert [s.name for s in run.status] == told["status"] and [f.name for f in run.fallback] == told["fallback"]
+assert run.metadata["controller"] == "{name}" and (run.plans is not None) == ("{name}" == "mpc")
+near(km.metrics(run).cost, told["cost"])
+"""
+
+TRUST = """
+from koopmpc.values import from_data
+report = from_data(json.loads((folder / "trust_{name}.json").read_text()))
+assert type(report).__module__.startswith("koopmpc.validate"), type(report)
+assert report.score.rmse.tolist() == expected["trust {name}"]["rmse"]
+assert str(report)
+"""
+
+EPISODES = """
+for suffix in (".npz", ".parquet", ".csv"):
+    data, told = km.load_episodes(folder / ("episodes" + suffix)), expected["episodes"]
+    assert [e.X.tolist() for e in data] == told["X"] and [e.U.tolist() for e in data] == told["U"]
+    assert list(data.states) == told["states"] and data.dt == told["dt"]
+    assert data == km.load_episodes(folder / "episodes.npz")
+    wind = km.load_episodes(folder / ("wind" + suffix))
+    assert wind.disturbances == ("wind [N]",) and wind[0].W.tolist() == [[0.1]] * 3
+"""
+
+OPENINGS = {
+    **{f"model {name}": MODEL.format(name=name) for name in MODELS},
+    **{f"log {name}": LOG.format(name=name) for name in ("mpc", "lqr", "nonlinear")},
+    **{f"trust {name}": TRUST.format(name=name) for name in ("bilinear", "thin_plate_fourier", "traced")},
+    "episodes": EPISODES,
+}
+
+
+def fresh(script):
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("what", OPENINGS)
+def test_a_file_of_the_first_edition_reads_in_a_fresh_process(what):
+    ran = fresh(OPENED.format(folder=str(FOLDER)) + OPENINGS[what])
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_every_class_that_a_file_may_name_is_found_in_a_fresh_process():
+    ran = fresh(
+        "import importlib, json, pkgutil\n"
+        "import koopmpc\n"
+        "from koopmpc.values import Value, class_of\n"
+        "assert not Value._kinds, 'nothing is imported yet'\n"
+        "assert class_of('Nothing') is None\n"
+        "found = set(Value._kinds)\n"
+        "for module in pkgutil.walk_packages(koopmpc.__path__, 'koopmpc.'):\n"
+        "    if not module.name.endswith('__main__'):\n"
+        "        importlib.import_module(module.name)\n"
+        "assert not set(Value._kinds) - found, set(Value._kinds) - found\n"
+    )
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_a_class_that_was_renamed_is_found_by_its_old_name(monkeypatch):
+    monkeypatch.setitem(ALIASES, "Moved", "Plan")
+    array = {"kind": "array", "dtype": "float64", "shape": [1, 1], "values": [0.5]}
+    plan = from_data({"kind": "Moved", "X": array, "U": array})
+    assert type(plan).__name__ == "Plan"
+    assert plan.U.tolist() == [[0.5]]
+
+
+def test_old_names_stand_for_classes_that_there_are_and_hide_none():
+    from koopmpc.values import class_of
+
+    assert all(class_of(new) for new in ALIASES.values())
+    assert not ALIASES.keys() & Value._kinds.keys()
+
+
+def test_the_fixtures_are_small_and_listed():
+    assert all(file.stat().st_size < 300_000 for file in FOLDER.iterdir())
+    assert {*json.loads((FOLDER / "expected.json").read_text())} >= {*MODELS, "episodes"}
