@@ -28,20 +28,7 @@ _SHOWN, _LONG = 4, 80  # items and characters that a repr shows of a field
 ALIASES: dict[str, str] = {}
 """Old name of a class → its name now: files of earlier versions name classes as they were called then."""
 
-_HOMES = (
-    "recording.description",
-    "validate.report",
-    "synthesis.selection",
-    "identify.fits.prior",
-    "estimate.kalman",
-    "estimate.disturbance",
-    "control.move",
-    "data.collect",
-    "predict.plane",
-    "validate.forecast",
-    "papers.reconstruction",
-)
-"""Modules below koopmpc that, with what they import, define every Value."""
+_ROOMS = ("predict", "lifting", "data", "identify", "validate", "estimate", "control", "loop", "synthesis")
 
 
 class Value:
@@ -160,13 +147,16 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
 def class_of(name: str) -> type[Value] | None:
     """Return the Value of koopmpc that has this name, or had it once; None where there is none.
 
-    Rooms are imported when they are first asked for, so those that define Values are imported here where the name is
-    not known yet. The name only chooses among classes of koopmpc; nothing is imported because a file names it.
+    What a room serves is imported when it is first asked for. A class that is not known yet is therefore looked up in
+    the tables of the rooms: the name in the file only chooses among them.
     """
     name = ALIASES.get(name, name)
-    if name not in Value._kinds:
-        for home in _HOMES:
-            import_module(f"koopmpc.{home}")
+    for room in _ROOMS:
+        if name in Value._kinds:
+            break
+        door = import_module(f"koopmpc.{room}")
+        if name in getattr(door, "__all__", ()):
+            getattr(door, name)
     return Value._kinds.get(name)
 
 
