@@ -1,11 +1,12 @@
 """Small systems, and the finite-horizon problem written a second and a third time: dense, and in CVXPY."""
 
-import casadi as ca
 import numpy as np
 import scipy.linalg
 
-import koopmpc as km
 from koopmpc.control.riccati import stationary
+from tests.example_plants import linear as linear
+from tests.example_plants import random_pair as random_pair
+from tests.example_plants import step_map as step_map
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
 
@@ -35,37 +36,6 @@ class Telling:
         if np.isfinite(y).all():
             self.z = self.predictor.lift(y)
         return bool(np.isfinite(y).all())
-
-
-def random_pair(rng, nx, nu, radius=1.05):
-    A = rng.normal(size=(nx, nx))
-    return A * radius / np.abs(np.linalg.eigvals(A)).max(), rng.normal(size=(nx, nu))
-
-
-def linear(A, B, dt=0.1, constant=None):
-    """x⁺ = A x + B u (+ c) as a predictor on State() or State() + Constant()."""
-    nx, nu = np.shape(B)
-    states, inputs = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
-    if constant is None:
-        return km.LinearPredictor(np.array(A), np.array(B), np.eye(nx), km.State(), dt, states, inputs)
-    whole = scipy.linalg.block_diag(A, 1.0)
-    whole[:nx, nx] = constant
-    return km.LinearPredictor(
-        whole,
-        np.vstack([B, np.zeros((1, nu))]),
-        np.eye(nx, nx + 1),
-        km.State() + km.Constant(),
-        dt,
-        states,
-        inputs,
-    )
-
-
-def step_map(A, B, dt=0.1, constant=None):
-    nx, nu = np.shape(B)
-    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
-    c = np.zeros(nx) if constant is None else np.asarray(constant)
-    return km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u + ca.DM(c)]), dt)
 
 
 def equilibrium(A, B, C, Q, r, constant=None):

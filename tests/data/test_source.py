@@ -10,7 +10,7 @@ import pytest
 import koopmpc as km
 from koopmpc.data.source import Changed, Source, source_of
 from tests.bare import shown
-from tests.identify.plants import random_episodes
+from tests.example_plants import random_episodes
 
 
 def sets(count: int = 4) -> list[km.Episodes]:

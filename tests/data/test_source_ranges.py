@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.data.files.npz import RangePart, ranges
-from tests.identify.plants import brute_force, random_episodes
+from tests.example_plants import brute_force, random_episodes
 
 LENGTHS = st.lists(st.integers(1, 30), min_size=1, max_size=8)
 

@@ -1,39 +1,18 @@
 """Small systems with and without a Constant, and a Kalman filter as the textbook has it."""
 
 import numpy as np
-import scipy.linalg
 
-import koopmpc as km
+from tests import example_plants as plants
 
 
 def linear(A, B, constant=None, E=None, dt=0.1):
-    """x⁺ = A x + B u (+ E w + c) as a predictor on State() (+ Constant())."""
-    nx, nu = np.shape(B)
-    states, inputs = tuple(f"x{i} [m]" for i in range(nx)), tuple(f"u{i} [N]" for i in range(nu))
-    nw = 0 if E is None else np.shape(E)[1]
-    extra = {} if E is None else {"E": np.array(E), "disturbances": tuple(f"w{i}" for i in range(nw))}
-    if constant is None:
-        return km.LinearPredictor(np.array(A), np.array(B), np.eye(nx), km.State(), dt, states, inputs, **extra)
-    whole = scipy.linalg.block_diag(A, 1.0)
-    whole[:nx, nx] = constant
-    if E is not None:
-        extra["E"] = np.vstack([E, np.zeros((1, nw))])
-    return km.LinearPredictor(
-        whole,
-        np.vstack([B, np.zeros((1, nu))]),
-        np.eye(nx, nx + 1),
-        km.State() + km.Constant(),
-        dt,
-        states,
-        inputs,
-        **extra,
-    )
+    """x⁺ = A x + B u (+ E w + c), its names with units."""
+    return plants.linear(A, B, constant, E, dt, units=True)
 
 
 def stable(rng, nx, nu, radius=0.8):
     """A random (A, B) whose modes all die out."""
-    A = rng.normal(size=(nx, nx))
-    return A * radius / np.abs(np.linalg.eigvals(A)).max(), rng.normal(size=(nx, nu))
+    return plants.random_pair(rng, nx, nu, radius)
 
 
 class Textbook:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.plants import batch, compiled
 from koopmpc.plants.graph import Graph
-from tests.plants.models import CartPole, Pendulum
+from tests.example_plants import CartPole, Pendulum
 
 needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
 MAPS = {

@@ -6,7 +6,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.plants.dynamics import output, right_side
-from tests.plants.models import CartPole, Pendulum, Spring
+from tests.example_plants import CartPole, Pendulum, Spring
 
 
 def test_right_side_is_the_model_with_its_parameters():

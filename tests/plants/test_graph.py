@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.plants.graph import OPERATIONS, Graph
 from koopmpc.values import from_data, to_data
-from tests.plants.models import CartPole
+from tests.example_plants import CartPole
 
 F = km.discretize(CartPole(), 0.05).F
 GRAPH = Graph.trace(F)

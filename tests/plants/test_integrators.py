@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 import koopmpc as km
 from koopmpc.plants.dynamics import right_side
 from koopmpc.plants.integrators import gauss_legendre
-from tests.plants.models import CartPole, Pendulum, Spring, energy
+from tests.example_plants import CartPole, Pendulum, Spring, energy
 
 X0, TORQUE, END = [1.0, 0.5], 0.7, 2.0
 

@@ -7,7 +7,7 @@ import pytest
 import koopmpc as km
 from koopmpc.plants import compiled
 from koopmpc.plants.compiled import Routine
-from tests.plants.models import CartPole
+from tests.example_plants import CartPole
 
 
 def function() -> ca.Function:

@@ -3,7 +3,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.plants.simulated import SimulatedPlant
-from tests.plants.models import CartPole, Spring
+from tests.example_plants import CartPole, Spring
 
 MAP = km.discretize(CartPole(), 0.05)
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.plants.models import CartPole, Pendulum, Spring
+from tests.example_plants import CartPole, Pendulum, Spring
 
 ALL = [km.Euler(), km.RK4(), km.ImplicitMidpoint(), km.Collocation(2), km.CVODES()]
 PLANTS = {repr(integrator): km.discretize(CartPole(), 0.05, integrator) for integrator in ALL}

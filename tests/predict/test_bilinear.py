@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.predict.models import random_predictor
+from tests.example_plants import random_predictor
 
 LIFTING = km.State() + km.Fourier(1)
 

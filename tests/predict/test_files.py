@@ -12,7 +12,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.predict.files import load_value, save_value
-from tests.identify.plants import random_episodes
+from tests.example_plants import random_episodes
 
 DATA = random_episodes(0, [80, 60], 2, 1)
 CENTERS = [[0.0, 0.5], [0.2, -0.7]]

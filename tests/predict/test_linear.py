@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.lifting.reduced import Projected
-from tests.predict.models import random_predictor
+from tests.example_plants import random_predictor
 
 LIFTING = km.State() + km.Constant() + km.Fourier(1)
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 import koopmpc as km
-from tests.identify.plants import one_step_pairs
-from tests.predict.models import random_predictor
+from tests.example_plants import one_step_pairs, random_predictor
 
 OSCILLATOR = np.array([[0.0, 1.0], [-4.0, -0.3]])  # ẍ = −4x − 0.3ẋ
 

@@ -9,7 +9,7 @@ import pytest
 import koopmpc as km
 from koopmpc.plants import batch, compiled
 from koopmpc.plants.graph import Graph
-from tests.plants.models import CartPole
+from tests.example_plants import CartPole
 
 pytestmark = pytest.mark.speed
 EPISODES, STEPS = 5000, 200

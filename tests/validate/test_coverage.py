@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.validate.regions import empty_regions
 from koopmpc.values import from_data, to_data
-from tests.identify.plants import random_episodes
+from tests.example_plants import random_episodes
 
 NAMES = ("theta [rad]", "omega [rad/s]")
 

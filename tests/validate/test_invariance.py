@@ -8,7 +8,7 @@ from scipy.linalg import subspace_angles
 
 import koopmpc as km
 from koopmpc.lifting.reduced import Projected
-from tests.identify.plants import one_step_pairs, random_episodes
+from tests.example_plants import one_step_pairs, random_episodes
 from tests.validate.test_residual_dmd import CLOSED, manifold, pendulum
 
 DICTIONARY = km.State() + km.Monomials(2)

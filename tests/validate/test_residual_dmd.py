@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.identify.plants import one_step_pairs, random_episodes
+from tests.example_plants import one_step_pairs, random_episodes
 
 CLOSED = km.State() + km.Expressions(lambda x: [x[0] ** 2], ("square",))
 

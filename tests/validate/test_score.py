@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.predict.models import random_predictor
+from tests.example_plants import random_predictor
 
 
 def runs(model: km.LinearPredictor, lengths: list[int], seed: int = 0, noise: float = 0.0) -> km.Episodes:

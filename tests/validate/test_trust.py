@@ -8,7 +8,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.values import from_data, to_data
-from tests.plants.models import Pendulum
+from tests.example_plants import Pendulum
 
 HORIZON = 10
 LIFTING = km.State() + km.Fourier(2, states=[0])
