@@ -1,7 +1,10 @@
 """Shapes of a scene: plain data that a problem returns and the recording draws; SI units, y up."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
 
 Point = tuple[float, float]
 Color = tuple[int, int, int]
@@ -39,3 +42,6 @@ class Disk:
 
 
 Shape = Line | Box | Disk
+
+Scene = Callable[[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]], Sequence[Shape]]
+"""scene(x, u) → the shapes of one state and input; always the same names."""

@@ -3,8 +3,15 @@
 import numpy as np
 
 from koopmpc.control.limits import Limits
-from koopmpc.loop.faults import ActuatorDelay, ActuatorLoss, DroppedSamples, FrozenSensor, NaNSensor, SolverFailure
-from koopmpc.loop.injection import Fault
+from koopmpc.loop.faults import (
+    ActuatorDelay,
+    ActuatorLoss,
+    DroppedSamples,
+    Fault,
+    FrozenSensor,
+    NaNSensor,
+    SolverFailure,
+)
 
 FAULTS: dict[str, Fault] = {
     "nan-sensor": NaNSensor(probability=0.1),

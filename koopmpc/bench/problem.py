@@ -1,10 +1,9 @@
 """Problem: a plant, how to learn it, how to control it, and the cases in which controllers are compared."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -19,9 +18,7 @@ from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.integrators import RK4, Integrator
 from koopmpc.plants.simulated import Plant
 from koopmpc.plants.step_map import StepMap
-from koopmpc.scene import Shape
-
-Scene = Callable[[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]], Sequence[Shape]]
+from koopmpc.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)

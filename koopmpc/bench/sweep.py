@@ -14,10 +14,10 @@ from koopmpc.bench.problem import Case, Problem
 from koopmpc.bench.results import Row, failures, reached, write_results
 from koopmpc.control.move import Controller
 from koopmpc.errors import ProblemError
-from koopmpc.loop.injection import Fault, named
+from koopmpc.loop.faults import Fault
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import Observer, simulate
+from koopmpc.loop.simulate import StepObserver, simulate
 from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.viewer import find_viewer, why_none
@@ -157,7 +157,7 @@ def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]
     }
     drawn: dict[str, Any] = {"scene": problem.scene, "model": getattr(controller, "predictor", None)}
 
-    def closed_loop(*observers: Observer) -> Run:
+    def closed_loop(*observers: StepObserver) -> Run:
         return simulate(
             plant,
             controller,
@@ -201,4 +201,4 @@ def _metadata(problem: Problem, task: _Task, injected: Sequence[Fault]) -> dict[
         "ridge": problem.ridge,
         "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed},
     }
-    return known | ({"fault": task.fault, "faults": named(injected)} if injected else {})
+    return known | ({"fault": task.fault, "faults": [str(broken) for broken in injected]} if injected else {})

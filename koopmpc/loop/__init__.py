@@ -7,6 +7,6 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.loop.metrics import Metrics as Metrics
     from koopmpc.loop.run import Plans as Plans
-    from koopmpc.loop.simulate import Step as Step
+    from koopmpc.loop.run import Step as Step
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"metrics": "Metrics", "run": "Plans", "simulate": "Step"})
+    __getattr__, __dir__, __all__ = attach(__name__, {"metrics": "Metrics", "run": "Plans Step"})

@@ -1,8 +1,10 @@
 """Faults: what breaks between plant and controller; frozen, composable, the same again for the same seed."""
 
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +12,91 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.errors import DataError
-from koopmpc.loop.injection import Fault, Injection, Wiring
+
+
+class Wiring(NamedTuple):
+    """What a fault may know of the loop that it breaks: the number of measurements, and the input limits."""
+
+    ny: int
+    inputs: Interval
+
+
+class Injection:
+    """What one fault does in one run: functions of the step k in place of these methods, which change nothing.
+
+    Each is called once a step, for k = 0, 1, 2, … in order. Pass functions, or override the methods in a subclass.
+    """
+
+    def __init__(
+        self,
+        *,
+        measured: Callable[[int, Float[np.ndarray, " ny"]], Float[np.ndarray, " ny"]] | None = None,
+        applied: Callable[[int, Float[np.ndarray, " nu"]], Float[np.ndarray, " nu"]] | None = None,
+        solver_fails: Callable[[int], bool] | None = None,
+    ) -> None:
+        given = {"measured": measured, "applied": applied, "solver_fails": solver_fails}
+        self.__dict__.update({name: function for name, function in given.items() if function is not None})
+
+    def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        """Return what the controller gets in place of the measurement y_k; y itself is not written to."""
+        return y
+
+    def applied(self, k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
+        """Return what the plant gets in place of the controller's u_k; u itself is not written to."""
+        return u
+
+    def solver_fails(self, k: int) -> bool:
+        """Return whether the controller's solver loses its answer at step k."""
+        return False
+
+
+class Fault(ABC):
+    """What breaks in a loop; subclass as a frozen dataclass. A fault holds no state and serves any number of runs."""
+
+    @abstractmethod
+    def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
+        """Return this fault's part in one run, at its beginning.
+
+        Raises
+        ------
+        DataError
+            The fault does not fit the loop.
+        """
+
+
+class Injections(Injection):
+    """All faults of one run; a signal passes through them in order.
+
+    Each fault gets a generator of its own, spawned from `rng`, which is not advanced.
+    """
+
+    def __init__(self, faults: Sequence[Fault], wiring: Wiring, rng: np.random.Generator) -> None:
+        if isinstance(cast(object, faults), Fault):
+            raise DataError(f"faults is {faults}; pass a list of faults, for example faults=[{faults}]")
+        for fault in faults:
+            if not isinstance(cast(object, fault), Fault):
+                raise DataError(f"faults holds {fault!r}; pass objects, for example faults=[km.faults.NaNSensor()]")
+        self._parts = [fault.start(wiring, own) for fault, own in zip(faults, rng.spawn(len(faults)), strict=True)]
+
+    def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        """Return y_k after all faults."""
+        for part in self._parts:
+            y = part.measured(k, y)
+        return y
+
+    def applied(self, k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
+        """Return u_k after all faults, and raise where they made it infinite, NaN, or of another shape."""
+        got = u
+        for part in self._parts:
+            got = part.applied(k, got)
+        if np.shape(got) != np.shape(u) or not np.isfinite(got).all():
+            raise DataError(f"the faults made u = {got} of u = {u} at step {k}; they must keep it finite")
+        return got
+
+    def solver_fails(self, k: int) -> bool:
+        """Return whether any fault makes the solver fail; each is asked, so that each draws its own numbers."""
+        failing = [part.solver_fails(k) for part in self._parts]
+        return any(failing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +129,15 @@ class NaNSensor(_Windowed):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the sensor of one run."""
-        return _NaNSensor(self, _picked(self.channels, wiring.ny), rng)
+        channels = _picked(self.channels, wiring.ny)
+
+        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+            if rng.random() < self.probability and self._at(k):
+                y = y.copy()
+                y[channels] = np.nan
+            return y
+
+        return Injection(measured=measured)
 
 
 @dataclass(frozen=True)
@@ -58,7 +152,17 @@ class FrozenSensor(_Windowed):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the sensor of one run."""
-        return _FrozenSensor(self, _picked(self.channels, wiring.ny))
+        channels = _picked(self.channels, wiring.ny)
+        frozen: list[Float[np.ndarray, " n"]] = []  # one entry, once the window has begun
+
+        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+            if self._at(k):
+                frozen[:] = frozen or [y[channels]]
+                y = y.copy()
+                y[channels] = frozen[0]
+            return y
+
+        return Injection(measured=measured)
 
 
 @dataclass(frozen=True)
@@ -76,7 +180,15 @@ class DroppedSamples(_Windowed):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the line of one run."""
-        return _DroppedSamples(self, rng)
+        arrived: list[Float[np.ndarray, " ny"]] = []  # the last measurement that arrived
+
+        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+            lost = rng.random() < self.probability and self._at(k)
+            if not (arrived and lost):
+                arrived[:] = [y.copy()]
+            return arrived[0].copy()
+
+        return Injection(measured=measured)
 
 
 @dataclass(frozen=True)
@@ -90,7 +202,13 @@ class SensorDelay(Fault):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the line of one run."""
-        return _SensorDelay(self.steps)
+        line: deque[Float[np.ndarray, " ny"]] = deque(maxlen=self.steps + 1)
+
+        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+            line.append(y.copy())
+            return line[0].copy()
+
+        return Injection(measured=measured)
 
 
 @dataclass(frozen=True)
@@ -122,7 +240,8 @@ class ActuatorLoss(_Windowed):
             limited = np.isfinite(limit)
             return np.where(limited, rest + kept * (np.where(limited, limit, rest) - rest), limit)
 
-        return _ActuatorLoss(self, Interval(lost(low), lost(high)))
+        left = lost(low), lost(high)
+        return Injection(applied=lambda k, u: np.clip(u, *left) if self._at(k) else u)
 
 
 @dataclass(frozen=True)
@@ -136,7 +255,14 @@ class ActuatorDelay(Fault):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the line of one run."""
-        return _ActuatorDelay(self.steps, np.clip(np.zeros(len(wiring.inputs.low)), *wiring.inputs))
+        rest = np.clip(np.zeros(len(wiring.inputs.low)), *wiring.inputs)
+        line: deque[Float[np.ndarray, " nu"]] = deque([rest] * self.steps, maxlen=self.steps + 1)
+
+        def applied(k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
+            line.append(u.copy())
+            return line[0].copy()
+
+        return Injection(applied=applied)
 
 
 @dataclass(frozen=True)
@@ -154,80 +280,8 @@ class SolverFailure(_Windowed):
         _share(self.probability, "probability")
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
-        """Return the solver's luck in one run."""
-        return _SolverFailure(self, rng)
-
-
-class _NaNSensor(Injection):
-    def __init__(self, fault: NaNSensor, channels: list[int], rng: np.random.Generator) -> None:
-        self._fault, self._channels, self._rng = fault, channels, rng
-
-    def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
-        if self._rng.random() < self._fault.probability and self._fault._at(k):
-            y = y.copy()
-            y[self._channels] = np.nan
-        return y
-
-
-class _FrozenSensor(Injection):
-    def __init__(self, fault: FrozenSensor, channels: list[int]) -> None:
-        self._fault, self._channels = fault, channels
-        self._frozen: Float[np.ndarray, " n"] | None = None
-
-    def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
-        if not self._fault._at(k):
-            return y
-        y = y.copy()
-        if self._frozen is None:
-            self._frozen = y[self._channels]
-        y[self._channels] = self._frozen
-        return y
-
-
-class _DroppedSamples(Injection):
-    def __init__(self, fault: DroppedSamples, rng: np.random.Generator) -> None:
-        self._fault, self._rng = fault, rng
-        self._last: Float[np.ndarray, " ny"] | None = None
-
-    def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
-        lost = self._rng.random() < self._fault.probability and self._fault._at(k)
-        if self._last is None or not lost:
-            self._last = y.copy()
-        return self._last.copy()
-
-
-class _SensorDelay(Injection):
-    def __init__(self, steps: int) -> None:
-        self._line: deque[Float[np.ndarray, " ny"]] = deque(maxlen=steps + 1)
-
-    def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
-        self._line.append(y.copy())
-        return self._line[0].copy()
-
-
-class _ActuatorLoss(Injection):
-    def __init__(self, fault: ActuatorLoss, box: Interval) -> None:
-        self._fault, self._box = fault, box
-
-    def applied(self, k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
-        return np.clip(u, *self._box) if self._fault._at(k) else u
-
-
-class _ActuatorDelay(Injection):
-    def __init__(self, steps: int, rest: Float[np.ndarray, " nu"]) -> None:
-        self._line: deque[Float[np.ndarray, " nu"]] = deque([rest] * steps, maxlen=steps + 1)
-
-    def applied(self, k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
-        self._line.append(u.copy())
-        return self._line[0].copy()
-
-
-class _SolverFailure(Injection):
-    def __init__(self, fault: SolverFailure, rng: np.random.Generator) -> None:
-        self._fault, self._rng = fault, rng
-
-    def solver_fails(self, k: int) -> bool:
-        return self._rng.random() < self._fault.probability and self._fault._at(k)
+        """Return which steps of one run lose the solver's answer."""
+        return Injection(solver_fails=lambda k: rng.random() < self.probability and self._at(k))
 
 
 def _share(value: float, name: str) -> None:

@@ -1,7 +1,7 @@
-"""Run: everything that happened in one closed loop."""
+"""Run: everything that happened in one closed loop, and the steps and rows that it is made of."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -9,46 +9,134 @@ from jaxtyping import Float, Int
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.move import Fallback, Status
+from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.values import Value
 
 
-@dataclass(frozen=True, eq=False)
-class Plans(Value):
-    """The plan of every step: X (T, N+1, nx), U (T, N, nu); NaN where a step had none."""
+@dataclass(slots=True)
+class Step:
+    """One step of a closed loop as an observer sees it: x_k, y_k, the Move, and where it led.
 
-    X: Float[np.ndarray, "T N1 nx"]
-    U: Float[np.ndarray, "T N nu"]
+    `simulate` fills every field; in a loop of your own k, y, u and reference are enough.
+    """
+
+    k: int
+    y: Float[np.ndarray, " ny"]
+    u: Float[np.ndarray, " nu"]
+    reference: Float[np.ndarray, " nr"]
+    move: Move | None = None
+    x: Float[np.ndarray, " nx"] | None = None
+    plan: Plan | None = None
+    x_next: Float[np.ndarray, " nx"] | None = None
+    y_next: Float[np.ndarray, " ny"] | None = None
+    reference_next: Float[np.ndarray, " nr"] | None = None
+    u_reference: Float[np.ndarray, " nu"] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Run(Value):
-    """A closed loop of T steps of dt seconds, complete: `metrics` and the log need nothing else.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepRows(Value):
+    """Consecutive steps of a closed loop as arrays; row k of each belongs to step k.
+
+    There are m moves. There are n = m + 1 states where the one that the last move led to is among them, else n = m.
 
     Attributes
     ----------
     X
-        (T+1, nx) true states, NaN where the plant hides them.
+        (n, nx) true states, NaN where the plant hides them.
     Y
-        (T+1, ny) measurements as the controller got them, noise and faults included.
+        (n, ny) measurements as the controller got them, noise and faults included.
     U
-        (T, nu) inputs as applied.
+        (m, nu) inputs as applied.
     reference
-        (T+1, nr) row k belongs to x_k.
+        (n, nr) row k belongs to x_k.
     status, fallback
-        T entries each.
+        m entries each.
     solve_time
-        (T,) wall-clock time of each step [s].
+        (m,) wall-clock time of each step [s].
     iterations
-        (T,) solver iterations of each step.
-    plans
-        The plan of each step, where asked for.
+        (m,) solver iterations of each step.
+    slack
+        (m,) how far the plan of each step breaks the soft limit that gives way most, in its own unit; zeros by default.
+    u_reference
+        (m, nu) inputs that hold the reference: the cost charges an input's distance from them; zeros by default.
+    """
+
+    X: Float[np.ndarray, "n nx"]
+    Y: Float[np.ndarray, "n ny"]
+    U: Float[np.ndarray, "m nu"]
+    reference: Float[np.ndarray, "n nr"]
+    status: tuple[Status, ...]
+    fallback: tuple[Fallback, ...]
+    solve_time: Float[np.ndarray, " m"]
+    iterations: Int[np.ndarray, " m"]
+    u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
+    slack: Float[np.ndarray, " ms"] = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if not self.u_reference.size:
+            object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
+        if not self.slack.size:
+            object.__setattr__(self, "slack", np.zeros(len(self.U)))
+
+    @staticmethod
+    def of(steps: Sequence[Step], nx: int, *, end: bool) -> "StepRows":
+        """Return consecutive steps as rows; with `end`, the state that the last one led to is the last row.
+
+        A state that the plant hides is NaN. A step without a Move counts as solved, in no time.
+        """
+        hidden, last = np.full(nx, np.nan), steps[-1]
+        X = [hidden if s.x is None else s.x for s in steps]
+        Y, reference = [s.y for s in steps], [s.reference for s in steps]
+        if end and last.y_next is not None:
+            X.append(hidden if last.x_next is None else last.x_next)
+            Y.append(last.y_next)
+            reference.append(last.reference if last.reference_next is None else last.reference_next)
+        moves = [s.move for s in steps]
+        held = [np.zeros(len(s.u)) if s.u_reference is None else s.u_reference for s in steps]
+        return StepRows(
+            X=np.array(X, dtype=np.float64),
+            Y=np.array(Y, dtype=np.float64),
+            U=np.array([s.u for s in steps], dtype=np.float64),
+            reference=np.array(reference, dtype=np.float64),
+            status=tuple(Status.OPTIMAL if m is None else m.status for m in moves),
+            fallback=tuple(Fallback.NONE if m is None else m.fallback for m in moves),
+            solve_time=np.array([0.0 if m is None else m.solve_time for m in moves]),
+            iterations=np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
+            u_reference=np.array(held, dtype=np.float64),
+            slack=np.array([0.0 if m is None else m.slack for m in moves]),
+        )
+
+    @staticmethod
+    def joined(parts: Sequence["StepRows"]) -> "StepRows":
+        """Return consecutive parts as one, without the last move where the state that it led to is missing."""
+        moves = sum(len(part.X) for part in parts) - 1
+        whole: dict[str, Any] = {}
+        for name in (f.name for f in fields(StepRows)):
+            values = [getattr(part, name) for part in parts]
+            joined = sum(values, ()) if isinstance(values[0], tuple) else np.concatenate(values)
+            whole[name] = joined if name in _OF_STATES else joined[:moves]
+        return StepRows(**whole)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the rows as keywords of a Run."""
+        return {f.name: getattr(self, f.name) for f in fields(StepRows)}
+
+    def part(self, first: int, last: int) -> "StepRows":
+        """Return rows first … last − 1; the state after the last move is among them where `last` is beyond it."""
+        return StepRows(**{name: values[first:last] for name, values in self.columns().items()})
+
+
+_OF_STATES = ("X", "Y", "reference")  # the columns with a row for each state; the others have one for each move
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class About(Value):
+    """What does not change from step to step of a closed loop.
+
+    Attributes
+    ----------
     cost, limits
         What the run is judged by.
-    slack
-        (T,) how far the plan of each step breaks the soft limit that gives way most, in its own unit.
-    u_reference
-        (T, nu) inputs whose distance from U costs: what holds the reference; zeros by default.
     dt
         Sampling time [s].
     states, inputs, outputs
@@ -59,31 +147,64 @@ class Run(Value):
         Names, numbers and lists: problem, controller, case, seeds, versions.
     """
 
-    X: Float[np.ndarray, "T1 nx"]
-    Y: Float[np.ndarray, "T1 ny"]
-    U: Float[np.ndarray, "T nu"]
-    reference: Float[np.ndarray, "T1 nr"]
-    status: tuple[Status, ...]
-    fallback: tuple[Fallback, ...]
-    solve_time: Float[np.ndarray, " T"]
-    iterations: Int[np.ndarray, " T"]
     cost: Cost | None
     limits: Limits | None
     dt: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    plans: Plans | None = None
     angles: tuple[int, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    u_reference: Float[np.ndarray, "T nu"] = field(default_factory=lambda: np.empty((0, 0)))
-    slack: Float[np.ndarray, " Ts"] = field(default_factory=lambda: np.empty(0))
 
-    def __post_init__(self) -> None:
-        if not self.u_reference.size:
-            object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
-        if not self.slack.size:
-            object.__setattr__(self, "slack", np.zeros(len(self.U)))
+    def about(self) -> dict[str, Any]:
+        """Return these fields as keywords of a Run, or of an About."""
+        return {f.name: getattr(self, f.name) for f in fields(About)}
+
+    def tracked(self, nr: int) -> tuple[str, ...]:
+        """Return the names of the `nr` outputs that the references belong to."""
+        names = self.states if self.cost is None else self.cost.of.bind(self.states).names
+        return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))
+
+
+@dataclass(frozen=True, eq=False)
+class Plans(Value):
+    """The plan of every step: X (T, N+1, nx), U (T, N, nu); NaN where a step had none."""
+
+    X: Float[np.ndarray, "T N1 nx"]
+    U: Float[np.ndarray, "T N nu"]
+
+    @staticmethod
+    def of(plans: Sequence[Plan | None]) -> "Plans | None":
+        """Return the plans of consecutive steps; None where no step had one."""
+        first = next((p for p in plans if p is not None), None)
+        if first is None:
+            return None
+        nothing = Plan(np.full_like(first.X, np.nan), np.full_like(first.U, np.nan))
+        whole = [nothing if p is None else p for p in plans]
+        return Plans(np.stack([p.X for p in whole]), np.stack([p.U for p in whole]))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Run(About, StepRows):
+    """A closed loop of T steps of dt seconds, complete: `metrics` and the log need nothing else.
+
+    It has the columns of `StepRows`, with T moves and T + 1 states, and the facts of `About`.
+
+    Attributes
+    ----------
+    X, Y, reference
+        (T+1, nx) true states, (T+1, ny) measurements, (T+1, nr) references.
+    U, u_reference
+        (T, nu) inputs as applied, and the inputs that hold the reference.
+    status, fallback, solve_time, iterations, slack
+        T entries each: how each step ended, how long it took [s], and what its solver did.
+    plans
+        The plan of each step, where asked for.
+    cost, limits, dt, states, inputs, outputs, angles, metadata
+        What does not change from step to step.
+    """
+
+    plans: Plans | None = None
 
     @property
     def steps(self) -> int:

@@ -1,8 +1,9 @@
 """simulate: one controller on one plant, step by step; every step has a status, every input is finite."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import replace
+from math import isfinite
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -11,101 +12,22 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.move import Controller, Move, Plan
+from koopmpc.control.move import Controller, Fallible, Move
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.loop.injection import Fault, Injections, Wiring, call, named
-from koopmpc.loop.run import Plans, Run
+from koopmpc.loop.faults import Fault, Injections, Wiring
+from koopmpc.loop.run import Plans, Run, Step, StepRows
 from koopmpc.plants.simulated import Plant, SimulatedPlant, require_plant
 from koopmpc.plants.step_map import StepMap
 
 Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
-
-
-def reference_rows(reference: ArrayLike, steps: int, horizon: int) -> Float[np.ndarray, "T nr"]:
-    """Return steps + horizon + 1 rows, the last one repeated."""
-    rows = checks.array(reference, "reference")
-    rows = np.atleast_1d(rows)
-    if rows.ndim == 1:
-        rows = np.broadcast_to(rows, (steps + 1, len(rows)))
-    if rows.shape[0] != steps + 1:
-        raise ShapeError(f"reference has shape {rows.shape}, expected (nr,) or (steps+1, nr) = ({steps + 1}, nr)")
-    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
-
-
-def held_inputs(u_reference: ArrayLike | None, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
-    """Return one row a step of the inputs that hold the reference; zeros where there are none."""
-    if u_reference is None:
-        return np.zeros((steps, nu))
-    values = checks.array(u_reference, "u_reference")
-    if values.ndim < 2:
-        return np.tile(checks.vector(values, "u_reference", nu), (steps, 1))
-    return checks.array(values, "u_reference", (steps, nu))
-
-
-def measured_rows(measured: ArrayLike, steps: int, horizon: int) -> Float[np.ndarray, "T nw"]:
-    """Return steps + horizon rows of measured disturbances, the last one repeated."""
-    rows = np.atleast_1d(checks.array(measured, "measured"))
-    if rows.ndim == 1:
-        rows = np.broadcast_to(rows, (steps, len(rows)))
-    if rows.ndim != 2 or len(rows) != steps:
-        raise ShapeError(f"measured has shape {rows.shape}, expected (nw,) or (steps, nw) = ({steps}, nw)")
-    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
-
-
-def signal_of(
-    signal: Signal | None, name: str, rows: int, n: int
-) -> Callable[[int, np.random.Generator], Float[np.ndarray, " n"]] | None:
-    """Return the signal as a function of (k, rng); None where there is none."""
-    if signal is None:
-        return None
-    if callable(signal):
-        return lambda k, rng: checks.array(signal(k, rng), name, (n,))
-    values = checks.array(signal, name)
-    if values.ndim < 2:
-        constant = checks.vector(values, name, n)
-        return lambda k, rng: constant
-    values = checks.array(values, name, (rows, n))
-    return lambda k, rng: values[k]
-
-
-def noise_of(
-    noise: Signal | None, steps: int, ny: int
-) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
-    """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
-    if noise is None or callable(noise) or np.ndim(noise) == 2:
-        return signal_of(noise, "noise", steps + 1, ny)
-    deviation = checks.vector(noise, "noise", ny)
-    return lambda k, rng: deviation * rng.standard_normal(ny)
+StepObserver = Callable[[Step], None]
 
 
 _CONTROLLER = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
     "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller"
 )
-_MOVE = ("status", "fallback", "solve_time", "iterations", "slack")
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One step of a closed loop as an observer sees it: x_k, y_k, the Move, and where it led.
-
-    `simulate` fills every field; in a loop of one's own k, y, u and reference are enough.
-    """
-
-    k: int
-    y: Float[np.ndarray, " ny"]
-    u: Float[np.ndarray, " nu"]
-    reference: Float[np.ndarray, " nr"]
-    move: Move | None = None
-    x: Float[np.ndarray, " nx"] | None = None
-    plan: Plan | None = None
-    x_next: Float[np.ndarray, " nx"] | None = None
-    y_next: Float[np.ndarray, " ny"] | None = None
-    reference_next: Float[np.ndarray, " nr"] | None = None
-    u_reference: Float[np.ndarray, " nu"] | None = None
-
-
-Observer = Callable[[Step], None]
+_MOVE = ("u", "status", "fallback", "solve_time", "iterations", "slack")
 
 
 def simulate(
@@ -123,7 +45,7 @@ def simulate(
     measured: ArrayLike | None = None,
     faults: Sequence[Fault] = (),
     rng: np.random.Generator | int = 0,
-    observers: Sequence[Observer] = (),
+    observers: Sequence[StepObserver] = (),
     plans: bool = False,
     preview: bool = True,
     angles: Sequence[int] = (),
@@ -135,11 +57,15 @@ def simulate(
     ----------
     plant
         A StepMap, or any Plant. Model mismatch is a plant other than the controller's model.
+    controller
+        Any Controller with the plant's dt. It is reset to x0 at the beginning.
     x0
         (nx,) initial state.
     reference
         (nr,) held throughout, or (steps+1, nr): row k belongs to x_k. The controller gets rows k … k+horizon, the
         last one repeated; with ``preview=False`` row k throughout.
+    steps
+        Number of steps T.
     cost, limits
         What the run is judged by; kept in the Run.
     u_reference
@@ -154,130 +80,165 @@ def simulate(
         one repeated; with ``preview=False`` row k throughout. What they do to the plant is a `disturbance`, such as
         W @ E.T. Kept in the metadata.
     faults
-        What breaks, see `koopmpc.loop.faults`; a signal passes through them in order, y_k after its noise. Run.Y is
-        what the controller got and Run.U what the plant got, which the controller is told at the next step; the
-        metadata name them under "faults".
+        What breaks, see `km.faults`. A signal passes through them in order, y_k after its noise. Run.Y is what the
+        controller got. Run.U is what the plant got, which the controller is told at the next step. The metadata
+        name them under "faults".
+    rng
+        Seed of noise, disturbance and faults. Each fault draws from random numbers of its own, so noise and
+        disturbance are the same with and without faults.
     observers
         Called once a step with a Step.
     plans
         Keep the plan of every step.
+    preview
+        Whether the controller gets the references and measured disturbances of the steps ahead.
     angles
         Indices of states whose errors wrap at ±π in the metrics.
+    metadata
+        Names, numbers and lists that the Run and its log keep.
 
     Raises
     ------
     ShapeError, DataError
         Sizes do not fit; plant or controller lack a member; a controller returned a u that is not finite.
     """
-    steps = checks.count(steps, "steps")
-    rng = checks.generator(rng)
+    steps, rng, x0 = checks.count(steps, "steps"), checks.generator(rng), checks.array(x0, "x0", (None,))
     if isinstance(plant, StepMap):
         plant = SimulatedPlant(plant)
     require_plant(plant)
     checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
         raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
-    x0 = checks.array(x0, "x0", (None,))
-    y = _measured(plant.reset(x0, rng))
-    nx, ny, nu = len(plant.states), len(y), controller.nu
+    first = plant.reset(x0, rng)
+    nx, ny, nu, N = len(plant.states), len(first), controller.nu, controller.horizon
     if nu != len(plant.inputs):
         raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(plant.inputs)} ({plant.inputs})")
-    rows = reference_rows(reference, steps, controller.horizon)
+    rows = _rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
     nr = rows.shape[1] if cost is None else cost.of.bind(plant.states).nz
     if rows.shape[1] != nr:
         raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    push = signal_of(disturbance, "disturbance", steps, nx)
-    if push is not None and not isinstance(plant, SimulatedPlant):
+    disturbed = _signal(disturbance, "disturbance", steps, nx)
+    if disturbed is not None and not isinstance(plant, SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
-    jitter = noise_of(noise, steps, ny)
-    held = held_inputs(u_reference, steps, nu)
-    told = None if measured is None else measured_rows(measured, steps, controller.horizon)
-    if told is not None:
-        metadata = {**(metadata or {}), "measured": told[:steps].tolist()}
-    injected = None
+    noisy = _noise(noise, steps, ny)
+    held = np.zeros((steps, nu)) if u_reference is None else _held(u_reference, steps, nu)
+    metadata = dict(metadata or {})
+    W = None
+    if measured is not None:
+        W = _rows_ahead(measured, "measured", "nw", steps, N, "steps")
+        metadata["measured"] = W[:steps].tolist()
+    broken = None
     if faults:
-        box = (limits or Limits()).inputs(nu)
-        injected = Injections(faults, Wiring(ny, box), rng)
-        metadata = {**(metadata or {}), "faults": named(faults)}
+        broken = Injections(faults, Wiring(ny, (limits or Limits()).inputs(nu)), rng)
+        metadata["faults"] = [str(fault) for fault in faults]
 
-    X, Y, U = np.full((steps + 1, nx), np.nan), np.empty((steps + 1, ny)), np.empty((steps, nu))
-    moves: list[Move] = []
-    kept: list[Plan | None] = []
-    look_ahead = getattr(controller, "plan", None)
-    N = controller.horizon
-    Y[0] = y if jitter is None else y + jitter(0, rng)
-    if injected is not None:
-        Y[0] = injected.measured(0, Y[0].copy())
-    _store(X, 0, plant.state)
+    def sensed(k: int, measurement: ArrayLike) -> Float[np.ndarray, " ny"]:
+        y = np.array(measurement, dtype=np.float64)  # NaN passes: the controller then says BAD_MEASUREMENT
+        if noisy is not None:
+            y += noisy(k, rng)
+        return y if broken is None else np.array(broken.measured(k, y), dtype=np.float64)
+
+    def known() -> Float[np.ndarray, " nx"]:
+        state = plant.state
+        return hidden if state is None else np.array(state, dtype=np.float64)
+
+    taken: list[Step] = []
+    hidden = np.full(nx, np.nan)
+    look_ahead = getattr(controller, "plan", None) if plans or observers else None
+    x, y, applied = known(), sensed(0, first), None
+    if x.shape != (nx,):
+        raise ShapeError(f"the plant's state has shape {x.shape}, its states name {nx}; they must agree")
     controller.reset(x0)
+    ask = cast("Callable[..., Move]", controller)
     for k in range(steps):
-        ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, rows.shape[1]))
-        applied = U[k - 1] if k else None
-        more = {} if told is None else {"w": told[k : k + max(N, 1)] if preview else told[k]}
-        fails = injected is not None and injected.solver_fails(k)
-        move = call(controller, Y[k].copy(), ahead, applied, solver_fails=fails, **more)
-        if k == 0:
-            checks.members(move, "what the controller returned", ("u", *_MOVE), "return a km.Move")
-        if np.shape(move.u) != (nu,):
-            raise ShapeError(f"the controller returned u of shape {np.shape(move.u)} at step {k}, expected ({nu},)")
-        if not np.isfinite(move.u).all():
-            raise DataError(f"the controller returned u = {move.u} at step {k}; every input must be finite")
-        U[k] = move.u if injected is None else injected.applied(k, move.u)
-        moves.append(move)
-        plan = look_ahead() if look_ahead is not None and (plans or observers) else None
-        kept.append(plan if plans else None)
-        if push is not None and isinstance(plant, SimulatedPlant):
-            y = _measured(plant.step(U[k].copy(), push(k, rng)))
+        ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, nr))
+        more = {} if W is None else {"w": W[k : k + max(N, 1)] if preview else W[k]}
+        if broken is not None and broken.solver_fails(k) and isinstance(controller, Fallible):
+            controller.solver_fails = True
+            try:
+                move = ask(y.copy(), ahead, applied, **more)
+            finally:
+                controller.solver_fails = False
         else:
-            y = _measured(plant.step(U[k].copy()))
-        Y[k + 1] = y if jitter is None else y + jitter(k + 1, rng)
-        if injected is not None:
-            Y[k + 1] = injected.measured(k + 1, Y[k + 1].copy())
-        _store(X, k + 1, plant.state)
-        if observers:
-            step = Step(k, Y[k], U[k], rows[k], move, X[k], plan, X[k + 1], Y[k + 1], rows[k + 1], held[k])
-            for observer in observers:
-                observer(step)
+            move = ask(y.copy(), ahead, applied, **more)
+        if k == 0:
+            checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
+        u = np.array(move.u, dtype=np.float64)
+        if u.shape != (nu,):
+            raise ShapeError(f"the controller returned u of shape {u.shape} at step {k}, expected ({nu},)")
+        if not all(map(isfinite, u.tolist())):  # for a few inputs four times as fast as numpy
+            raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
+        u = u if broken is None else np.array(broken.applied(k, u), dtype=np.float64)
+        plan = None if look_ahead is None else look_ahead()
+        if disturbed is not None and isinstance(plant, SimulatedPlant):
+            y_next = plant.step(u.copy(), disturbed(k, rng))
+        else:
+            y_next = plant.step(u.copy())
+        x_next, y_next = known(), sensed(k + 1, y_next)
+        step = Step(k, y, u, rows[k], move, x, plan, x_next, y_next, rows[k + 1], held[k])
+        for observer in observers:
+            observer(step)
+        taken.append(step if plans or plan is None else replace(step, plan=None))
+        x, y, applied = x_next, y_next, u
     return Run(
-        X=X,
-        Y=Y,
-        U=U,
-        reference=rows[: steps + 1].copy(),
-        status=tuple(m.status for m in moves),
-        fallback=tuple(m.fallback for m in moves),
-        solve_time=np.array([m.solve_time for m in moves]),
-        iterations=np.array([m.iterations for m in moves], dtype=np.int64),
-        slack=np.array([m.slack for m in moves]),
+        **StepRows.of(taken, nx, end=True).columns(),
         cost=cost,
         limits=limits,
         dt=plant.dt,
         states=tuple(plant.states),
         inputs=tuple(plant.inputs),
         outputs=tuple(plant.outputs),
-        plans=_stack(kept) if plans else None,
+        plans=Plans.of([step.plan for step in taken]),
         angles=tuple(angles),
-        metadata=dict(metadata or {}),
-        u_reference=held,
+        metadata=metadata,
     )
 
 
-def _measured(y: Any) -> Float[np.ndarray, " ny"]:
-    return np.array(y, dtype=np.float64)  # NaN passes: a sensor may fail, and the controller says BAD_MEASUREMENT
+def _rows_ahead(
+    values: ArrayLike, name: str, columns: str, count: int, horizon: int, counted: str
+) -> Float[np.ndarray, "T n"]:
+    """Return `count` rows of a signal that is told ahead, and the last of them again for the horizon behind the end."""
+    rows = np.atleast_1d(checks.array(values, name))
+    if rows.ndim == 1:
+        rows = np.broadcast_to(rows, (count, len(rows)))
+    if rows.ndim != 2 or len(rows) != count:
+        expected = f"({columns},) or ({counted}, {columns}) = ({count}, {columns})"
+        raise ShapeError(f"{name} has shape {rows.shape}, expected {expected}")
+    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
 
 
-def _store(X: Float[np.ndarray, "T1 nx"], k: int, state: Float[np.ndarray, " nx"] | None) -> None:
-    if state is not None:
-        X[k] = state
+def _held(u_reference: ArrayLike, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
+    """Return one row a step of the inputs that hold the reference."""
+    values = checks.array(u_reference, "u_reference")
+    if values.ndim < 2:
+        return np.tile(checks.vector(values, "u_reference", nu), (steps, 1))
+    return checks.array(values, "u_reference", (steps, nu))
 
 
-def _stack(plans: Sequence[Plan | None]) -> Plans | None:
-    """Stack the plans; rows of NaN where a step had none."""
-    first = next((p for p in plans if p is not None), None)
-    if first is None:
+def _signal(
+    signal: Signal | None, name: str, rows: int, n: int
+) -> Callable[[int, np.random.Generator], Float[np.ndarray, " n"]] | None:
+    """Return the signal as a function of (k, rng); None where there is none."""
+    if signal is None:
         return None
-    nothing = Plan(np.full_like(first.X, np.nan), np.full_like(first.U, np.nan))
-    whole = [nothing if p is None else p for p in plans]
-    return Plans(np.stack([p.X for p in whole]), np.stack([p.U for p in whole]))
+    if callable(signal):
+        return lambda k, rng: checks.array(signal(k, rng), name, (n,))
+    values = checks.array(signal, name)
+    if values.ndim < 2:
+        constant = checks.vector(values, name, n)
+        return lambda k, rng: constant
+    values = checks.array(values, name, (rows, n))
+    return lambda k, rng: values[k]
+
+
+def _noise(
+    noise: Signal | None, steps: int, ny: int
+) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
+    """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
+    if noise is None or callable(noise) or np.ndim(noise) == 2:
+        return _signal(noise, "noise", steps + 1, ny)
+    deviation = checks.vector(noise, "noise", ny)
+    return lambda k, rng: deviation * rng.standard_normal(ny)

@@ -1,11 +1,10 @@
-"""About: all of a Run that does not change from step to step, as exact JSON and as a page to read."""
+"""Description: what does not change from step to step of a run, as exact JSON and as a page to read."""
 
 import dataclasses
 import json
 import re
 import unicodedata
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, cast
@@ -17,54 +16,21 @@ from koopmpc.control.limits import Limits
 from koopmpc.errors import LogError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
-from koopmpc.loop.run import Run
-from koopmpc.values import Value, from_data, to_data
+from koopmpc.loop.run import About
+from koopmpc.values import from_data, to_data
 
 _FORMAT = "koopmpc-log-1"
 
 
-@dataclass(frozen=True, eq=False)
-class About(Value):
-    """The fields of a Run that one line in a log holds for all steps."""
+def application_of(about: About) -> str:
+    """Return one application a problem: Rerun keeps the layouts that people make by it."""
+    return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]", "_", str(about.metadata.get("problem", "run")))
 
-    cost: Cost | None
-    limits: Limits | None
-    dt: float
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    angles: tuple[int, ...] = ()
-    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
-    @classmethod
-    def of(cls, run: Run) -> "About":
-        """Return what `run` says about itself."""
-        return cls(**{f.name: getattr(run, f.name) for f in dataclasses.fields(cls)})
-
-    def fields(self) -> dict[str, Any]:
-        """Return the fields as keywords for a Run."""
-        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-
-    @property
-    def problem(self) -> str:
-        """The problem's name, "run" where the metadata have none."""
-        return str(self.metadata.get("problem", "run"))
-
-    @property
-    def application(self) -> str:
-        """One application a problem: Rerun keeps the layouts that people make by it."""
-        return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]", "_", self.problem)
-
-    @property
-    def title(self) -> str:
-        """Problem, case, controller and fault, as far as they are known."""
-        parts = [self.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
-        return " · ".join(str(p) for p in parts if p is not None) or "run"
-
-    def tracked(self, nr: int) -> tuple[str, ...]:
-        """Return the names of the `nr` outputs that the references belong to."""
-        names = self.states if self.cost is None else self.cost.of.bind(self.states).names
-        return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))
+def title_of(about: About) -> str:
+    """Return problem, case, controller and fault, as far as they are known."""
+    parts = [about.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
+    return " · ".join(str(p) for p in parts if p is not None) or "run"
 
 
 def to_json(about: About, steps: int | None) -> str:
@@ -95,7 +61,7 @@ def from_json(text: str) -> tuple[About, int | None]:
 
 def to_markdown(about: About) -> str:
     """Return a page that says what ran, under which cost and limits, with which seeds and versions."""
-    lines = [f"# {about.title}", ""]
+    lines = [f"# {title_of(about)}", ""]
     if "title" in about.metadata:
         lines += [str(about.metadata["title"]), ""]
     lines += [f"**States** {', '.join(about.states)}  ", f"**Inputs** {', '.join(about.inputs)}  "]

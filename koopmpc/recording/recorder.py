@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event, Thread
@@ -16,20 +15,17 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.errors import DataError
-from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import Step
-from koopmpc.recording.description import About
-from koopmpc.recording.format.rows import Rows, rows_of_run, rows_of_steps, run_of_rows
+from koopmpc.loop.run import About, Run, Step, StepRows
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.recording.format.rows import block_of_run, block_of_steps
 from koopmpc.recording.format.writer import Writer
 from koopmpc.recording.viewer import PORT, find_viewer, why_none
-from koopmpc.recording.views.eigenvalues import Model
-from koopmpc.recording.views.scenes import Scene
+from koopmpc.scene import Scene
 
 _BATCH = 0.2  # time between two batches [s]
-_NO_PLANS = np.empty((0, 0, 0))
 
 
-class Stream:
+class BackgroundWriter:
     """Steps go into `put`, which returns at once; a thread writes them in batches until `close`."""
 
     def __init__(self, about: About, writer: Writer) -> None:
@@ -51,7 +47,7 @@ class Stream:
 
     def _work(self, writer: Writer) -> None:
         """Write batches until the end; after a failure nothing more is written, and `close` tells."""
-        blocks: list[Rows] = []
+        written: list[StepRows] = []  # for the metrics at the end
         last: list[Step] = []  # held back, for the state that it led to may come with the end
         closing = False
         while not closing:
@@ -62,12 +58,14 @@ class Stream:
             try:
                 ready, last = (steps, []) if closing else (steps[:-1], steps[-1:])
                 if ready:
-                    rows = rows_of_steps(ready, len(self._about.states), end=closing)
-                    blocks.append(replace(rows, planned=rows.planned[:0], plan_X=_NO_PLANS, plan_U=_NO_PLANS))
+                    rows = block_of_steps(ready, len(self._about.states), end=closing)
+                    written.append(StepRows(**rows.columns()))
                     writer.write(rows)
                     writer.flush()
                 if closing:
-                    writer.end(run_of_rows(blocks, self._about))
+                    whole = sum(len(part.X) for part in written) > 1
+                    columns = StepRows.joined(written).columns() if whole else {}
+                    writer.end(Run(**columns, **self._about.about()) if whole else None)
             except Exception as error:  # whatever a scene, a disk or a viewer raises must not reach the loop
                 self._failure = error
 
@@ -84,7 +82,9 @@ class Stream:
 _PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
 
 
-def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Model | None = None) -> None:
+def record(
+    run: Run, path: str | Path, *, scene: Scene | None = None, model: LinearPredictor | BilinearPredictor | None = None
+) -> None:
     """Write `run` as a complete Rerun log; `load_run(path)` equals `run` to the bit.
 
     Parameters
@@ -103,8 +103,8 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Mod
     LogError
         The path cannot be written.
     """
-    writer = Writer(About.of(run), path=Path(path), scene=scene, model=model, steps=run.steps)
-    writer.write(rows_of_run(run))
+    writer = Writer(About(**run.about()), path=Path(path), scene=scene, model=model, steps=run.steps)
+    writer.write(block_of_run(run))
     writer.end(run)
 
 
@@ -124,7 +124,7 @@ class Recorder:
     path
         The .rrd to write; None for a viewer alone.
     live
-        Stream to a viewer.
+        BackgroundWriter to a viewer.
     dt, states, inputs, outputs, cost, limits, angles, metadata
         As in a Run; outputs are the states by default.
     scene, model
@@ -153,7 +153,7 @@ class Recorder:
         angles: Sequence[int] = (),
         metadata: Mapping[str, Any] | None = None,
         scene: Scene | None = None,
-        model: Model | None = None,
+        model: LinearPredictor | BilinearPredictor | None = None,
         live: bool = False,
         port: int = PORT,
     ) -> None:
@@ -171,17 +171,17 @@ class Recorder:
         )
         self._path, self._live, self._port = None if path is None else Path(path), live, port
         self._scene, self._model = scene, model
-        self._streams: dict[str, Stream] = {}
+        self._writers: dict[str, BackgroundWriter] = {}
         self._open = False
 
     def __enter__(self) -> "Recorder":
         """Open the log, and find the viewer."""
         if self._path is not None:
-            self._streams[str(self._path)] = self._stream(self._path, None)
+            self._writers[str(self._path)] = self._opened(self._path, None)
         if self._live:
             viewer = find_viewer(self._port)
             if viewer is not None:
-                self._streams[viewer] = self._stream(None, viewer)
+                self._writers[viewer] = self._opened(None, viewer)
             else:
                 kept = "the log is written all the same" if self._path else "nothing is recorded"
                 warnings.warn(f"{why_none(self._port)}; {kept}", UserWarning, stacklevel=2)
@@ -193,23 +193,23 @@ class Recorder:
         if not self._open:
             raise DataError("the Recorder is not open; call it inside `with Recorder(...) as recorder:`")
         own = _copied(step)
-        for stream in self._streams.values():
-            stream.put(own)
+        for writer in self._writers.values():
+            writer.put(own)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Write what is queued, the metrics and the end, and close."""
         self._open = False
-        for name, stream in self._streams.items():
-            failure = stream.close(_PATIENCE_FILE if name == str(self._path) else _PATIENCE_VIEWER)
+        for name, writer in self._writers.items():
+            failure = writer.close(_PATIENCE_FILE if name == str(self._path) else _PATIENCE_VIEWER)
             if failure is not None:
                 warnings.warn(f"the recording to {name} is not complete: {failure}", UserWarning, stacklevel=2)
-        self._streams = {}
+        self._writers = {}
 
-    def _stream(self, path: Path | None, viewer: str | None) -> Stream:
+    def _opened(self, path: Path | None, viewer: str | None) -> BackgroundWriter:
         writer = Writer(self._about, path=path, viewer=viewer, scene=self._scene, model=self._model)
-        return Stream(self._about, writer)
+        return BackgroundWriter(self._about, writer)
 
 
 def _copied(step: Step) -> Step:

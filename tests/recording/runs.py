@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control.move import Fallback, Plan
-from koopmpc.loop.run import Plans
-from koopmpc.loop.simulate import Step
+from koopmpc.loop.run import Plans, Step
 
 metadata = st.dictionaries(
     st.text(max_size=8),

@@ -10,8 +10,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.recording.description import About, from_json, to_json, to_markdown
-from koopmpc.recording.format.rows import blocks, rows_of_run, run_of_rows
+from koopmpc.loop.run import About, Run, StepRows
+from koopmpc.recording.description import from_json, to_json, to_markdown
+from koopmpc.recording.format.rows import block_of_run, blocks
 from tests.recording.runs import make_run, options
 
 
@@ -68,12 +69,12 @@ def test_a_scene_whose_shapes_change_is_refused(ahead: bool, tmp_path: Path) -> 
 @given(T=st.integers(1, 12), least=st.integers(1, 4), most=st.integers(1, 6), k=st.integers(0, 5))
 def test_blocks_are_the_rows(T: int, least: int, most: int, k: int) -> None:
     run = make_run(T=T, N=2)
-    rows = replace(rows_of_run(run), k=k, planned=np.arange(k, k + T))
+    rows = replace(block_of_run(run), k=k, planned=np.arange(k, k + T))
     parts = blocks(rows, least, most)
     assert len(parts) <= most
     assert all(len(part.U) >= min(least, T) for part in parts)
     assert [part.k for part in parts] == [k + sum(len(p.U) for p in parts[:i]) for i in range(len(parts))]
-    assert run_of_rows(parts, About.of(run)) == replace(run, plans=None)
+    assert Run(**StepRows.joined(parts).columns(), **run.about()) == replace(run, plans=None)
     assert all(np.array_equal(p.planned, p.k + np.arange(len(p.U))) for p in parts)
     assert np.array_equal(np.concatenate([p.plan_X for p in parts]), run.plans.X)
     assert np.array_equal(np.concatenate([p.plan_U for p in parts]), run.plans.U)
@@ -112,7 +113,7 @@ def test_the_description_says_what_ran_and_with_what() -> None:
         "seed": 7,
         "versions": {"casadi": "9.9"},
     }
-    page = to_markdown(About.of(make_run(metadata=told)))
+    page = to_markdown(About(**make_run(metadata=told).about()))
     assert page.startswith("# pendulum · upright · lqr")
     for part in (
         "| seed | 7 |",
@@ -127,8 +128,8 @@ def test_the_description_says_what_ran_and_with_what() -> None:
 
 def test_the_description_is_exact_data() -> None:
     run = make_run(metadata={"a": [1, 2.5, None], "b": {"c": float("nan")}, "d": np.arange(3.0)})
-    about, steps = from_json(to_json(About.of(run), 20))
-    assert about == About.of(run)
+    about, steps = from_json(to_json(About(**run.about()), 20))
+    assert about == About(**run.about())
     assert steps == 20
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.figures.plane import eigenfunctions_on, plane_through
-from koopmpc.recording.format.columns import Columns, read_columns
+from koopmpc.recording.format.columns import LogColumns, read_columns
 from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from koopmpc.recording.views.eigenvalues import circle, sequence
 from koopmpc.validate.forecast import forecast
@@ -28,7 +28,7 @@ def log(tmp_path_factory: pytest.TempPathFactory, report: km.validate.TrustRepor
     return path
 
 
-def _read(path: Path, *entities: str) -> Columns:
+def _read(path: Path, *entities: str) -> LogColumns:
     return read_columns(path, entities)
 
 

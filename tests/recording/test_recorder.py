@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.loop.simulate import Step
+from koopmpc.loop.run import Step
 from koopmpc.recording import viewer as connect
 from koopmpc.recording.viewer import free_port, start_viewer
 from tests.recording.runs import about, make_run, steps_of

@@ -1,5 +1,5 @@
 # pyright: basic
-"""Columns: what an .rrd file holds, by entity and component; torn ends are cut off, changed columns found."""
+"""LogColumns: what an .rrd file holds, by entity and component; torn ends are cut off, changed columns found."""
 
 import json
 import struct
@@ -20,7 +20,7 @@ _MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and
 _FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
 
 
-class Columns:
+class LogColumns:
     """The columns of a recording: rows in order of their step, by (entity, component).
 
     `torn` says that the file ends within a message.
@@ -104,7 +104,7 @@ def _whole(k: np.ndarray) -> int:
     return int(gaps[0]) if len(gaps) else len(k)
 
 
-def read_columns(path: Path, entities: tuple[str, ...]) -> Columns:
+def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
     """Return the columns of the `entities` in the file.
 
     Raises
@@ -119,7 +119,7 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> Columns:
         with _whole_messages(path) as (whole, torn), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Rerun's word on a missing footer: load_run has its own
             chunks = RrdReader(whole).stream().filter(content=list(entities)).to_chunks()
-            return Columns(chunks, entities, torn)
+            return LogColumns(chunks, entities, torn)
     except LogError:
         raise
     except Exception as error:  # the reader of Rerun raises whatever its own parts raise

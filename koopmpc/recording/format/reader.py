@@ -11,9 +11,9 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.data.files.storage import reads
 from koopmpc.errors import LogError
-from koopmpc.loop.run import Plans, Run
-from koopmpc.recording.description import About, from_json
-from koopmpc.recording.format.columns import Columns, read_columns
+from koopmpc.loop.run import About, Plans, Run
+from koopmpc.recording.description import from_json
+from koopmpc.recording.format.columns import LogColumns, read_columns
 
 _ENTITIES = (
     "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/slack", "/solver/time_ms",
@@ -39,7 +39,7 @@ def load_run(path: str | Path) -> Run:
         raise LogError(f"{path} is damaged: {error}") from error
 
 
-def _run(log: Columns, path: Path) -> Run:
+def _run(log: LogColumns, path: Path) -> Run:
     about, planned_steps = _about(log, path)
     X, reference = log.vectors("/state"), log.vectors("/reference")
     U = log.vectors("/control/u")
@@ -78,11 +78,11 @@ def _run(log: Columns, path: Path) -> Run:
         plans=_plans(log, steps),
         u_reference=_sparse(log, "/control/u_reference", steps, len(about.inputs)),
         slack=_sparse(log, "/solver/slack", steps, 1)[:, 0],
-        **about.fields(),
+        **about.about(),
     )
 
 
-def _about(log: Columns, path: Path) -> tuple[About, int | None]:
+def _about(log: LogColumns, path: Path) -> tuple[About, int | None]:
     text = log.static("/description", "json")
     if text is None:
         raise LogError(
@@ -91,7 +91,7 @@ def _about(log: Columns, path: Path) -> tuple[About, int | None]:
     return from_json(text)
 
 
-def _measured(log: Columns, X: np.ndarray) -> np.ndarray:
+def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
     """Return the measurements: the states, but for the rows that were written apart."""
     k, values = log.matrix("/measurement")
     if not len(k):
@@ -104,7 +104,7 @@ def _measured(log: Columns, X: np.ndarray) -> np.ndarray:
     return Y
 
 
-def _sparse(log: Columns, entity: str, steps: int, width: int) -> np.ndarray:
+def _sparse(log: LogColumns, entity: str, steps: int, width: int) -> np.ndarray:
     """Return the rows of an entity: zero, but for those that were written."""
     k, values = log.matrix(entity)
     held, inside = np.zeros((steps, width)), k < steps
@@ -113,7 +113,7 @@ def _sparse(log: Columns, entity: str, steps: int, width: int) -> np.ndarray:
     return held
 
 
-def _statuses(log: Columns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
+def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
     """Return what each step ended with: the last change at or before it."""
     k, _, words = log.rows("/solver/status", "state")
     if not len(k) or k[0] != 0:
@@ -131,7 +131,7 @@ def _pair(word: str) -> tuple[Status, Fallback]:
     return Status[status], Fallback[fallback or "NONE"]
 
 
-def _plans(log: Columns, steps: int) -> Plans | None:
+def _plans(log: LogColumns, steps: int) -> Plans | None:
     """Return the plans, NaN where a step had none; None where no step had one."""
     parts = []
     for entity in ("/prediction/x", "/prediction/u"):

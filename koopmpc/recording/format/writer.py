@@ -14,12 +14,21 @@ from koopmpc import checks
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
-from koopmpc.loop.run import Run
-from koopmpc.recording.description import About, drawable, metrics_to_markdown, to_json, to_markdown
-from koopmpc.recording.format.rows import Rows, blocks
+from koopmpc.loop.run import About, Run
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.recording.description import (
+    application_of,
+    drawable,
+    metrics_to_markdown,
+    title_of,
+    to_json,
+    to_markdown,
+)
+from koopmpc.recording.format.rows import LogBlock, blocks
 from koopmpc.recording.views.blueprint import blueprint, input_limits, styles
-from koopmpc.recording.views.eigenvalues import Model, draw_eigenvalues
-from koopmpc.recording.views.scenes import Bounds, Drawing, Names, Scene, draw, draw_ahead, stages
+from koopmpc.recording.views.eigenvalues import draw_eigenvalues
+from koopmpc.recording.views.scenes import Drawing, Extent, Names, draw, draw_ahead, stages
+from koopmpc.scene import Scene
 
 _FLUSH = 3.0  # longest wait for a sink [s]
 
@@ -38,7 +47,7 @@ class Writer:
         path: Path | None,
         viewer: str | None = None,
         scene: Scene | None = None,
-        model: Model | None = None,
+        model: LinearPredictor | BilinearPredictor | None = None,
         steps: int | None = None,
     ) -> None:
         """Check what is told; `viewer` is the address of a viewer that is up."""
@@ -47,9 +56,9 @@ class Writer:
         self._about, self._scene, self._model = about, scene, model
         self._page, self._json = to_markdown(about), to_json(about, steps)  # refuses what cannot be saved
         self._path, self._viewer = path, viewer
-        self._rec = rr.RecordingStream(about.application, recording_id=uuid.uuid4())
+        self._rec = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
         self._opened, self._ahead = False, False  # ahead: whether a plan was ever drawn
-        self._bounds, self._shown = Bounds(), Bounds().ranges()
+        self._extent, self._shown = Extent(), Extent().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # of each column's bytes: a damaged log must not read as a whole one
@@ -59,7 +68,7 @@ class Writer:
             with checks.writing(path, "ab"):
                 pass  # Rerun makes no folders, and says nothing of what it cannot write
 
-    def write(self, rows: Rows) -> None:
+    def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""
         parts = blocks(rows)
         drawings = [self._drawings(part) for part in parts]  # all, for the layout shows as much as they fill
@@ -68,7 +77,7 @@ class Writer:
         for part, drawn in zip(parts, drawings, strict=True):
             self._write(part, drawn)
 
-    def _write(self, rows: Rows, drawings: dict[str, Drawing]) -> None:
+    def _write(self, rows: LogBlock, drawings: dict[str, Drawing]) -> None:
         import rerun as rr
 
         n, m = len(rows.X), len(rows.U)
@@ -129,7 +138,7 @@ class Writer:
             self._open()
         document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
         self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
-        if self._bounds.ranges() != self._shown:
+        if self._extent.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
         self.flush()
         self._rec.disconnect()
@@ -142,7 +151,7 @@ class Writer:
         sinks: list[Any] = [] if self._path is None else [rr.FileSink(self._path)]
         sinks += [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
         self._rec.set_sinks(*sinks)
-        self._rec.send_recording_name(drawable(self._about.title))
+        self._rec.send_recording_name(drawable(title_of(self._about)))
         self._sum("/description:json", self._json.encode())
         text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
         self._rec.log("description", text, rr.AnyValues(json=self._json), static=True)
@@ -153,9 +162,9 @@ class Writer:
                 self._style(entity, drawing)
 
     def _blueprint(self) -> Any:
-        self._shown = self._bounds.ranges()
-        bounds = self._bounds if self._scene is not None else None
-        return blueprint(self._about, bounds=bounds, model=self._model)
+        self._shown = self._extent.ranges()
+        extent = self._extent if self._scene is not None else None
+        return blueprint(self._about, extent=extent, model=self._model)
 
     def _times(self, k: np.ndarray) -> list[Any]:
         import rerun as rr
@@ -185,7 +194,7 @@ class Writer:
             self._styled.add(entity)
             self._rec.log(entity, style, static=True)
 
-    def _statuses(self, rows: Rows) -> None:
+    def _statuses(self, rows: LogBlock) -> None:
         """Write the status where it changes, and a line of text for every fallback that sets in."""
         import rerun as rr
 
@@ -203,7 +212,7 @@ class Writer:
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
             self._rec.send_columns("log", self._times(rows.k + np.array(fallen)), columns)
 
-    def _drawings(self, rows: Rows) -> dict[str, Drawing]:
+    def _drawings(self, rows: LogBlock) -> dict[str, Drawing]:
         """Return the scene of every row, and of a few stages of its plan, by entity."""
         scene = self._scene
         if scene is None:
@@ -220,12 +229,12 @@ class Writer:
             x = y if np.isnan(x).any() and len(y) == len(x) else x
             shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
             now.append([] if shapes is None else self._names.checked(shapes, rows.k + i))
-        drawn = draw(self._names, now, self._bounds)
+        drawn = draw(self._names, now, self._extent)
         found = {f"world/{name}": drawing for name, drawing in drawn.items()}
         if ahead or self._ahead:
             self._ahead = True
             futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
-            drawn = draw_ahead(self._names, now, futures, self._bounds)
+            drawn = draw_ahead(self._names, now, futures, self._extent)
             found |= {f"world/prediction/{name}": drawing for name, drawing in drawn.items()}
         return found
 

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc.recording.description import About, drawable
-from koopmpc.recording.format.rows import Rows
-from koopmpc.recording.views.eigenvalues import Model, eigenvalue_views
-from koopmpc.recording.views.scenes import BACKGROUND, Bounds
+from koopmpc.loop.run import About
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.recording.description import drawable
+from koopmpc.recording.format.rows import LogBlock
+from koopmpc.recording.views.eigenvalues import eigenvalue_views
+from koopmpc.recording.views.scenes import BACKGROUND, Extent
 from koopmpc.scene import Color
 
 PALETTE: tuple[Color, ...] = (
@@ -26,7 +28,7 @@ _LIMIT: Color = (232, 84, 84)
 _QUIET: Color = (140, 148, 160)
 
 
-def styles(about: About, rows: Rows) -> dict[str, Any]:
+def styles(about: About, rows: LogBlock) -> dict[str, Any]:
     """Return the static archetypes by entity that name and colour what `rows` hold."""
     import rerun as rr
 
@@ -85,10 +87,10 @@ def _lines(names: Sequence[str], colors: Sequence[Color], width: float, **more: 
 _SEPARATE = 4  # up to so many states have a plot each
 
 
-def blueprint(about: About, *, bounds: Bounds | None, model: Model | None) -> Any:
+def blueprint(about: About, *, extent: Extent | None, model: LinearPredictor | BilinearPredictor | None) -> Any:
     """Return the layout of one run: what the data cannot fill has no view.
 
-    `bounds` is what the animation shows, None where there is no scene.
+    `extent` is what the animation shows, None where there is no scene.
     """
     import rerun.blueprint as rrb
 
@@ -114,7 +116,7 @@ def blueprint(about: About, *, bounds: Bounds | None, model: Model | None) -> An
         rrb.TextLogView(origin="log", name="Log"),
     )
     lower = texts if model is None else rrb.Horizontal(eigenvalue_views(model)[0], texts)
-    right = lower if bounds is None else rrb.Vertical(_animation(bounds), lower, row_shares=[3.0, 2.0])
+    right = lower if extent is None else rrb.Vertical(_animation(extent), lower, row_shares=[3.0, 2.0])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.0, 1.0]),
         rrb.TimePanel(timeline="sim_time", state="collapsed"),
@@ -149,10 +151,10 @@ def _states(about: About) -> list[Any]:
     ]
 
 
-def _animation(bounds: Bounds) -> Any:
+def _animation(extent: Extent) -> Any:
     import rerun.blueprint as rrb
 
-    ranges = bounds.ranges()
+    ranges = extent.ranges()
     fixed = None if ranges is None else rrb.VisualBounds2D(x_range=ranges[0], y_range=ranges[1])
     return rrb.Spatial2DView(
         origin="world",

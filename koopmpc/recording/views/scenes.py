@@ -1,7 +1,7 @@
 # pyright: basic
 """Scenes: shapes over time as columns for Rerun; recording knows shapes, no plant."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -11,7 +11,6 @@ from jaxtyping import Float
 from koopmpc.errors import DataError
 from koopmpc.scene import Box, Color, Disk, Line, Shape
 
-Scene = Callable[[np.ndarray, np.ndarray], Sequence[Shape]]
 BACKGROUND: Color = (247, 248, 250)
 _FAR = 0.25  # how far beyond what was drawn a prediction is shown, as a share of it: some predictions diverge
 _STAGES = 4  # how many future stages of a plan are drawn
@@ -41,7 +40,7 @@ class Box2D:
 
 
 @dataclass
-class Bounds:
+class Extent:
     """What the animation shows: all that was drawn, and what was predicted as far as that is not far off."""
 
     drawn: Box2D = field(default_factory=Box2D)
@@ -85,10 +84,10 @@ class Names:
         return list(scene)
 
 
-def draw(names: Iterable[str], scenes: Sequence[Sequence[Shape]], bounds: Bounds) -> dict[str, Drawing]:
+def draw(names: Iterable[str], scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
     """Return a drawing by name for one scene a row; an empty scene clears what was there."""
     for shape in (shape for scene in scenes for shape in scene):
-        bounds.drawn.include(shape)
+        extent.drawn.include(shape)
     return {
         name: _drawing([[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i)
         for i, name in enumerate(names)
@@ -99,14 +98,14 @@ def draw_ahead(
     names: Iterable[str],
     scenes: Sequence[Sequence[Shape]],
     ahead: Sequence[Sequence[Sequence[Shape]]],
-    bounds: Bounds,
+    extent: Extent,
 ) -> dict[str, Drawing]:
     """Return a drawing by name for the predicted scenes of each row, the later the fainter.
 
     A shape that does not move within the plan is not drawn again.
     """
     for shape in (shape for row in ahead for scene in row for shape in scene):
-        bounds.predicted.include(shape)
+        extent.predicted.include(shape)
     drawings: dict[str, Drawing] = {}
     for name in names:
         rows: list[list[tuple[Shape, Color]]] = []
