@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.bench.controllers import CONTROLLERS
-from koopmpc.bench.faults import FAULTS
+from koopmpc.bench.sweep import FAULTS
 from koopmpc.cli.app import _program, app
 from tests.bench.tiny import write
 

@@ -1,4 +1,4 @@
-"""What the controllers and cases of one problem share, built once: the step map, the truth, the data, the model."""
+"""The seven controllers of the bench, and what they share of one problem: step map, plant, data and models."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -32,9 +32,9 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 
 class Prepared:
-    """The parts of a problem, each built when it is first asked for and then kept.
+    """The parts of a problem; each is built when it is first used and then kept.
 
-    `model` is made from data alone; `step_map` is what linear and nonlinear controllers are given.
+    Koopman controllers get `model` or `bilinear`, which are fitted to data alone; the others get `step_map`.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -49,11 +49,11 @@ class Prepared:
 
     @cached_property
     def truth(self) -> StepMap | Plant:
-        """The plant that is driven: the problem's `plant`, or its model where there is none."""
+        """The plant that is driven: the problem's `plant`, by default its model."""
         return self._driven(self.problem.plant)
 
     def truth_of(self, case: str) -> StepMap | Plant:
-        """Return the plant that is driven in this case: its own, or the problem's."""
+        """Return the plant that is driven in this case, by default the problem's."""
         plant = self.problem.cases[case].plant
         return self.truth if plant is None else self._driven(plant)
 
@@ -65,9 +65,10 @@ class Prepared:
         return plant
 
     def u_reference(self, case: str) -> Float[np.ndarray, "T nu"]:
-        """Return the inputs that hold the references of a case, found on the truth; kept for the next controller.
+        """Return the inputs that hold the references of a case on the plant that is driven.
 
-        On a plant without equations they are the model's, and zero where the cost's u_target is "zero".
+        Where that plant has no equations they are found on the model; where the cost's u_target is "zero" they are
+        zero. They are found once and serve all controllers.
         """
         if case not in self._held:
             self._held[case] = self._find(case)
@@ -88,7 +89,7 @@ class Prepared:
 
     @cached_property
     def data(self) -> Episodes:
-        """Episodes of the truth under the problem's excitation."""
+        """Episodes of the plant under the problem's excitation."""
         training = self.problem.training
         return collect(
             self.truth,
@@ -101,7 +102,7 @@ class Prepared:
 
     @cached_property
     def model(self) -> LinearPredictor:
-        """z⁺ = A z + B u fitted to the data; `training_time` [s] is what data and fit took."""
+        """z⁺ = A z + B u fitted to the data; `training_time` [s] is how long data and fit took."""
         start = time.perf_counter()
         model = edmd(self.data, self.problem.lifting, ridge=self.problem.ridge)
         self.training_time = time.perf_counter() - start
@@ -117,13 +118,13 @@ Build = Callable[[Prepared, Limits], Controller]
 
 
 def _lqr(parts: Prepared, limits: Limits) -> Controller:
-    """Feedback of the model's linearisation at the equilibrium."""
+    """LQR on the model's linearisation at the equilibrium."""
     model = LinearPredictor.local(parts.step_map, *parts.problem.equilibrium)
     return LQR(model, parts.problem.cost, limits)
 
 
 def _koopman_lqr(parts: Prepared, limits: Limits) -> Controller:
-    """Feedback of the lifted state."""
+    """LQR on the lifted predictor, learned from data."""
     return LQR(parts.model, parts.problem.cost, limits)
 
 
@@ -139,18 +140,18 @@ def _koopman_mpc(parts: Prepared, limits: Limits) -> Controller:
 
 
 def _offset_free(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the lifted predictor, with a disturbance of every lifted coordinate."""
+    """MPC on the lifted predictor, with an estimated disturbance of every lifted coordinate."""
     problem = parts.problem
     return KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
 
 
 def _bilinear_mpc(parts: Prepared, limits: Limits) -> Controller:
-    """Real-time iterations on the bilinear predictor, lifted anew at every step of the plan."""
+    """Real-time iteration on the bilinear predictor, which is lifted anew at every step of the plan."""
     return BilinearMPC(parts.bilinear, parts.problem.cost, limits, parts.problem.horizon)
 
 
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the model itself, the best of twelve starts: the oracle where the model is the truth."""
+    """MPC on the model itself, the best of twelve initial guesses: the oracle where the model is the plant."""
     return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
 
 
@@ -167,8 +168,8 @@ CONTROLLERS: dict[str, Build] = {
 LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc")
 
 
-def chosen(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the names of controllers, all seven by default.
+def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
+    """Return the names as a tuple, by default all seven.
 
     Raises
     ------

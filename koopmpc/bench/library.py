@@ -1,4 +1,4 @@
-"""The problems that there are: found by path or name, loaded from one file each."""
+"""Problem files: found by path or name, listed, and loaded."""
 
 import ast
 import hashlib
@@ -18,7 +18,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 class Entry(NamedTuple):
-    """A problem file: its name, the first line of its docstring, and where it is."""
+    """A problem file: its name, the first line of its docstring, and its path."""
 
     name: str
     title: str
@@ -26,13 +26,13 @@ class Entry(NamedTuple):
 
 
 def shipped() -> tuple[Path, ...]:
-    """Return the problem files that come with koopmpc: inside the wheel, or beside the package in a checkout."""
+    """Return the problem files that come with koopmpc, inside the wheel or beside the package in a checkout."""
     wheel = _PACKAGE / "problems"
     return tuple(_files(wheel if wheel.is_dir() else _PACKAGE.parent / "problems"))
 
 
 def list_problems() -> tuple[Entry, ...]:
-    """Return every problem that has a name here: those in ./problems first, then the shipped ones."""
+    """Return every problem that can be loaded by name: those in ./problems first, then the shipped ones."""
     found: dict[str, Path] = {}
     for path in (*_files(Path("problems")), *shipped()):
         found.setdefault(path.stem, path)
@@ -48,8 +48,7 @@ def load_problem(problem: str | Path) -> Problem:
     Raises
     ------
     ProblemError
-        There is no such problem or case (the message names the nearest), the file raises, or it defines no
-        `problem`.
+        There is no such problem or case, the file raises, or it defines no `problem`.
     """
     text = str(problem)
     path, case = _find(text), ""

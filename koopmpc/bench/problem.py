@@ -32,9 +32,14 @@ class Training:
     excitation
         u_k = excitation(k, y, rng): Noise, PRBS, Multisine, Chirp, Feedback, or a function.
     episodes, steps
-        How many episodes, of how many steps each.
+        Number of episodes, and number of steps in each.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
+
+    Raises
+    ------
+    DataError
+        There is no episode or no step.
     """
 
     x0: Uniform | ArrayLike
@@ -50,7 +55,7 @@ class Training:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One start and one reference, the same for every controller.
+    """One initial state and one reference, the same for every controller.
 
     Attributes
     ----------
@@ -61,9 +66,15 @@ class Case:
     steps
         Length of the run.
     limits
-        Take the place of the problem's limits in this case.
+        Limits of this case; by default those of the problem.
     plant
-        The truth of this case, where nobody was told of it: another mass, a load. Data are the problem's.
+        The plant that is driven in this case, for example one with another mass, which no controller knows of. The
+        training data still come from the problem's plant.
+
+    Raises
+    ------
+    DataError, ShapeError
+        x0 or the reference holds NaN, x0 is no vector, or there is no step.
     """
 
     x0: ArrayLike
@@ -97,24 +108,26 @@ class Problem:
     cost, limits, horizon
         The same for all controllers.
     cases
-        At least one, by name.
+        Cases by name, at least one.
+    integrator
+        The method that turns ẋ = f(x, u) into x⁺ = F(x, u).
     angles
         Indices of states whose errors wrap at ±π.
     plant
-        The truth, where it differs from `dynamics`: data are collected and runs are made on it.
+        The plant that data are collected from and that runs are made on; by default `dynamics`.
     controllers
-        Names of the controllers that the bench compares; all by default. A cost on observables that a linearisation
-        lacks, such as sin θ, leaves linear ones out.
+        Names of the controllers that the bench compares; all by default. Where the cost is on observables that a
+        linearisation lacks, such as sin θ, name only controllers that have them.
     scene
-        scene(x, u) → shapes, always the same names; recordings draw them.
+        scene(x, u) → shapes, always with the same names; recordings draw them.
     name, title
         The file's stem and the first line of its docstring; `load_problem` fills them in.
 
     Raises
     ------
     ShapeError, DataError
-        A start, a reference, the equilibrium, an angle, the cost or limits do not fit; there is no case, or one
-        whose name cannot be a file's.
+        An initial state, a reference, the equilibrium, an angle, the cost or the limits do not fit; there is no case,
+        or the name of one cannot be that of a file.
     """
 
     dynamics: Dynamics
@@ -170,7 +183,7 @@ class Problem:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
 
     def select(self, case: str) -> "Problem":
-        """Return the problem with this one case.
+        """Return the problem with this case alone.
 
         Raises
         ------
@@ -191,7 +204,7 @@ class Problem:
 
 
 def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
-    """Raise where limits have other sizes than the inputs, states and observables that they limit."""
+    """Raise a ShapeError where limits have other sizes than the inputs, states and observables that they limit."""
     try:
         limits.inputs(dynamics.nu)
         limits.rates(dynamics.nu)

@@ -1,5 +1,5 @@
 # pyright: basic
-"""Row: what one run amounts to, and whether it ended as it should."""
+"""RunRow: the figures of one run of the bench, whether it ended as it should, and results.parquet."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,29 +14,29 @@ from koopmpc.loop.run import Run
 
 ORACLE = "nonlinear-mpc"
 REACHED = 0.05  # the band around the reference, as a share of the first weighted error
-_TOLERANCE = 1e-9  # of an input limit, relative
+_TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
 
 
 @dataclass(frozen=True)
-class Row:
+class RunRow:
     """One run of the bench.
 
     Attributes
     ----------
     problem, case, controller
-        Which run it was.
+        Names that identify the run.
     metrics
-        Its figures; None where it raised.
+        Figures of the run; None where it raised.
     reached
         Whether the weighted tracking error stays below 5 % of its first value over the last tenth of the run.
     training_time
-        What the data and the fit of its model took [s]; 0 for controllers that learn nothing.
+        Time to collect the data and fit the model [s]; 0 for controllers that learn nothing.
     log
-        Where its log is; None where there is none.
+        Path of the log; None where there is none.
     failure
-        Why it did not end as it should; None where it did. Poor control is no failure.
+        Why the run did not end as it should; None where it did. Poor control is no failure.
     fault
-        Name of what was broken on purpose; None where nothing was.
+        Name of the injected fault; None where there was none.
     """
 
     problem: str
@@ -50,16 +50,16 @@ class Row:
     fault: str | None = None
 
 
-def telling(rows: Sequence[Row]) -> Row | None:
-    """Return the run to look at first: koopman-mpc where it reaches and costs most beside the oracle.
+def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
+    """Return the run to look at first: the koopman-mpc that reaches and costs most compared with nonlinear-mpc.
 
-    Without an oracle, or where koopman-mpc reaches nowhere, its first run; without one, any that has a log.
+    Without such a comparison it is the first run of koopman-mpc, else the first run that has a log.
     """
     logged = [row for row in rows if row.log is not None and row.fault is None]
     koopman = [row for row in logged if row.controller == "koopman-mpc"]
     oracle = {(row.problem, row.case): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics}
 
-    def ratio(row: Row) -> float:
+    def ratio(row: RunRow) -> float:
         best = oracle.get((row.problem, row.case), 0.0)
         return row.metrics.cost / best if row.reached and row.metrics is not None and best > 0 else 0.0
 
@@ -116,8 +116,8 @@ _FIGURES: dict[str, type] = {
 }
 
 
-def write_results(rows: Sequence[Row], path: Path) -> None:
-    """Write one row a run as .parquet: vectors are lists, `status` and `fallback` have a field for every name."""
+def write_results(rows: Sequence[RunRow], path: Path) -> None:
+    """Write the rows as .parquet: vectors are lists, `status` and `fallback` have a field for every name."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -132,8 +132,8 @@ def write_results(rows: Sequence[Row], path: Path) -> None:
     pq.write_table(pa.Table.from_pylist([_record(row) for row in rows], schema=pa.schema(columns)), path)
 
 
-def _record(row: Row) -> dict[str, Any]:
-    """Return one line of the table; the figures of a run that raised are missing."""
+def _record(row: RunRow) -> dict[str, Any]:
+    """Return the row as a record of the table; the figures of a run that raised are missing."""
     record: dict[str, Any] = {name: getattr(row, name) for name in (*_NAMES, "failure")}
     record |= {"reached": row.reached, "training_time": row.training_time, "log": row.log and row.log.name}
     if row.metrics is not None:

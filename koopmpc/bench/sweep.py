@@ -1,4 +1,4 @@
-"""sweep: every controller on every case of every problem; one log a run, one row a run."""
+"""sweep: run every controller on every case of every problem; each run makes a log and a row of results."""
 
 import traceback
 import warnings
@@ -8,13 +8,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from koopmpc.bench.controllers import CONTROLLERS, LEARNED, Prepared, chosen
-from koopmpc.bench.faults import FAULTS, possible
+from koopmpc.bench.controllers import CONTROLLERS, LEARNED, Prepared, controller_names
 from koopmpc.bench.problem import Case, Problem
-from koopmpc.bench.results import Row, failures, reached, write_results
+from koopmpc.bench.results import RunRow, failures, reached, write_results
+from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
 from koopmpc.errors import ProblemError
-from koopmpc.loop.faults import Fault
+from koopmpc.loop.faults import (
+    ActuatorDelay,
+    ActuatorLoss,
+    DroppedSamples,
+    Fault,
+    FrozenSensor,
+    NaNSensor,
+    SolverFailure,
+)
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, simulate
@@ -23,11 +31,18 @@ from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.viewer import find_viewer, why_none
 
 RESULTS = "results.parquet"  # beside the logs of the runs
-Progress = Callable[[str, int, int], None]
+FAULTS: dict[str, Fault] = {
+    "nan-sensor": NaNSensor(probability=0.1),
+    "frozen-sensor": FrozenSensor(begin=10, end=15),
+    "dropped-samples": DroppedSamples(0.2),
+    "actuator-loss": ActuatorLoss(0.5),
+    "actuator-delay": ActuatorDelay(1),
+    "solver-failure": SolverFailure(0.2),
+}
 
 
 class _Task(NamedTuple):
-    """One run: a case, a controller, and what is broken."""
+    """One run: the names of its case, its controller and its fault."""
 
     case: str
     controller: str
@@ -41,36 +56,38 @@ def sweep(
     folder: str | Path,
     faults: bool = False,
     live: bool = False,
-    progress: Progress | None = None,
-) -> list[Row]:
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[RunRow]:
     """Run each controller on each case of each problem, and judge all by the same cost and limits.
 
     Parameters
     ----------
     problems
-        What to run; `load_problem("cart_pole:recover")` holds one case alone.
+        The problems; `load_problem("cart_pole:recover")` holds one case alone.
     controllers
-        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, nonlinear-mpc; by default all.
+        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc and nonlinear-mpc; by default
+        the controllers that each problem names, which are all seven where it names none.
     folder
-        Made if need be; holds one <problem>-<case>-<controller>.rrd a run, and results.parquet.
+        Receives <problem>-<case>-<controller>.rrd for each run, and results.parquet; it is made where it is missing.
     faults
-        Run each case again under each fault of `koopmpc.bench.faults`; <controller>-<fault>.rrd are their logs.
+        Whether to run each case again under each of `FAULTS`; their logs end in <controller>-<fault>.rrd.
     live
-        Stream each run, while it runs, to the viewer that is up, or that is opened. Without one: one UserWarning.
+        Whether to stream each run to a Rerun viewer; one is opened where none is up. Without a viewer there is one
+        UserWarning, and the runs are recorded all the same.
     progress
-        Called with (what runs now, runs done, runs in all).
+        Called with (name of the run, runs done, runs in all).
 
     Returns
     -------
     rows
-        One a run. An exception ends that run alone and is its row's `failure`.
+        One row for each run. An exception ends that run alone and becomes the `failure` of its row.
 
     Raises
     ------
     ProblemError
-        There is no such controller, or a case comes twice.
+        There is no such controller, or a case is given twice.
     """
-    asked, problems, folder = chosen(controllers), list(problems), Path(folder)
+    asked, problems, folder = controller_names(controllers), list(problems), Path(folder)
     cases = [f"{problem.name}:{case}" for problem in problems for case in problem.cases]
     twice = next((case for case in cases if cases.count(case) > 1), None)
     if twice is not None:
@@ -83,10 +100,10 @@ def sweep(
         (problem, _Task(case, name, fault))
         for problem in problems
         for case in problem.cases
-        for fault in (None, *(possible(problem.limits_of(case)) if faults else ()))
-        for name in (asked if controllers else chosen(problem.controllers))
+        for fault in (None, *(possible_faults(problem.limits_of(case)) if faults else ()))
+        for name in (asked if controllers else controller_names(problem.controllers))
     ]
-    rows: list[Row] = []
+    rows: list[RunRow] = []
     parts: Prepared | None = None
     for problem, task in tasks:
         if parts is None or parts.problem is not problem:
@@ -100,44 +117,50 @@ def sweep(
     return rows
 
 
-def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> Row:
-    """Run, judge, log and read back; whatever is raised on the way becomes the row's failure."""
+def possible_faults(limits: Limits) -> tuple[str, ...]:
+    """Return the names of the faults that can occur: without input limits an actuator has no range to lose."""
+    limited = any(end is not None and np.isfinite(end).any() for end in (limits.u_min, limits.u_max))
+    return tuple(name for name in FAULTS if limited or name != "actuator-loss")
+
+
+def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> RunRow:
+    """Run one task, compute its figures, write its log and read it back; an exception becomes the row's failure."""
     problem, (case, name, fault) = parts.problem.name, task
     log = folder / ("-".join((problem, *filter(None, task))) + ".rrd")
     try:
         run, drawn = _run(parts, task, live)
         judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[case].steps)
-    except Exception as error:  # one run must not take the others with it; the exit code says so
-        return Row(problem, case, name, failure=_told(error, log), fault=fault)
+    except Exception as error:  # the other runs go on; the exit code says that one failed
+        return RunRow(problem, case, name, failure=_described(error, log), fault=fault)
     try:
         found += _recorded(run, log, drawn)
         if load_run(log) != run:
             found.append(f"{log.name} does not read back equal to the run")
-    except Exception as error:  # nor must a log take the figures of its run with it
-        found.append(_told(error, log))
+    except Exception as error:  # the figures of the run are kept without its log
+        found.append(_described(error, log))
     if log.exists() and not log.stat().st_size:
         log.unlink()
     kept = log if log.exists() else None
     training = parts.training_time if name in LEARNED else 0.0
-    return Row(problem, case, name, *judged, training, kept, "; ".join(found) or None, fault)
+    return RunRow(problem, case, name, *judged, training, kept, "; ".join(found) or None, fault)
 
 
-def _told(error: Exception, log: Path) -> str:
-    """Return the error as a row tells it; its traceback goes beside the log."""
+def _described(error: Exception, log: Path) -> str:
+    """Return the error in one line, and write its traceback beside the log."""
     trace = log.with_suffix(".txt")
     trace.write_text("".join(traceback.format_exception(error)))
     return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
 
 
 def _recorded(run: Run, log: Path, drawn: dict[str, Any]) -> list[str]:
-    """Write the log; where its scene cannot be drawn, write it without and return why."""
+    """Write the log; where its scene cannot be drawn, write it without the scene and return why."""
     try:
         record(run, log, **drawn)
     except Exception as error:
         if drawn["scene"] is None:
             raise
         record(run, log, **{**drawn, "scene": None})
-        return [f"the log is without its scene: drawing scene(x, u) raised {_told(error, log)}"]
+        return [f"the log is without its scene: drawing scene(x, u) raised {_described(error, log)}"]
     return []
 
 
@@ -179,7 +202,7 @@ def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]
 
 
 def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
-    """Call the controller twice and reset it: what only the first calls cost is no part of a step's time."""
+    """Call the controller twice and reset it, so that the cost of first calls is no part of a step's time."""
     y = parts.step_map.measure(case.x0)
     reference = np.atleast_1d(np.asarray(case.reference))
     row = reference if reference.ndim == 1 else reference[0]

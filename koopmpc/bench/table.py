@@ -1,7 +1,8 @@
-"""The bench as a table to read: one table a case, one line a controller."""
+"""The bench as text: one table for each case, one line for each controller."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from rich import box
@@ -9,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from koopmpc.bench.results import ORACLE, Row
+from koopmpc.bench.results import ORACLE, RunRow
 from koopmpc.loop.metrics import Metrics, duration
 
 FAULT_LEGEND = (
@@ -20,19 +21,17 @@ FAULT_LEGEND = (
 )
 
 
-def under_faults(title: str, rows: Sequence[Row]) -> Table:
-    """Return the runs of one case that had a fault, against those that had none."""
+def plain_table(title: str, **settings: Any) -> Table:
+    """Return an empty table with its title at the left and one rule below the headings."""
+    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, **settings)
+
+
+def _under_faults(title: str, rows: Sequence[RunRow]) -> Table:
+    """Return a table of the runs of one case with a line for each fault, relative to the runs without faults."""
     whole = {row.controller: row for row in rows if row.fault is None}
     found = {(row.fault, row.controller): row for row in rows if row.fault is not None}
-    lines = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        min_width=len(title),
-        padding=0,  # the box has a blank between columns
-        show_edge=False,
-    )
+    # Without padding the box still has a blank between columns.
+    lines = plain_table(title, min_width=len(title), padding=0, show_edge=False)
     lines.add_column("fault", no_wrap=True)
     for controller in whole:
         lines.add_column(controller.replace("-", "\n"), justify="right", no_wrap=True)
@@ -43,8 +42,8 @@ def under_faults(title: str, rows: Sequence[Row]) -> Table:
     return lines
 
 
-def _cell(row: Row, whole: Row) -> str:
-    """Return how a controller did under a fault."""
+def _cell(row: RunRow, whole: RunRow) -> str:
+    """Return how a controller fared under a fault, compared with its run without faults."""
     if row.metrics is None:
         return "raised"
     if not row.reached:
@@ -83,14 +82,14 @@ LEGEND = (
 )
 
 
-def table(rows: Sequence[Row]) -> RenderableType:
-    """Return one table for each case, the failures in full, and what the columns mean; 100 columns are enough."""
+def table(rows: Sequence[RunRow]) -> RenderableType:
+    """Return one table for each case, the failures in full, and what the columns mean; all fits 100 columns."""
     parts: list[RenderableType] = []
     for (problem, case), group in groupby(rows, key=lambda row: (row.problem, row.case)):
         ran = list(group)
         parts.append(_case(f"{problem}:{case}", [row for row in ran if row.fault is None]))
         if any(row.fault is not None for row in ran):
-            parts.append(under_faults(f"{problem}:{case} under faults", ran))
+            parts.append(_under_faults(f"{problem}:{case} under faults", ran))
     for row in rows:
         if row.failure is not None:
             what = " ".join(filter(None, (f"{row.problem}:{row.case}", row.controller, row.fault)))
@@ -101,8 +100,8 @@ def table(rows: Sequence[Row]) -> RenderableType:
     return Group(*parts)
 
 
-def _case(title: str, rows: list[Row]) -> Table:
-    lines = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1))
+def _case(title: str, rows: list[RunRow]) -> Table:
+    lines = plain_table(title, padding=(0, 0, 0, 1))
     lines.add_column("controller", no_wrap=True)
     measured = [row.metrics for row in rows if row.metrics is not None]
     violated = any(figures.violation > 0 for figures in measured)
@@ -123,7 +122,7 @@ def _case(title: str, rows: list[Row]) -> Table:
     return lines
 
 
-def _cells(row: Row, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
+def _cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
     yield f"{figures.cost:.1f}" if figures.cost < 1e5 else f"{figures.cost:.2g}"
     ratio = figures.cost / oracle if oracle > 0 else np.nan
     yield "–" if np.isnan(ratio) else f"{ratio:.3f}" if ratio < 100 else f"{ratio:.1g}"

@@ -198,19 +198,19 @@ def _sweep(
     problems: Sequence["Problem"], controllers: list[str] | None, faults: bool, live: bool, logs: Path, what: str
 ) -> None:
     """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
-    from koopmpc.bench.controllers import chosen
-    from koopmpc.bench.results import telling
+    from koopmpc.bench.controllers import controller_names
+    from koopmpc.bench.results import row_to_view
     from koopmpc.bench.sweep import sweep
     from koopmpc.bench.table import table
 
-    chosen(controllers)
+    controller_names(controllers)
     folder = _new_folder(logs, what)
     with _bar("") as progress:
         rows = sweep(problems, controllers, folder=folder, faults=faults, live=live, progress=progress)
     out = _console()
     out.print(table(rows))
     out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
-    shown = telling(rows)
+    shown = row_to_view(rows)
     if shown is not None:
         out.print(Text(f"look at a run: {shlex.join([*_program(), 'view', str(shown.log)])}"), soft_wrap=True)
     if any(row.failure is not None for row in rows):

@@ -10,9 +10,9 @@ from enum import Enum
 from importlib import import_module
 from pathlib import Path
 
-from rich import box
 from rich.table import Table
 
+from koopmpc.bench.table import plain_table
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
 
@@ -43,7 +43,7 @@ def judged(where: str, says: str, *, holds: bool, why: str, in_part: bool = Fals
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
     """Return a table with one line for each claim."""
-    lines = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    lines = plain_table(title, padding=(0, 1, 0, 0))
     for heading in ("where", "claim", "verdict", "why"):
         lines.add_column(heading)
     for claim in claims:

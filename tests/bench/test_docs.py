@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.faults import FAULTS
 from koopmpc.bench.results import reached
+from koopmpc.bench.sweep import FAULTS
 
 
 def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypatch, capsys):

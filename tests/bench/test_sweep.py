@@ -8,9 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.controllers import CONTROLLERS, Prepared, chosen
-from koopmpc.bench.faults import FAULTS, possible
-from koopmpc.bench.results import Row, failures, reached, telling
+from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
+from koopmpc.bench.results import RunRow, failures, reached, row_to_view
+from koopmpc.bench.sweep import FAULTS, possible_faults
 from koopmpc.control.move import Fallback
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
@@ -199,13 +199,13 @@ def test_a_log_that_cannot_be_written_takes_no_figures_and_is_not_offered(swept,
     assert row.metrics is not None
     assert row.log is None
     assert not list(tmp_path.glob("*.rrd"))
-    assert telling([row]) is None
+    assert row_to_view([row]) is None
 
 
 def test_the_run_to_look_at_is_the_hardest_that_koopman_mpc_manages(swept):
     def ran(case, controller, cost, reached=True, fault=None):
         figures = replace(swept[1][0].metrics, cost=cost)
-        return Row("p", case, controller, figures, reached, log=Path(f"{case}.rrd"), fault=fault)
+        return RunRow("p", case, controller, figures, reached, log=Path(f"{case}.rrd"), fault=fault)
 
     rows = [
         ran("easy", "lqr", 1.0),
@@ -217,11 +217,11 @@ def test_the_run_to_look_at_is_the_hardest_that_koopman_mpc_manages(swept):
         ran("lost", "nonlinear-mpc", 1.0),
         ran("easy", "koopman-mpc", 5.0, fault="nan-sensor"),
     ]
-    assert telling(rows) is rows[3]
-    assert telling(rows[:1]) is rows[0]
-    assert telling([rows[1], rows[3]]) is rows[1]
-    assert telling([rows[5]]) is rows[5]
-    assert telling([]) is None
+    assert row_to_view(rows) is rows[3]
+    assert row_to_view(rows[:1]) is rows[0]
+    assert row_to_view([rows[1], rows[3]]) is rows[1]
+    assert row_to_view([rows[5]]) is rows[5]
+    assert row_to_view([]) is None
 
 
 class Unseen(km.Recorder):
@@ -282,7 +282,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(chosen(None)) == SEVEN
+    assert list(controller_names(None)) == SEVEN
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
@@ -357,8 +357,8 @@ def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path):
     rows = km.sweep([free], ["lqr"], folder=tmp_path, faults=True)
     assert [row.fault for row in rows] == [None, *(name for name in FAULTS if name != "actuator-loss")]
     assert not any(row.failure for row in rows)
-    assert possible(km.Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
-    assert "actuator-loss" not in possible(km.Limits(u_min=-np.inf))
+    assert possible_faults(km.Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
+    assert "actuator-loss" not in possible_faults(km.Limits(u_min=-np.inf))
 
 
 def test_a_run_that_diverged_reaches_nothing_and_warns_of_nothing(swept):

@@ -7,8 +7,8 @@ import numpy as np
 from rich.console import Console
 
 from koopmpc.bench.controllers import CONTROLLERS
-from koopmpc.bench.faults import FAULTS
-from koopmpc.bench.results import Row
+from koopmpc.bench.results import RunRow
+from koopmpc.bench.sweep import FAULTS
 from koopmpc.bench.table import table
 from koopmpc.loop.metrics import Metrics
 
@@ -37,11 +37,11 @@ def printed(renderable, width=100):
 
 def rows():
     return [
-        Row("plant", "case", "lqr", replace(GOOD, cost=2.41e6, settling_time=np.inf), reached=False),
-        Row("plant", "case", "linear-mpc", replace(GOOD, settling_time=np.inf), reached=True),
-        Row("plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31),
-        Row("plant", "case", "nonlinear-mpc", GOOD, reached=True),
-        Row("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
+        RunRow("plant", "case", "lqr", replace(GOOD, cost=2.41e6, settling_time=np.inf), reached=False),
+        RunRow("plant", "case", "linear-mpc", replace(GOOD, settling_time=np.inf), reached=True),
+        RunRow("plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31),
+        RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True),
+        RunRow("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
     ]
 
 
@@ -86,12 +86,12 @@ def faulty_rows():
     lost = replace(GOOD, cost=5e6, fallback={"NONE": 150, "HOLD": 50})
     return [
         *rows()[1:4],
-        Row("plant", "case", "linear-mpc", lost, fault="nan-sensor"),
-        Row("plant", "case", "koopman-mpc", replace(GOOD, cost=121.705), reached=True, fault="nan-sensor"),
-        Row("plant", "case", "nonlinear-mpc", fault="nan-sensor", failure="RuntimeError: no [luck]"),
-        Row("plant", "case", "linear-mpc", replace(GOOD, cost=60250.0), reached=True, fault="delay"),
-        Row("plant", "case", "koopman-mpc", GOOD, reached=True, fault="delay"),
-        Row("plant", "case", "nonlinear-mpc", GOOD, reached=True, fault="delay"),
+        RunRow("plant", "case", "linear-mpc", lost, fault="nan-sensor"),
+        RunRow("plant", "case", "koopman-mpc", replace(GOOD, cost=121.705), reached=True, fault="nan-sensor"),
+        RunRow("plant", "case", "nonlinear-mpc", fault="nan-sensor", failure="RuntimeError: no [luck]"),
+        RunRow("plant", "case", "linear-mpc", replace(GOOD, cost=60250.0), reached=True, fault="delay"),
+        RunRow("plant", "case", "koopman-mpc", GOOD, reached=True, fault="delay"),
+        RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True, fault="delay"),
     ]
 
 
@@ -121,7 +121,7 @@ def test_no_faults_no_table_of_faults():
 def test_the_seven_controllers_under_every_fault_fit_a_hundred_columns():
     worst = replace(GOOD, cost=1e9, fallback={"HOLD": 300})
     ran = [
-        Row("plant", "case", name, metrics, reached=True, fault=fault)
+        RunRow("plant", "case", name, metrics, reached=True, fault=fault)
         for fault, metrics in [(None, GOOD), *((fault, worst) for fault in FAULTS)]
         for name in CONTROLLERS
     ]
