@@ -25,7 +25,7 @@ full: $(VENV)/installed-dev
 	$(TYPED) -m "(slow or not slow) and not speed and not loops"
 
 loops: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m loops tests/closed_loop
+	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m loops tests/closed_loop
 
 speed: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name

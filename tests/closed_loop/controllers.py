@@ -1,0 +1,135 @@
+"""The controllers that are judged, each with the library's default settings, and two yardsticks."""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+import koopmpc as km
+from tests.closed_loop.optimum import held
+from tests.closed_loop.tasks import Task, UTarget
+
+
+class NotApplicableError(Exception):
+    """This controller cannot be asked for this task: it needs the whole state, and the task measures less."""
+
+
+class Parts:
+    """What the controllers of one task and one training seed share, each built when it is first asked for."""
+
+    def __init__(self, task: Task, seed: int, u_target: UTarget | None = None) -> None:
+        self.task, self.seed = task.but(u_target), seed
+        self._u_target = u_target
+
+    @cached_property
+    def data(self) -> km.Episodes:
+        """The training data."""
+        return self.task.data(self.seed)
+
+    @cached_property
+    def selection(self) -> Any:
+        """The models that cross-validation proposes for the task's horizon."""
+        return km.select(self.data, horizon=self.task.horizon)
+
+    @property
+    def linear(self) -> km.LinearPredictor:
+        """The best linear model."""
+        return self.selection.linear
+
+    @cached_property
+    def bilinear(self) -> km.BilinearPredictor:
+        """The best bilinear model: what was chosen, or else the first of its kind on the leaderboard."""
+        if isinstance(self.selection.predictor, km.BilinearPredictor):
+            return self.selection.predictor
+        row = next(row for row in self.selection.leaderboard if row.bilinear)
+        return km.bilinear_edmd(self.data, row.lifting, embedding=row.embedding, ridge=row.ridge, difference=True)
+
+    def cost(self, **more: Any) -> km.Cost:
+        """Return the cost as a controller is given it."""
+        task, target = self.task, self.task.u_target
+        if target == "given":
+            rows = held(task.name, "equilibrium")
+            target = rows[0] if (rows == rows[0]).all() else rows
+        of = km.State() if not task.measured else task.of  # a model of the output alone tracks all it has
+        return km.Cost(Q=task.Q, R=task.R, of=of, u_target=target, **more)
+
+    def plain(self, model: km.LinearPredictor) -> km.KoopmanMPC:
+        """Return MPC without a terminal weight of its own: Q_N = Q."""
+        task = self.task
+        Q_N: Any = task.Q
+        if task.tracked is not None and task.measured:  # only lifted coordinates can be weighed one by one
+            C = np.array([[float(name == own) for own in model.lifting.names] for name in task.tracked])
+            Q_N = C.T @ np.diag(task.Q) @ C
+        return km.KoopmanMPC(model, self.cost(Q_N=Q_N), task.limits, task.horizon)
+
+    @property
+    def equations(self) -> km.StepMap:
+        """The model equations, for those who measure what these need."""
+        if not self.task.measured:
+            raise NotApplicableError
+        return self.task.equations
+
+
+def _edmd(p: Parts) -> Any:
+    """Textbook EDMD: state, constant and second-degree monomials, no ridge, Q_N = Q."""
+    embedding = None if p.task.measured else km.Delay(2)
+    lifting = km.State() + km.Constant() + km.Monomials(2)
+    return p.plain(km.edmd(p.data, lifting, embedding=embedding, ridge=0))
+
+
+def _dmdc(p: Parts) -> Any:
+    """Plain DMDc, Q_N = Q."""
+    if p.task.measured:
+        return p.plain(km.dmdc(p.data))
+    return p.plain(km.edmd(p.data, km.State(), embedding=km.Delay(2)))
+
+
+def _lqr(p: Parts) -> Any:
+    model = km.LinearPredictor.local(p.equations, *p.task.around)
+    return km.LQR(model, p.cost(), p.task.limits)
+
+
+def _linear_mpc(p: Parts) -> Any:
+    return km.LinearMPC(p.equations, *p.task.around, p.cost(), p.task.limits, p.task.horizon)
+
+
+def _nonlinear_mpc(p: Parts) -> Any:
+    return km.NonlinearMPC(p.equations, p.cost(), p.task.limits, p.task.horizon)
+
+
+def _bilinear_exact(p: Parts) -> Any:
+    return km.BilinearMPC(p.equations, p.cost(), p.task.limits, p.task.horizon)
+
+
+def _koopman_mpc(p: Parts) -> Any:
+    return km.KoopmanMPC(p.linear, p.cost(), p.task.limits, p.task.horizon)
+
+
+def _koopman_offset(p: Parts) -> Any:
+    return km.KoopmanMPC(p.linear, p.cost(), p.task.limits, p.task.horizon, estimator=km.LiftedDisturbance())
+
+
+def _bilinear_mpc(p: Parts) -> Any:
+    return km.BilinearMPC(p.bilinear, p.cost(), p.task.limits, p.task.horizon)
+
+
+def _bilinear_offset(p: Parts) -> Any:
+    return km.BilinearMPC(p.bilinear, p.cost(), p.task.limits, p.task.horizon, estimator=km.LiftedDisturbance())
+
+
+CONTROLLERS: dict[str, Callable[[Parts], Any]] = {
+    "edmd": _edmd,
+    "dmdc": _dmdc,
+    "lqr": _lqr,
+    "linear-mpc": _linear_mpc,
+    "nonlinear-mpc": _nonlinear_mpc,
+    "bilinear-exact": _bilinear_exact,
+    "koopman-mpc": _koopman_mpc,
+    "koopman-offset": _koopman_offset,
+    "bilinear-mpc": _bilinear_mpc,
+    "bilinear-offset": _bilinear_offset,
+}
+YARDSTICKS = ("edmd", "dmdc")
+GIVEN = ("lqr", "linear-mpc", "nonlinear-mpc", "bilinear-exact")  # on equations: one seed is as good as three
+LEARNED = ("koopman-mpc", "koopman-offset", "bilinear-mpc", "bilinear-offset")  # from data alone

@@ -1,0 +1,109 @@
+"""The judge as tests: the measure is right, and no default loses on any task against the stored table."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from tests.closed_loop.controllers import CONTROLLERS, GIVEN, YARDSTICKS
+from tests.closed_loop.judge import LOST, Row, measure, worst
+from tests.closed_loop.optimum import boxes, held, optimum
+from tests.closed_loop.table import losses, saved, stored, text
+from tests.closed_loop.tasks import TASKS
+
+NONE = km.control.move.Fallback.NONE
+RUNS = [(name, start) for name, task in TASKS.items() for start in range(len(task.starts))]
+
+
+@pytest.mark.loops
+@pytest.mark.parametrize("task", TASKS)
+def test_no_default_loses_five_percent_against_the_last_commit(task, record_property):
+    table = measure([task], list(CONTROLLERS), workers=1)
+    record_property("closed loops", text(table, stored()))
+    lost = losses(table, stored())
+    assert not lost, "\n".join([*lost, text(table, stored())])
+
+
+@pytest.mark.loops
+@pytest.mark.parametrize(("name", "start"), RUNS)
+def test_the_optimum_is_a_run_of_the_true_plant_whose_metrics_are_its_cost(name, start):
+    task, best = TASKS[name], optimum(name, start)
+    nothing = np.zeros(task.steps)
+    run = km.Run(
+        X=best.X,
+        Y=best.X,
+        U=best.U,
+        reference=task.rows,
+        status=(km.Status.OPTIMAL,) * task.steps,
+        fallback=(NONE,) * task.steps,
+        solve_time=nothing,
+        iterations=nothing.astype(int),
+        slack=nothing,
+        cost=km.Cost(Q=task.Q, R=task.R, of=task.of),
+        limits=task.limits,
+        u_reference=held(name),
+        dt=task.dt,
+        states=task.plant.states,
+        inputs=task.plant.inputs,
+        outputs=task.plant.states,
+    )
+    assert best.cost == pytest.approx(km.metrics(run).cost, rel=1e-9)
+    low, high, u_low, u_high = boxes(task)
+    size = np.ptp(best.X, axis=0) + 1e-12
+    assert (np.maximum(low - best.X[1:], best.X[1:] - high) <= 1e-6 * size).all()
+    assert (np.maximum(u_low - best.U, best.U - u_high) <= 1e-6 * (u_high - u_low)).all()
+    after = np.array([task.plant(x, u) for x, u in zip(best.X[:-1], best.U, strict=True)])
+    assert np.abs((after - best.X[1:]) / size).max() < 1e-6
+    assert len(best.found) >= 4  # of five starts, and the least cost was found twice
+    assert best.found[1] <= best.found[0] * (1 + 1e-6)
+
+
+@pytest.mark.loops
+@pytest.mark.parametrize("name", TASKS)
+def test_inputs_that_hold_a_reference_are_equilibria_of_the_true_plant(name):
+    task = TASKS[name].but("equilibrium")
+    last = held(name, "equilibrium")[-1]
+    rest = task.rows[-2] if task.tracked is None else None
+    if name in ("beyond", "stiff") or rest is None:  # its reference is none of its states
+        return
+    assert np.abs(task.plant(rest, last) - rest) == pytest.approx(0, abs=1e-3 * np.abs(rest).max())
+
+
+@pytest.mark.loops
+@pytest.mark.parametrize("name", TASKS)
+def test_nothing_that_keeps_the_limits_beats_the_optimum(name):
+    for row in stored().get(name, {}).values():
+        if row.ratio is not None and row.violation < 1e-4:
+            assert row.ratio > 1 - 1e-3
+
+
+@pytest.mark.loops
+def test_a_table_is_read_as_it_was_written(tmp_path):
+    table = {"one": {"edmd": Row(1.25, 0.01, 0.002, {"OPTIMAL": 3}, "", 0.001, 0.002), "lqr": Row(None)}}
+    saved(table, tmp_path / "table.json")
+    assert stored(tmp_path / "table.json") == table
+
+
+@pytest.mark.loops
+def test_losses_are_named_and_yardsticks_are_free_to_lose():
+    old = {"t": {"koopman-mpc": Row(1.0), "bilinear-mpc": Row(1.0), "edmd": Row(1.0), "lqr": Row(LOST)}}
+    new = {"t": {"koopman-mpc": Row(1.06), "bilinear-mpc": Row(1.04), "edmd": Row(9.0), "lqr": Row(LOST)}}
+    assert [line.split(":")[0] for line in losses(new, old)] == ["t, koopman-mpc"]
+    broken = {"t": {"bilinear-mpc": Row(LOST, failure="ValueError: no")}}
+    assert "failed" in losses(broken, old)[0]
+    pushed = {"t": {"bilinear-mpc": replace(old["t"]["bilinear-mpc"], violation=0.02)}}
+    assert "violates" in losses(pushed, old)[0]
+
+
+@pytest.mark.loops
+def test_the_worst_row_has_the_worst_of_each_figure_and_all_statuses():
+    row = worst([Row(1.0, 0.2, statuses={"OPTIMAL": 1}), Row(2.0, 0.1, statuses={"OPTIMAL": 2, "FAILED": 1})])
+    assert (row.ratio, row.violation, row.statuses) == (2.0, 0.2, {"OPTIMAL": 3, "FAILED": 1})
+
+
+@pytest.mark.loops
+def test_the_stored_table_has_every_task_and_every_controller():
+    assert set(stored()) == set(TASKS)
+    assert all(set(CONTROLLERS) == set(rows) for rows in stored().values())
+    assert set(GIVEN) | set(YARDSTICKS) < set(CONTROLLERS)
