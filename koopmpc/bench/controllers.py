@@ -15,9 +15,9 @@ from koopmpc.control.linear.linear_mpc import LinearMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
-from koopmpc.control.nonlinear.model import learned_map
+from koopmpc.control.nonlinear.equilibrium import Equilibria
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
-from koopmpc.control.nonlinear.terminal import Equilibria
+from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.control.tracking import outputs
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
@@ -82,10 +82,10 @@ class Prepared:
         if problem.cost.u_target == "zero":
             return np.zeros((steps, plant.nu))
         seen = outputs(plant.states, plant.nu, problem.cost, problem.limits_of(case))
-        equilibria = Equilibria(learned_map(plant), problem.cost, seen, 10 * problem.horizon)
+        equilibria = Equilibria(learned_map(plant), problem.cost, seen)
         rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
         distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
-        return np.array([equilibria.rests.find(row).u for row in distinct])[of.ravel()]
+        return np.array([equilibria.find(row).u for row in distinct])[of.ravel()]
 
     @cached_property
     def data(self) -> Episodes:

@@ -74,7 +74,7 @@ def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: km.Limits) -> None
 def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: km.Cost, limits: km.Limits) -> None:
     model = pendulum()
     reference = [0, 1, 0] if cost is CIRCLE else [0, 0]
-    ours = km.BilinearMPC(model, cost, limits, 15, passes=60)
+    ours = km.BilinearMPC(model, cost, limits, 15, sqp_iterations=60)
     theirs = km.NonlinearMPC(model.step_map(), cost, limits, 15, settings={"ipopt.tol": 1e-10})
     x = np.array([0.7, -0.3])
     for _ in range(5):
@@ -87,7 +87,7 @@ def test_converged_passes_are_nonlinear_mpc_on_the_same_map(cost: km.Cost, limit
 
 def test_its_plan_follows_the_model_once_it_has_converged() -> None:
     model = pendulum()
-    mpc = km.BilinearMPC(model, CIRCLE, km.Limits(-1, 1), 20, passes=60)
+    mpc = km.BilinearMPC(model, CIRCLE, km.Limits(-1, 1), 20, sqp_iterations=60)
     move = mpc([2.0, 0.5], [0, 1, 0])
     plan = mpc.plan()
     assert np.array_equal(plan.X[0], [2.0, 0.5])
@@ -155,7 +155,7 @@ def test_a_soft_limit_that_gives_way_is_reported() -> None:
 
 
 def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
-    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5), 15, passes=2)
+    mpc = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5), 15, sqp_iterations=2)
 
     def run(controller: km.BilinearMPC) -> list[np.ndarray]:
         controller.reset()
@@ -227,8 +227,8 @@ def test_refusals() -> None:
     model = pendulum()
     with pytest.raises(km.errors.DataError, match="horizon is 0; it must be at least 1"):
         km.BilinearMPC(model, CIRCLE, None, 0)
-    with pytest.raises(km.errors.DataError, match="passes is 0; it must be at least 1"):
-        km.BilinearMPC(model, CIRCLE, None, 5, passes=0)
+    with pytest.raises(km.errors.DataError, match="sqp_iterations is 0; it must be at least 1"):
+        km.BilinearMPC(model, CIRCLE, None, 5, sqp_iterations=0)
     with pytest.raises(km.errors.ShapeError, match="Q_N weighs x_N − r_N, but the reference is not of the state"):
         km.BilinearMPC(model, km.Cost(Q=[2, 2, 0.2], R=0.1, Q_N=[1, 1], of=UPRIGHT), None, 5)
     mpc = km.BilinearMPC(model, CIRCLE, None, 5)

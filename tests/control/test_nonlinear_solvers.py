@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.nonlinear.model import learned_map
-from koopmpc.control.nonlinear.terminal import Equilibria
+from koopmpc.control.nonlinear.equilibrium import TerminalTargets
+from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.control.riccati import stationary
 from koopmpc.control.tracking import outputs
 
@@ -91,26 +91,28 @@ def test_several_starts_leave_a_local_optimum() -> None:
 def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() -> None:
     plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
     read = outputs(plant.states, plant.nu, cost, km.Limits(-2, 2))
-    goal = Equilibria(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
+    target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
 
     def end(x: np.ndarray) -> float:
-        e = goal.M @ read.tracked(x).full().ravel() + goal.L @ x - goal.m
+        e = target.M @ read.tracked(x).full().ravel() + target.L @ x - target.m
         return float(e @ e)
 
-    assert np.allclose(np.sin(goal.x[0]), 0, atol=1e-6)
-    assert np.cos(goal.x[0]) > 0.99
+    assert np.allclose(np.sin(target.equilibrium.x[0]), 0, atol=1e-6)
+    assert np.cos(target.equilibrium.x[0]) > 0.99
     far = np.array([1.0, 0.5])
     assert end(far + np.array([2 * np.pi, 0])) == pytest.approx(end(far), rel=1e-9)
-    affine = plant.linearize(goal.x, goal.u)
+    affine = plant.linearize(target.equilibrium.x, target.u)
     P = stationary(affine.A, affine.B, np.diag([1.0, 0.1]), read.R, 300).P
     for d in np.array([[1e-3, 0], [0, 1e-3], [1e-3, -2e-3]]):
-        assert end(goal.x + d) == pytest.approx(d @ P @ d, rel=1e-2)
-    assert end(goal.x + np.array([np.pi, 0])) > end(goal.x + np.array([0.5, 0]))  # hanging is no goal
+        assert end(target.equilibrium.x + d) == pytest.approx(d @ P @ d, rel=1e-2)
+    assert end(target.equilibrium.x + np.array([np.pi, 0])) > end(
+        target.equilibrium.x + np.array([0.5, 0])
+    )  # hanging is no goal
 
 
 def test_the_goal_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
     """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
     plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
     read = outputs(plant.states, plant.nu, cost, km.Limits(-2, 2))
-    goal = Equilibria(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
-    assert np.cos(goal.x[0]) < -0.99
+    target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
+    assert np.cos(target.equilibrium.x[0]) < -0.99

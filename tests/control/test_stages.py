@@ -42,7 +42,7 @@ def linear(disturbed: bool = False, mass: float = 1.0) -> km.LinearPredictor:
 
 def built(kind, model, cost, limits, moves, **options):
     if kind == "bilinear":
-        return km.BilinearMPC(model, cost, limits, N, moves=moves, passes=3, **options)
+        return km.BilinearMPC(model, cost, limits, N, moves=moves, sqp_iterations=3, **options)
     tight = {"ipopt.tol": 1e-10, "ipopt.bound_relax_factor": 0.0}
     return km.NonlinearMPC(model.step_map(), cost, limits, N, moves=moves, settings=tight, **options)
 
@@ -101,7 +101,7 @@ def test_the_program_with_rates_is_that_of_cvxpy():
 @pytest.mark.parametrize("latency", [0, 2])
 def test_a_measured_disturbance_and_its_preview_are_koopman_mpcs(latency):
     model, cost, limits = linear(disturbed=True), R_DELTA, km.Limits(**BOX, du_max=0.3)
-    ours = km.BilinearMPC(model, cost, limits, N, passes=3, latency=latency)
+    ours = km.BilinearMPC(model, cost, limits, N, sqp_iterations=3, latency=latency)
     theirs = km.KoopmanMPC(model, cost, limits, N, latency=latency, solver="daqp")
     assert ours.horizon == theirs.horizon == N + latency
     rng, x = np.random.default_rng(0), np.array([0.3, -0.2, 0.1])
@@ -157,7 +157,7 @@ def test_on_a_true_model_the_plan_happens_late(kind):
     model = pendulum()
     limits = km.Limits(-3, 3, du_max=1)
     if kind == "bilinear":
-        mpc = km.BilinearMPC(model, TRACKED, limits, 15, latency=2, passes=30)
+        mpc = km.BilinearMPC(model, TRACKED, limits, 15, latency=2, sqp_iterations=30)
     else:
         mpc = km.NonlinearMPC(model.step_map(), TRACKED, limits, 15, latency=2)
     run = km.simulate(
@@ -177,11 +177,11 @@ def test_on_a_true_model_the_plan_happens_late(kind):
 def test_an_update_is_a_new_controller():
     old, new = pendulum(), pendulum(1.2, 0.01)
     limits = km.Limits(-3, 3, du_max=1)
-    updated, fresh = (km.BilinearMPC(model, TRACKED, limits, 15, passes=20) for model in (old, new))
+    updated, fresh = (km.BilinearMPC(model, TRACKED, limits, 15, sqp_iterations=20) for model in (old, new))
     updated([0.3, 0.1], [0.2, 0])
     updated.update(new)
     updated.reset()
-    assert updated.predictor is new
+    assert updated.model is new
     x = np.array([0.3, 0.1])
     for _ in range(5):
         a, b = updated(x, [0.2, 0]), fresh(x, [0.2, 0])
@@ -360,10 +360,10 @@ show(lambda: BilinearMPC(flat, cost, limits, 5)("now", [0, 0]))
         "DataError y is not an array of numbers: got NoneType",
         "DataError reference is not an array of numbers: got str",
         "DataError ipopt was not built with settings {'tol': 1}",
-        "DataError step_map is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
+        "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
         "DataError the model has no inputs",
         "DataError cost is a Limits",
-        "DataError predictor is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
+        "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
         "DataError estimator is a LiftedKalman, expected a LiftedDisturbance",
         "DataError w was passed, but the predictor has no E",
         "DataError y is not an array of numbers: got str",

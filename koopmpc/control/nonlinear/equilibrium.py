@@ -1,6 +1,7 @@
-"""The equilibrium x = F(x, u) + e that holds a reference, or comes nearest to it inside the limits.
+"""The equilibrium x = F(x, u) + e that holds a reference, or comes nearest to it, and what the end of a horizon costs.
 
-Near a guess by Gauss–Newton steps with the limits that are active held; from afar, or where these fail, by ipopt.
+Near a guess an equilibrium is found by Gauss–Newton steps that hold the active limits; from afar, or where these fail,
+by ipopt.
 """
 
 from typing import Any, NamedTuple, cast
@@ -9,30 +10,53 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc import checks
+from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval
-from koopmpc.control.nonlinear.model import LearnedMap
+from koopmpc.control.linear.horizon import one_step
+from koopmpc.control.nonlinear.problem import LearnedMap
+from koopmpc.control.riccati import stationary
 from koopmpc.control.target import TOLERANCE, root
 from koopmpc.control.tracking import Outputs
+from koopmpc.errors import ShapeError
+from koopmpc.lifting.state import State
 from koopmpc.plants.buffered import Buffered
 
-QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
-SETTLED = 1e-10  # of the size of (x, u): a Gauss–Newton step that is the last
-CLOSE = 1e-2  # the same where the next control step will go on: what it leaves is of the square of it
-_NEWTON = 20  # steps
-_AT = 1e-6  # of a limit: how near ipopt stays to one that is active
+SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
+CLOSE = 1e-2  # the same where the next control step goes on: the error left is of the square of this share
+_QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
+_NEWTON = 20  # Gauss–Newton steps, at most
+_AT = 1e-6  # share of 1 + |value| within which ipopt ends at a limit that is active
 _STARTS = 12  # guesses of an equilibrium where the reference is not of the state
 _MISSED = 1e-6  # share of ‖r‖²_Q that a good equilibrium may leave
+_MOST = 10_000  # terminal targets remembered before the memory starts anew
 
 
-class Rest(NamedTuple):
-    """An equilibrium, and for each limited value of [u; g(x)] whether it is at its upper (1) or lower (−1) limit."""
+class Equilibrium(NamedTuple):
+    """An equilibrium; `active` is 1 (−1) where a limited value of [u; g(x)] is at its upper (lower) limit, else 0."""
 
     x: Float[np.ndarray, " nx"]
     u: Float[np.ndarray, " nu"]
     active: Int[np.ndarray, " nl"]
 
 
-class Linearised(NamedTuple):
+class TerminalTarget(NamedTuple):
+    """The equilibrium of a reference row, the reference input, and the cost ‖M of(x_N) + L x_N + V u_{N−1} − m‖².
+
+    The reference input `u` is that of the equilibrium, or zero where the cost asks for it. A constant disturbance e of
+    the state moves it by about `slope` e.
+    """
+
+    equilibrium: Equilibrium
+    u: Float[np.ndarray, " nu"]
+    M: Float[np.ndarray, "nt nr"]  # nt = nx + nr, or nx + nu + nr where changes of u are weighed
+    L: Float[np.ndarray, "nt nx"]
+    V: Float[np.ndarray, "nt nu"]
+    m: Float[np.ndarray, " nt"]
+    slope: Float[np.ndarray, "nu nx"]
+
+
+class Linearisation(NamedTuple):
     """F(x, u), its Jacobians A and B, of(x) and its Jacobian J, the limited outputs g and their Jacobian G."""
 
     F: Float[np.ndarray, " nx"]
@@ -44,76 +68,70 @@ class Linearised(NamedTuple):
     G: Float[np.ndarray, "ng nx"]
 
 
-class Local:
-    """(x, u, θ) → Linearised."""
+class Equilibria:
+    """Reference row and disturbance e → Equilibrium: minimises ‖of(x) − r‖²_Q inside all limits.
 
-    def __init__(self, model: LearnedMap, outputs: Outputs) -> None:
-        x, u, theta = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("t", len(model.theta))
-        F, of, g = model.F(x, u, theta), outputs.tracked(x), outputs.limited(x)
-        found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
-        function = ca.Function("local", [x, u, theta], [ca.densify(each) for each in found])
-        self._call = Buffered(function.expand() if model.F.is_a("SXFunction") else function)
-        self._nx = model.nx
-
-    def __call__(
-        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], theta: Float[np.ndarray, " nt"]
-    ) -> Linearised:
-        """Return the linearisation at (x, u)."""
-        F, A, B, of, J, g, G = self._call(x, u, theta)
-        A, B = (M.reshape((self._nx, -1), order="F") for M in (A, B))
-        J, G = (M.reshape((-1, self._nx), order="F") for M in (J, G))
-        return Linearised(F, A, B, of, J, g, G)
-
-
-class Rests:
-    """Reference row, push e → Rest: minimises ‖of(x) − r‖²_Q inside all limits, or else the input limits.
-
-    Of all that hold r it is the one of least size.
+    Where no equilibrium is inside all limits, those of the inputs alone count. Of all that hold r it is the one with
+    the least x and u.
     """
 
-    def __init__(self, model: LearnedMap, outputs: Outputs, *, of_state: bool) -> None:
-        self.model = model
-        self._outputs, self._of_state = outputs, of_state
-        self.local = Local(model, outputs)
-        self._least = 1e-8 * max(float(np.trace(outputs.Q)), 1e-12)
-        self._solver = _solver(model, outputs, self._least)
-        self._weight, self._small = root(outputs.Q), np.sqrt(1e-6 * self._least)
-        inputs, box = outputs.inputs, outputs.box
-        self._low, self._high = np.concatenate([inputs.low, box.low]), np.concatenate([inputs.high, box.high])
+    def __init__(self, model: LearnedMap, cost: Cost, outputs: Outputs) -> None:
+        self.model, self._outputs, o = model, outputs, outputs
+        self.of_state = isinstance(cost.of, State) and cost.of.whole
+        x, u, theta = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("t", len(model.theta))
+        F, of, g = model.F(x, u, theta), o.tracked(x), o.limited(x)
+        found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
+        local = ca.Function("local", [x, u, theta], [ca.densify(each) for each in found])
+        self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local)
+        least = 1e-8 * max(float(np.trace(o.Q)), 1e-12)
+        r, e = ca.MX.sym("r", len(o.Q)), ca.MX.sym("e", model.nx)
+        f = ca.mtimes([(of - r).T, ca.DM(o.Q), of - r]) + least * (ca.sumsqr(u) + ca.sumsqr(x))
+        nlp = {"x": ca.vertcat(x, u), "p": ca.vertcat(r, theta, e), "f": f, "g": ca.vertcat(F + e - x, g)}
+        self._solver = ca.nlpsol("equilibrium", "ipopt", nlp, _QUIET)
+        self._weight, self._small = root(o.Q), np.sqrt(1e-6 * least)
+        self._low, self._high = (np.concatenate([o.inputs[i], o.box[i]]) for i in (0, 1))
 
-    def slope(self, at: Linearised) -> Float[np.ndarray, "nu nx"]:
+    def linearise(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Linearisation:
+        """Return the linearisation at (x, u)."""
+        nx = len(x)
+        F, A, B, of, J, g, G = self._local(x, u, self.model.theta)
+        A, B = (M.reshape((nx, -1), order="F") for M in (A, B))
+        J, G = (M.reshape((-1, nx), order="F") for M in (J, G))
+        return Linearisation(F, A, B, of, J, g, G)
+
+    def slope(self, at: Linearisation) -> Float[np.ndarray, "nu nx"]:
         """Return ∂u/∂e of the equilibrium where no limit is active."""
-        gain, free = _moves(np.hstack([at.A - np.eye(self.model.nx), at.B]))
-        W = self._weighted(at)
+        gain, free = _inverse(np.hstack([at.A - np.eye(len(at.A)), at.B]))
+        W = self._residuals(at)
         beta = np.linalg.lstsq(W @ free, W @ gain, rcond=None)[0]
-        return (free @ beta - gain)[self.model.nx :]
+        return (free @ beta - gain)[len(at.A) :]
 
     def near(
         self,
-        begin: Rest,
+        begin: Equilibrium,
         row: Float[np.ndarray, " nr"],
         e: Float[np.ndarray, " nx"],
         enough: float = SETTLED,
-    ) -> Rest | None:
+    ) -> Equilibrium | None:
         """Return the equilibrium by Gauss–Newton steps from `begin`, None where they do not lead to one.
 
-        The limits that are active at `begin` are held, one that is broken is added, and one that only holds back is
-        released. The last step is at most `enough` of the size of (x, u).
+        The limits that are active at `begin` are held. A limit that is broken is added, and one whose multiplier has
+        the wrong sign is released. The last step is at most `enough` of the size of (x, u).
         """
-        nx, nu, theta = self.model.nx, self.model.nu, self.model.theta
+        nx, nu = self.model.nx, self.model.nu
         s, active = np.concatenate([begin.x, begin.u]), begin.active.copy()
         limited = np.zeros((len(active), nx + nu))
         limited[:nu, nx:] = np.eye(nu)
         for _ in range(_NEWTON):
-            at = self.local(s[:nx], s[nx:], theta)
+            at = self.linearise(s[:nx], s[nx:])
             limited[nu:, :nx] = at.G
             values = np.concatenate([s[nx:], at.g])
             held = np.flatnonzero(active)
             ends = np.where(active > 0, self._high, self._low)
             E = np.vstack([np.hstack([at.A - np.eye(nx), at.B]), limited[held]])
             missed = np.concatenate([at.F + e - s[:nx], values[held] - ends[held]])
-            gain, free = _moves(E)
-            W = self._weighted(at)
+            gain, free = _inverse(E)
+            W = self._residuals(at)
             left = np.concatenate([self._weight @ (row - at.of), -self._small * s])
             step = -gain @ missed
             step += free @ np.linalg.lstsq(W @ free, left - W @ step, rcond=None)[0]
@@ -122,45 +140,46 @@ class Rests:
             size = 1 + np.abs(s).max()
             s = s + step
             reached, tolerance = values + limited @ step, 1e-9 * (1 + np.abs(values))
-            pull = active[held] * (gain.T @ (W.T @ (left - W @ step)))[nx:]  # multipliers, positive where it holds
+            multipliers = active[held] * (gain.T @ (W.T @ (left - W @ step)))[nx:]  # positive where a limit holds
             over = np.where(active == 0, np.maximum(reached - self._high, self._low - reached) - tolerance, -np.inf)
-            if len(pull) and pull.min() < -1e-9 * np.abs(pull).max():
-                active[held[pull.argmin()]] = 0
+            if len(multipliers) and multipliers.min() < -1e-9 * np.abs(multipliers).max():
+                active[held[multipliers.argmin()]] = 0
             elif over.size and over.max() > 0:
                 worst = int(over.argmax())
                 active[worst] = 1 if reached[worst] > self._high[worst] else -1
             elif np.abs(step).max() <= enough * size:
                 if np.abs(E @ step + missed).max() > SETTLED * size:
                     return None
-                return Rest(s[:nx], np.clip(s[nx:], *self._outputs.inputs), active)
+                return Equilibrium(s[:nx], np.clip(s[nx:], *self._outputs.inputs), active)
         return None
 
     def find(
         self,
         row: Float[np.ndarray, " nr"],
         e: Float[np.ndarray, " nx"] | None = None,
-        near: Rest | None = None,
-    ) -> Rest:
+        near: Equilibrium | None = None,
+    ) -> Equilibrium:
         """Return the equilibrium that holds a reference row, by ipopt: from `near`, or from several guesses."""
-        nx, inputs, box = self.model.nx, self._outputs.inputs, self._outputs.box
-        push = np.zeros(nx) if e is None else e
-        rest = np.clip(np.zeros(self.model.nu), *inputs)
-        guesses = [np.concatenate([self.model.held(row, rest) if self._of_state else np.zeros(nx), rest])]
-        if near is not None:
-            guesses = [np.concatenate([near.x, near.u])]
-        elif not self._of_state:  # the nearest stationary point may be a wrong one: hanging instead of upright
+        model, inputs, box = self.model, self._outputs.inputs, self._outputs.box
+        nx, e = model.nx, np.zeros(model.nx) if e is None else e
+        u = np.clip(np.zeros(model.nu), *inputs)
+        x = np.zeros(nx)
+        if self.of_state:
+            x = row if model.embedding is None else model.embedding.held(row, u)
+        guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
+        if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
             scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, nx))
-            guesses += [np.concatenate([x, rest]) for x in scatter]
-        free = np.full(len(box.low), np.inf)
+            guesses += [np.concatenate([x, u]) for x in scatter]
+        unlimited = np.full(len(box.low), np.inf)
         good = _MISSED * float(row @ self._outputs.Q @ row)
         best = guesses[0]
-        for limits in (box, Interval(-free, free)):
+        for limits in (box, Interval(-unlimited, unlimited)):
             found, least = None, np.inf
             for guess in guesses:
                 solved = cast(
                     "dict[str, Any]",
                     self._solver(
-                        p=np.concatenate([row, self.model.theta, push]),
+                        p=np.concatenate([row, model.theta, e]),
                         x0=guess,
                         lbx=np.concatenate([np.full(nx, -np.inf), inputs.low]),
                         ubx=np.concatenate([np.full(nx, np.inf), inputs.high]),
@@ -169,48 +188,118 @@ class Rests:
                     ),
                 )
                 if self._solver.stats()["success"] and float(solved["f"]) < least:
-                    found, least = flat(solved["x"]), float(solved["f"])
+                    found, least = solved["x"].full().ravel(), float(solved["f"])
                 if least <= good:
                     break
             if found is not None:
                 best = found
                 break
-        return self._rest(best)
-
-    def _rest(self, s: Float[np.ndarray, " n"]) -> Rest:
-        """Return s = [x; u] with the limits that it is at."""
-        nx = self.model.nx
-        values = np.concatenate([s[nx:], self.local(s[:nx], s[nx:], self.model.theta).g])
+        x, u = best[:nx], best[nx:]
+        values = np.concatenate([u, self.linearise(x, u).g])
         reach = _AT * (1 + np.abs(values))
         above = (values >= self._high - reach).astype(np.intp)
-        return Rest(s[:nx], s[nx:], np.where(values <= self._low + reach, -1, above))
+        return Equilibrium(x, u, np.where(values <= self._low + reach, -1, above))
 
-    def _weighted(self, at: Linearised) -> Float[np.ndarray, "n m"]:
-        """Return the matrix of the target's residuals on (x, u): of(x) first, then (x, u) at next to no weight."""
+    def _residuals(self, at: Linearisation) -> Float[np.ndarray, "n m"]:
+        """Return the matrix of the residuals on (x, u): those of of(x) first, then (x, u) at next to no weight."""
         (nr, nx), n = at.J.shape, self.model.nx + self.model.nu
         W = self._small * np.eye(nr + n, n, -nr)
         W[:nr, :nx] = self._weight @ at.J
         return W
 
 
-def _moves(E: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n k"]]:
+class TerminalTargets:
+    """Reference row → TerminalTarget.
+
+    The terminal cost is ‖d‖²_P, P the Riccati solution of the linearisation, or Q_N. The distance d is measured in
+    the tracked outputs as far as they see it, d = J⁺(of(x_N) − of(x_r)) + (I − J⁺J)(x_N − x_r), J = ∂of/∂x: with
+    sin θ and cos θ tracked it is the same at every turn of θ, and with of(x) = x it is x_N − x_r. The part of
+    of(x_N) − of(x_r) that no small motion changes keeps its weight Q, times the mean size of P over JᵀQJ. With
+    R_delta, P weighs [d; u_{N−1} − u_r].
+
+    Parameters
+    ----------
+    most
+        Steps after which the Riccati difference equation ends, settled or not.
+
+    Raises
+    ------
+    ShapeError
+        Q_N weighs states, but the cost tracks something else.
+    """
+
+    def __init__(self, model: LearnedMap, cost: Cost, outputs: Outputs, most: int) -> None:
+        self._cost, self._outputs, self._most = cost, outputs, most
+        self.equilibria = Equilibria(model, cost, outputs)
+        if cost.Q_N is not None:
+            checks.weight(cost.Q_N, "Q_N", model.ny)
+            if not self.equilibria.of_state:
+                raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
+        self._known: dict[bytes, TerminalTarget] = {}
+
+    def update(self, model: LearnedMap) -> None:
+        """Go on with another θ: the last target is found anew, from where it was."""
+        self.equilibria.model = model
+        last, self._known = list(self._known.items())[-1:], {}
+        for key, target in last:
+            row = np.frombuffer(key)
+            found = self.equilibria.near(target.equilibrium, row, np.zeros(model.nx))
+            if found is not None:
+                self._known[key] = self._target(row, found)
+
+    def __call__(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
+        """Return the target of a reference row, kept for the next time."""
+        key = row.tobytes()
+        if key not in self._known:
+            if len(self._known) > _MOST:
+                self._known.clear()
+            self._known[key] = self._target(row, self.equilibria.find(row))
+        return self._known[key]
+
+    def disturbed(
+        self, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"], last: TerminalTarget | None
+    ) -> TerminalTarget:
+        """Return the target of a row where x⁺ = F(x, u) + e, mostly by one step from that of the last control step.
+
+        The error that this leaves is of the square of the change of e, and gone once e rests.
+        """
+        target = self(row)
+        begin = (target if last is None else last).equilibrium
+        found = self.equilibria.near(begin, row, e, CLOSE) or self.equilibria.find(row, e, begin)
+        u, m = self._input(found), target.m
+        if self._cost.Q_N is None:
+            m = target.M @ self.equilibria.linearise(found.x, found.u).of + target.L @ found.x + target.V @ u
+        return target._replace(equilibrium=found, u=u, m=m)
+
+    def _input(self, found: Equilibrium) -> Float[np.ndarray, " nu"]:
+        """Return the reference input."""
+        return found.u if self._cost.u_target == "equilibrium" else np.zeros_like(found.u)
+
+    def _target(self, row: Float[np.ndarray, " nr"], found: Equilibrium) -> TerminalTarget:
+        o, nx, nr, Q = self._outputs, len(found.x), len(row), self._outputs.Q
+        at, u = self.equilibria.linearise(found.x, found.u), self._input(found)
+        slope = self.equilibria.slope(at) * (self._cost.u_target == "equilibrium")
+        if self._cost.Q_N is not None:
+            M, L, V = (np.zeros((nx + nr, columns)) for columns in (nr, nx, len(u)))
+            M[:nr] = root(checks.weight(self._cost.Q_N, "Q_N", nr))
+            return TerminalTarget(found, u, M, L, V, M @ row, slope)
+        J = at.J
+        seen = J.T @ Q @ J
+        back, size = (np.linalg.pinv(each, rcond=1e-9) for each in (J, seen))
+        step = one_step(at.A, at.B, seen, o.R, o.R_delta)
+        P = stationary(step.A, step.B, step.Q, step.R, self._most, step.M).P
+        n, S = len(P), root(P)
+        M, L, V = (np.zeros((n + nr, columns)) for columns in (nr, nx, len(u)))
+        M[:n] = S[:, :nx] @ back
+        L[:n] = S[:, :nx] @ (np.eye(nx) - back @ J)
+        V[:n, : n - nx] = S[:, nx:]
+        mean = float((P[:nx, :nx] * size).sum()) / max(np.linalg.matrix_rank(seen), 1)
+        M[n:] = np.sqrt(max(mean, 1.0)) * root(Q) @ (np.eye(nr) - J @ back)
+        return TerminalTarget(found, u, M, L, V, M @ at.of + L @ found.x + V @ u, slope)
+
+
+def _inverse(E: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n k"]]:
     """Return the pseudo-inverse of E, and a basis of its null space."""
     left, sigma, right = np.linalg.svd(E)
     rank = int((sigma > TOLERANCE * max(float(sigma[0]), 1e-300)).sum())
     return right[:rank].T @ (left[:, :rank].T / sigma[:rank, None]), right[rank:].T
-
-
-def flat(matrix: ca.DM) -> Float[np.ndarray, " m"]:
-    """Return the entries as an array."""
-    return np.asarray(matrix.full(), dtype=np.float64).ravel()
-
-
-def _solver(model: LearnedMap, outputs: Outputs, least: float) -> ca.Function:
-    x, u = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu)
-    r, theta, e = ca.MX.sym("r", len(outputs.Q)), ca.MX.sym("t", len(model.theta)), ca.MX.sym("e", model.nx)
-    error = outputs.tracked(x) - r
-    f = ca.mtimes([error.T, ca.DM(outputs.Q), error]) + least * (ca.sumsqr(u) + ca.sumsqr(x))
-    g = ca.vertcat(model.F(x, u, theta) + e - x, outputs.limited(x))
-    return ca.nlpsol(
-        "equilibrium", "ipopt", {"x": ca.vertcat(x, u), "p": ca.vertcat(r, theta, e), "f": f, "g": g}, QUIET
-    )

@@ -1,4 +1,4 @@
-"""One pass of a real-time iteration: linearise along the plan, solve the quadratic program of its stages.
+"""Real-time iteration: linearise along the plan, solve the quadratic program of its stages, add the step.
 
 Diehl, Bock & Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", SIAM
 J. Control Optim. 43, 2005.
@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Interval
+from koopmpc.control.limits import Interval, allowance
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.stages import Aim, Problem
+from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
-    Passes,
-    Sides,
+    RiccatiSweeps,
     interior_step,
     linearisation,
+    sides,
     simulation,
     unconstrained,
     weights,
@@ -33,8 +33,8 @@ SHORTEST = 0.02  # of a step
 STUCK = 1e-9  # a step this short leads nowhere
 
 
-class Pass(NamedTuple):
-    """The step (δX, δU) of a pass, how far each soft output gave way, how it ended, and after how many iterations."""
+class StageStep(NamedTuple):
+    """The step (δX, δU), how far each soft limit gave way, how the solver ended, and after how many iterations."""
 
     X: Float[np.ndarray, "N nx"]
     U: Float[np.ndarray, "N nu"]
@@ -46,7 +46,7 @@ class Pass(NamedTuple):
 class RealTimeIteration:
     """The quadratic program along a plan X (N+1, nx), U (N, nu): δx_0 = x − X_0, c_k = F(X_k, U_k) + e_k − X_{k+1}.
 
-    `theta` and `e` are read in each pass, `low` and `high`, the limits of [U_k; g(X_{k+1})], too.
+    Each step reads `theta`, `e`, and `low` and `high`, the limits of [U_k; g(X_{k+1})].
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class RealTimeIteration:
         F, what is tracked and limited, and the stages.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: StagedProblem) -> None:
         N, nx, nu = len(problem.free), problem.nx, problem.F.size1_in(1)
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
@@ -64,49 +64,45 @@ class RealTimeIteration:
         self._free_stages = problem.free
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros
-        self.slack = 0.0  # of the soft limit that the plan breaks most
+        soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
+        self._allowance = allowance(Interval(*(end[soft] for end in self._limits)))
+        self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
-        self._goal = zeros((nr, nx + nr)), zeros((nx, nx + nr)), zeros(nx + nr)  # columns as rows
+        self._terminal = zeros((nr, nx + nr)), zeros((nx, nx + nr)), zeros(nx + nr)  # columns as rows
         A, B, F = zeros((N, nx, nx)), zeros((N, nu, nx)), zeros((N, nx))
         Q, q, r = zeros((N, nx, nx)), zeros((N, nx)), zeros((N, nu))
         self._g, self._G = zeros((N, ng)), zeros((N, nx, ng))
         self._F, self._c, self._x0 = F, zeros((N, nx)), zeros(nx)
-        plan = [self.X, self.U, self._R, self._U_r, *self._goal, self.theta]
+        plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta]
         self._A = A
         self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
         self._simulate = Routine(simulation(problem), [*self._ahead, self.theta], [self._trial])
         self._linearise = Routine(linearisation(problem), plan, [A, B, F, Q, q, r, self._g, self._G])
-        passes, curvature, R = Passes(nx, nu, N), zeros((N, nu)), weights(problem)
+        sweeps, curvature, R = RiccatiSweeps(nx, nu, N), zeros((N, nu)), weights(problem)
         stages = [A, B, self._c, Q, q, r, self._x0]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
         self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
         self._next, after = _views([each.shape for each in state])
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
-        self._free = Routine(unconstrained(passes, R), stages, [self._dX, self._dU, curvature])
+        self._free = Routine(unconstrained(sweeps, R), stages, [self._dX, self._dU, curvature])
         self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
-        interior = interior_step(passes, R, self._sides, ng) if ns else None
+        interior = interior_step(sweeps, R, self._sides, ng) if ns else None
         self._interior = interior and Routine(interior, [*stages, self._G, self._d, *state], [*after, self._measures])
 
     @property
-    def soft_box(self) -> Interval:
-        """The limit of each soft side, below and above."""
-        rows = self._sides.row[len(self._sides.row) - self._sides.soft :]
-        return Interval(*(end[rows] for end in self._limits))
-
-    @property
     def compiled(self) -> bool:
-        """Whether the passes run as machine code."""
+        """Whether the iterations run as machine code."""
         return self._linearise.compiled and self._free.compiled
 
-    def aim(self, aim: Aim) -> None:
-        """Set what is tracked."""
-        self._R[:], self._U_r[:] = aim.R, aim.U
-        for place, value in zip(self._goal, (aim.M.T, aim.L.T, aim.m), strict=True):
+    def track(self, targets: StageTargets) -> None:
+        """Set what is tracked from now on."""
+        self._R[:], self._U_r[:] = targets.R, targets.U
+        for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
             place[:] = value
 
-    def step(self, x: Float[np.ndarray, " nx"], deadline: float) -> Pass:
+    def step(self, x: Float[np.ndarray, " nx"], deadline: float) -> StageStep:
         """Return the solution of the quadratic program for the measured state x along the plan."""
         self._linearise.call()
         np.subtract(self._F, self.X[1:], out=self._c)
@@ -118,12 +114,12 @@ class RealTimeIteration:
         free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._moved()], axis=1)
         nothing = np.zeros_like(self._eps)
         if ((free >= self.low) & (free <= self.high)).all() and np.isfinite(self._dX).all():
-            return Pass(self._dX, self._dU, nothing, Status.UNCONSTRAINED, 0)
+            return StageStep(self._dX, self._dU, nothing, Status.UNCONSTRAINED, 0)
         if self._interior is None or not np.isfinite(free).all():
-            return Pass(self._dX, self._dU, nothing, Status.FAILED, 0)
+            return StageStep(self._dX, self._dU, nothing, Status.FAILED, 0)
         return self._limited(y, free, deadline)
 
-    def take(self, x: Float[np.ndarray, " nx"], found: Pass) -> float:
+    def take(self, x: Float[np.ndarray, " nx"], found: StageStep) -> float:
         """Add the step to the plan, all of it or the half, quarter, … along which F is near its linearisation.
 
         Over the length α the defects should become (1 − α) c; a difference of more than half of the largest change of
@@ -143,9 +139,10 @@ class RealTimeIteration:
                 break
             length /= 2
         self.X[0], X[:], U[:] = x, X_new, U_new
+        self.slack = float(found.slacks[found.slacks > self._allowance].max(initial=0.0))
         return length
 
-    def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> Pass:
+    def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> StageStep:
         """Follow the central path from the unconstrained solution."""
         s = self._sides
         rows = s.row
@@ -168,13 +165,13 @@ class RealTimeIteration:
         assert self._interior is not None, "there are limits"
         while iterations < MOST:
             if perf_counter() > deadline:
-                return Pass(self._dX, self._dU, self._eps, Status.TIME_LIMIT, iterations)
+                return StageStep(self._dX, self._dU, self._eps, Status.TIME_LIMIT, iterations)
             self._interior.call()
             iterations += 1
             self._now[:] = self._next
             mu, length = self._measures
             if not np.isfinite(mu) or not np.isfinite(length):
-                return Pass(self._dX, self._dU, self._eps, Status.FAILED, iterations)
+                return StageStep(self._dX, self._dU, self._eps, Status.FAILED, iterations)
             left *= 1 - length
             if length < STUCK:
                 break
@@ -186,7 +183,7 @@ class RealTimeIteration:
             status = Status.OPTIMAL
         elif left * worst > 1e-6:
             status = Status.INFEASIBLE
-        return Pass(self._dX, self._dU, self._eps * s.span[hard:], status, iterations)
+        return StageStep(self._dX, self._dU, self._eps * s.span[hard:], status, iterations)
 
     def _quantities(self) -> Float[np.ndarray, "N nq"]:
         return np.concatenate([self.U, self._g], axis=1)
@@ -201,35 +198,6 @@ class RealTimeIteration:
         mine = s.row < nu
         span[s.row[mine]] = s.span[mine]
         return max(float(np.mean(self._curvature[self._free_stages] * span**2)), 1e-300)
-
-
-def sides(problem: Problem) -> Sides:
-    """Return the finite ends of all limits, those that are hard first."""
-    nu, inputs, box = len(problem.R), problem.inputs, problem.box
-    low, high = np.concatenate([inputs.low, box.low]), np.concatenate([inputs.high, box.high])
-    linear = np.concatenate([np.full(nu, np.inf), problem.softness.linear])
-    quadratic = np.concatenate([np.zeros(nu), problem.softness.quadratic])
-    finite = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high, 0.0))
-    with np.errstate(invalid="ignore"):
-        span = np.where(np.isfinite(high - low) & (high > low), high - low, 1 + np.abs(finite))
-    ends = [
-        (i, sign)
-        for soft in (False, True)
-        for sign, end in ((1.0, low), (-1.0, high))
-        for i in range(len(low))
-        if np.isfinite(end[i]) and np.isfinite(linear[i]) == soft
-    ]
-    row = np.array([i for i, _ in ends], dtype=np.intp)
-    sign = np.array([s for _, s in ends], dtype=np.float64)
-    given = row[np.isfinite(linear[row])]
-    return Sides(
-        row=row,
-        sign=sign,
-        span=span[row],
-        soft=len(given),
-        linear=0.5 * linear[given] * span[given],
-        quadratic=quadratic[given] * span[given] ** 2,
-    )
 
 
 def _views(shapes: list[tuple[int, ...]]) -> tuple[Float[np.ndarray, " n"], list[Float[np.ndarray, "..."]]]:

@@ -1,7 +1,4 @@
-"""Multiple shooting: the nonlinear program of a horizon, its bounds, and its solution moved on by one step.
-
-Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC 1984.
-"""
+"""Multiple shooting: the nonlinear program of a horizon, its bounds, and its solution moved on by one step."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, cast
@@ -12,12 +9,11 @@ from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.equilibrium import flat
-from koopmpc.control.nonlinear.stages import Aim, Problem
+from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.errors import DataError
 
-Solver = Literal["ipopt", "fatrop", "sqpmethod"]
-_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+NLPSolver = Literal["ipopt", "fatrop", "sqpmethod"]
+OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "ipopt": {
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
@@ -48,8 +44,16 @@ _STATUS = {
 }
 
 
-class Horizon(NamedTuple):
-    """A solution: inputs, states and slacks, stage by stage, its cost, and how the solver ended."""
+class Start(NamedTuple):
+    """Where a solver begins: the variables, and the multipliers of their bounds and of the constraints."""
+
+    v: Float[np.ndarray, " n"]
+    bounds: Float[np.ndarray, " n"]
+    constraints: Float[np.ndarray, " m"]
+
+
+class NLPSolution(NamedTuple):
+    """Inputs, states and slacks of the stages, their cost, how the solver ended, and the start of the next step."""
 
     U: Float[np.ndarray, "N nu"]
     X: Float[np.ndarray, "N nx"]
@@ -57,63 +61,68 @@ class Horizon(NamedTuple):
     cost: float
     status: Status
     iterations: int
-
-
-class Start(NamedTuple):
-    """Where a solver begins: variables, and multipliers of their bounds and of the constraints."""
-
-    v: Float[np.ndarray, " n"]
-    bounds: Float[np.ndarray, " n"]
-    constraints: Float[np.ndarray, " m"]
+    start: Start
 
 
 class Shooting:
-    """Variables (u_k, x_{k+1}, ε_{k+1}) stage by stage, constraints x_{k+1} = F(x_k, u_k) and the limits.
+    """The nonlinear program of a horizon: variables (u_k, x_{k+1}, ε_{k+1}) stage by stage, ε ≥ 0 the slacks.
+
+    The constraints are x_{k+1} = F(x_k, u_k) + e_k and the limits.
 
     Parameters
     ----------
-    problem
-        F, what is tracked and limited, and the stages.
-    solver, options
-        CasADi's solver, and its options by CasADi's names.
+    problem, theta
+        The stages, and the θ of their F.
+    solver, settings
+        CasADi's solver, and its settings by CasADi's names.
 
     Raises
     ------
     DataError
-        The solver refuses its options.
+        The solver refuses its settings.
+
+    References
+    ----------
+    Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC 1984.
     """
 
-    def __init__(self, problem: Problem, solver: Solver, options: Mapping[str, Any]) -> None:
-        outputs, N = problem, len(problem.free)
-        nx, nu, nr, ng = problem.nx, problem.F.size1_in(1), len(outputs.Q), len(outputs.box.low)
+    def __init__(
+        self,
+        problem: StagedProblem,
+        theta: Float[np.ndarray, " nt"],
+        solver: NLPSolver,
+        settings: Mapping[str, Any],
+    ) -> None:
+        p, N = problem, len(problem.free)
+        nx, nu, nr, ng = p.nx, p.F.size1_in(1), len(p.Q), len(p.box.low)
+        moved = nx - p.with_rates * (nu + len(p.soft_rates))  # entries of s that a disturbance moves
         x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
-        F = ca.Function("F", [x, u], [problem.F(x, u, ca.DM(0, 1))])
-        smooth = problem.F.is_a("SXFunction")
-        linear, quadratic = outputs.softness
+        F, smooth = ca.Function("F", [x, u], [p.F(x, u, ca.DM(theta))]), p.F.is_a("SXFunction")
+        F = F.expand() if smooth else F
+        linear, quadratic = p.softness
         soft = np.flatnonzero(np.isfinite(linear))
         ns = len(soft)
+        self.soft = Interval(*(end[soft] for end in p.box))
         W = ca.MX.sym("W", nu + nx + ns, N)
         U, X, E = W[:nu, :], W[nu : nu + nx, :], W[nu + nx :, :]
-        x0, r, u_r = ca.MX.sym("x0", nx), ca.MX.sym("r", nr, N), ca.MX.sym("u_r", nu, N)
-        M, L, m = (ca.MX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1))
+        x0, r, u_r, e = (ca.MX.sym("p", *size) for size in ((nx, 1), (nr, N), (nu, N), (moved, N)))
+        M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
 
-        gaps = X - F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U)  # the sign that fatrop wants
-        end = M @ outputs.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
-        f = _weighted(U - u_r, outputs.R) + ca.sumsqr(end)
+        # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N, the order in which fatrop finds the stages, with its sign
+        gaps = X - F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) - ca.vertcat(e, ca.MX(nx - moved, N))
+        end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
+        f = _weighted(U - u_r, p.R) + ca.sumsqr(end)
         if N > 1:
-            f += _weighted(outputs.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], outputs.Q)
-        paths, low, high = [ca.MX(0, N)], [np.zeros(0)], [np.zeros(0)]
+            f += _weighted(p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], p.Q)
+        path, low, high = ca.MX(0, N), np.zeros(0), np.zeros(0)
         if ng:
-            values, infinite = outputs.limited.map(N)(X), np.full(ng, np.inf)
+            values, infinite = p.limited.map(N)(X), np.full(ng, np.inf)
             relaxed = ca.DM(np.eye(ng)[:, soft]) @ E if ns else ca.MX(ng, N)
             if ns:
-                weights = ca.DM(linear[soft]), ca.DM(quadratic[soft])
-                f += ca.sum2(weights[0].T @ E + weights[1].T @ E**2)
-            paths = [values - relaxed, values + relaxed]
-            low, high = [-infinite, outputs.box.low], [outputs.box.high, infinite]
-        path = ca.vertcat(*paths)
+                f += ca.sum2(ca.DM(linear[soft]).T @ E + ca.DM(quadratic[soft]).T @ E**2)
+            path = ca.vertcat(values - relaxed, values + relaxed)
+            low, high = np.concatenate([-infinite, p.box.low]), np.concatenate([p.box.high, infinite])
         npath = path.shape[0]
-        # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N: the order in which fatrop finds the stages
         g = [
             gaps[:, k] if part == 0 else path[:, k - part]
             for k in range(N + 1)
@@ -130,21 +139,16 @@ class Shooting:
             self._next_g[at] = np.vstack([at[1:], at[-1:]])
         stages = np.arange(W.numel()).reshape(N, -1)
         self._next_v = np.vstack([stages[1:], stages[-1:]]).ravel()
-        lows, highs = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
-        lows[path_at], highs[path_at] = np.concatenate(low), np.concatenate(high)
-        unlimited, zero = np.full(nx, np.inf), np.zeros(ns)
-        lowest = np.tile(np.concatenate([outputs.inputs.low, -unlimited, zero]), (N, 1))
-        highest = np.tile(np.concatenate([outputs.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
-        lowest[~problem.free, :nu] = highest[~problem.free, :nu] = 0.0
-        self._bounds = {
-            "lbx": lowest.ravel(),
-            "ubx": highest.ravel(),
-            "lbg": lows,
-            "ubg": highs,
-        }
-        parameters = ca.vertcat(x0, ca.vec(r), ca.vec(u_r), ca.vec(M), ca.vec(L), m)
+        lbg, ubg = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
+        lbg[path_at], ubg[path_at] = low, high
+        unlimited = np.full(nx, np.inf)
+        lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
+        ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
+        lbx[~p.free, :nu] = ubx[~p.free, :nu] = 0.0
+        self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
+        parameters = ca.veccat(x0, r, u_r, e, M, L, m)
         nlp = {"x": ca.vec(W), "p": parameters, "f": f, "g": ca.vertcat(*g)}
-        given: dict[str, Any] = {"expand": smooth, "error_on_fail": False}
+        given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         if solver == "fatrop":
             given |= {
                 "N": N,
@@ -153,13 +157,11 @@ class Shooting:
                 "ng": [0] + [npath] * N,
             }
         try:
-            self._solver = ca.nlpsol(
-                "shooting", solver, nlp, {"print_time": False, **_OPTIONS[solver], **given, **options}
-            )
+            self._solver = ca.nlpsol("shooting", solver, nlp, {**OPTIONS[solver], **given, **settings})
         except (RuntimeError, NotImplementedError, TypeError) as error:
             reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
             raise DataError(
-                f"{solver} was not built with settings {dict(options)}: {reason}; pass its own settings by CasADi's "
+                f"{solver} was not built with settings {dict(settings)}: {reason}; pass its own settings by CasADi's "
                 'names, for example {"ipopt.tol": 1e-8}'
             ) from error
         self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
@@ -170,22 +172,29 @@ class Shooting:
         W[:, : self._split[0]], W[:, self._split[0] : self._split[1]] = U, X
         return Start(W.ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
 
-    def solve(self, x0: Float[np.ndarray, " nx"], aim: Aim, start: Start, first: Interval) -> tuple[Horizon, Start]:
-        """Solve from `start` with u_0 inside `first`; return the solution, and the start that it leaves."""
-        nu = self._split[0]
+    def solve(
+        self,
+        x0: Float[np.ndarray, " nx"],
+        targets: StageTargets,
+        e: Float[np.ndarray, "N n"],
+        start: Start,
+        first: Interval,
+    ) -> NLPSolution:
+        """Solve from `start` with u_0 inside `first`."""
+        nu, t = self._split[0], targets
         self._bounds["lbx"][:nu], self._bounds["ubx"][:nu] = first
-        p = [x0, aim.R.ravel(), aim.U.ravel(), aim.M.ravel("F"), aim.L.ravel("F"), aim.m]
+        p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
         found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
         stats = self._solver.stats()
         unified = str(stats.get("unified_return_status"))
         status = _STATUS.get(str(stats["return_status"]), _STATUS.get(unified, Status.FAILED))
-        v = flat(found["x"])
+        v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         if not np.isfinite(v).all():
             status = Status.FAILED
         U, X, slacks = np.split(v.reshape(self._shape), self._split, axis=1)
-        after = Start(v[self._next_v], flat(found["lam_x"])[self._next_v], flat(found["lam_g"])[self._next_g])
-        return Horizon(U, X, slacks, float(found["f"]), status, int(stats.get("iter_count", 0))), after
+        after = Start(v[self._next_v], bounds[self._next_v], constraints[self._next_g])
+        return NLPSolution(U, X, slacks, float(found["f"]), status, int(stats.get("iter_count", 0)), after)
 
 
 def _weighted(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:

@@ -1,8 +1,8 @@
-"""A quadratic program of N stages with their own dynamics, as CasADi functions: Riccati passes, interior points.
+"""A quadratic program of N stages with their own dynamics, as CasADi functions: Riccati sweeps, interior points.
 
     min Σ ½ δx_{k+1}ᵀQ_{k+1}δx_{k+1} + q_{k+1}ᵀδx_{k+1} + ½ δu_kᵀRδu_k + r_kᵀδu_k,  δx_{k+1} = A_k δx_k + B_k δu_k + c_k
 
-A barrier term adds a diagonal to R and GᵀwG to Q, so that every Newton step is one backward and one forward pass:
+A barrier term adds a diagonal to R and GᵀwG to Q, so that every Newton step is one backward and one forward sweep:
 its work grows with N, not with N³, and an unstable plant spoils no digits.
 
 Rao, Wright & Rawlings, "Application of interior-point methods to model predictive control", J. Optim. Theory
@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.nonlinear.stages import Problem
+from koopmpc.control.nonlinear.problem import StagedProblem
 
 _SHORT = 0.995  # share of the way to the nearest bound
 
@@ -34,7 +34,36 @@ class Sides(NamedTuple):
     quadratic: Float[np.ndarray, " nsoft"]
 
 
-def linearisation(problem: Problem) -> ca.Function:
+def sides(problem: StagedProblem) -> Sides:
+    """Return the finite ends of all limits, those that are hard first."""
+    nu, inputs, box = len(problem.R), problem.inputs, problem.box
+    low, high = np.concatenate([inputs.low, box.low]), np.concatenate([inputs.high, box.high])
+    linear = np.concatenate([np.full(nu, np.inf), problem.softness.linear])
+    quadratic = np.concatenate([np.zeros(nu), problem.softness.quadratic])
+    finite = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high, 0.0))
+    with np.errstate(invalid="ignore"):
+        span = np.where(np.isfinite(high - low) & (high > low), high - low, 1 + np.abs(finite))
+    ends = [
+        (i, sign)
+        for soft in (False, True)
+        for sign, end in ((1.0, low), (-1.0, high))
+        for i in range(len(low))
+        if np.isfinite(end[i]) and np.isfinite(linear[i]) == soft
+    ]
+    row = np.array([i for i, _ in ends], dtype=np.intp)
+    sign = np.array([s for _, s in ends], dtype=np.float64)
+    given = row[np.isfinite(linear[row])]
+    return Sides(
+        row=row,
+        sign=sign,
+        span=span[row],
+        soft=len(given),
+        linear=0.5 * linear[given] * span[given],
+        quadratic=quadratic[given] * span[given] ** 2,
+    )
+
+
+def linearisation(problem: StagedProblem) -> ca.Function:
     """Return (X, U, R, U_r, M, L, m, θ) → (A, B, F, Q, q, r, g, G), stage beside stage.
 
     A, B, F at (X_k, U_k), k = 0 … N−1, B zero where a stage has no input; the rest at X_{k+1}: Q = JᵀQJ and
@@ -78,7 +107,7 @@ def linearisation(problem: Problem) -> ca.Function:
     return ca.Function("linearisation", [X, U, R, U_r, *goal, t], found)
 
 
-def simulation(problem: Problem) -> ca.Function:
+def simulation(problem: StagedProblem) -> ca.Function:
     """Return (X, U, θ) → F(X_k, U_k), stage beside stage."""
     nx, nu, N = problem.nx, problem.F.size1_in(1), len(problem.free)
     X, U, t = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N), ca.MX.sym("t", problem.F.size1_in(2))
@@ -86,15 +115,15 @@ def simulation(problem: Problem) -> ca.Function:
     return ca.Function("simulation", [X, U, t], [found])
 
 
-def weights(problem: Problem) -> Float[np.ndarray, "nu m"]:
+def weights(problem: StagedProblem) -> Float[np.ndarray, "nu m"]:
     """Return R stage beside stage; a stage without an input has a weight of its own, so that it rests at zero."""
     nu = len(problem.R)
     held = max(float(np.trace(problem.R)), float(np.trace(problem.Q))) / nu * np.eye(nu)
     return np.hstack([problem.R if free else held for free in problem.free])
 
 
-class Passes:
-    """The Riccati passes as functions of matrices, stage beside stage."""
+class RiccatiSweeps:
+    """The backward and forward sweeps of the Riccati recursion, as functions of matrices stage beside stage."""
 
     def __init__(self, nx: int, nu: int, N: int) -> None:
         self.nx, self.nu, self.N = nx, nu, N
@@ -135,7 +164,7 @@ class Passes:
         return M[:, order.tolist()]
 
     def factors(self, A: ca.MX, B: ca.MX, c: ca.MX, Q: ca.MX, R: ca.MX) -> list[ca.MX]:
-        """Return what the passes of this matrix need, last stage first: B, K, L, A − B K, P c; LᵀL = R + BᵀPB."""
+        """Return what the sweeps for these matrices need, last stage first: B, K, L, A − B K, P c; LᵀL = R + BᵀPB."""
         nx, nu = self.nx, self.nu
         turned = [self.turned(M, n) for M, n in ((A, nx), (B, nu), (c, 1), (Q, nx), (R, nu))]
         _, K, half, closed, Pc = self._factor(ca.DM(nx, nx), *turned)
@@ -150,24 +179,24 @@ class Passes:
         return X, U
 
 
-def unconstrained(passes: Passes, R: Float[np.ndarray, "nu m"]) -> ca.Function:
+def unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"]) -> ca.Function:
     """Return (A, B, c, Q, q, r, δx_0) → (δX, δU, diag S): the solution without limits, and the inputs' curvatures."""
-    nx, nu, N = passes.nx, passes.nu, passes.N
+    nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
     A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
-    factors = passes.factors(A, B, c, Q, ca.MX(ca.DM(R)))
-    X, U = passes.solve(factors, B, c, q, r, x0)
+    factors = sweeps.factors(A, B, c, Q, ca.MX(ca.DM(R)))
+    X, U = sweeps.solve(factors, B, c, q, r, x0)
     curvature = ca.sum1(factors[2] ** 2)  # column by column the diagonal of S
     return ca.Function("unconstrained", [A, B, c, Q, q, r, x0], [X, U, curvature])
 
 
-def interior_step(passes: Passes, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
+def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
     """Return one predictor–corrector step of the interior-point method.
 
     (A, B, c, Q, q, r, δx_0, G, d; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the distances of the plan
     (ns, N), t ≥ 0 the distances, λ their multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean complementarity
     before the step, α the step's length.
     """
-    nx, nu, N = passes.nx, passes.nu, passes.N
+    nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
     ns, nsoft = len(sides.row), sides.soft
     A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
     G, d = ca.MX.sym("G", ng, N * nx), ca.MX.sym("d", ns, N)
@@ -202,14 +231,14 @@ def interior_step(passes: Passes, R: Float[np.ndarray, "nu m"], sides: Sides, ng
     weights = (S.T**2) @ eased
     R_k = ca.MX(ca.DM(R)) + diagonal(weights[:nu, :])
     Q_k = Q + gram(G, weights[nu:, :]) if ng else Q
-    factors = passes.factors(A, B, c, Q_k, R_k)
+    factors = sweeps.factors(A, B, c, Q_k, R_k)
 
     def solve(c1: ca.MX | float, c2: ca.MX | float) -> tuple[ca.MX, ...]:
         rho = lam[ns - nsoft :, :] - l1 - l2 * eps + c2 / eps
         base = lam + (-w * (K * padded(rho) + gap) - lam + c1 / t) / (1 + w * K)
         gradient = -S.T @ (base + eased * moved)
         q_k = q + pulled(G, gradient[nu:, :]) if ng else q
-        X_new, U_new = passes.solve(factors, B, c, q_k, r + gradient[:nu, :], x0)
+        X_new, U_new = sweeps.solve(factors, B, c, q_k, r + gradient[:nu, :], x0)
         reached = distances(X_new, U_new) - moved
         d_lam = base - eased * reached - lam
         d_eps = kappa * (rho + d_lam[ns - nsoft :, :])

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.nonlinear.equilibrium import CLOSE, Rests
-from koopmpc.control.nonlinear.model import learned_map
+from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
+from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.control.tracking import outputs
 from tests.control.test_bilinear_mpc import pendulum
 
@@ -23,12 +23,12 @@ def two_tanks() -> km.StepMap:
     return km.StepMap(ca.Function("F", [x, u], [x + 0.1 * flow]), 0.1)
 
 
-def rests(model, limits: km.Limits, cost: km.Cost = COST) -> Rests:
+def equilibria(model, limits: km.Limits, cost: km.Cost = COST) -> Equilibria:
     seen = outputs(model.states, model.nu, cost, limits)
-    return Rests(learned_map(model), seen, of_state=True)
+    return Equilibria(learned_map(model), cost, seen)
 
 
-SWING, TANKS = rests(pendulum(), BOX), rests(two_tanks(), km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+SWING, TANKS = equilibria(pendulum(), BOX), equilibria(two_tanks(), km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
 
 
 @settings(max_examples=40)
@@ -36,7 +36,7 @@ SWING, TANKS = rests(pendulum(), BOX), rests(two_tanks(), km.Limits(0, [1.0, 0.6
 def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
     rng = np.random.default_rng(seed)
     each = TANKS if tanks else SWING
-    nx, theta = each.model.nx, each.model.theta
+    nx = each.model.nx
     row = rng.uniform(0.2, 1.6, nx) if tanks else np.array([rng.uniform(-0.5, 1.2), 0.0])
     e = 0.02 * rng.standard_normal(nx)
     begin = each.find(row)
@@ -45,7 +45,7 @@ def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
         return
     assert np.allclose(near.x, far.x, atol=1e-4)
     assert np.allclose(near.u, far.u, atol=1e-4)
-    at = each.local(near.x, near.u, theta)
+    at = each.linearise(near.x, near.u)
     assert np.allclose(at.F + e, near.x, atol=1e-9)
     for values, box in ((near.u, each._outputs.inputs), (at.g, each._outputs.box)):
         assert (values >= box.low - 1e-8).all()
@@ -65,8 +65,8 @@ def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(
     F, found = model.step_map(), []
     mpc = km.BilinearMPC(model, COST, limits, 30, estimator=km.LiftedDisturbance(0.3))
     x = np.array([0.1, 0.0])
-    find = Rests.find
-    monkeypatch.setattr(Rests, "find", lambda self, *rest: found.append(1) or find(self, *rest))
+    find = Equilibria.find
+    monkeypatch.setattr(Equilibria, "find", lambda self, *rest: found.append(1) or find(self, *rest))
     load = np.array([0.0, 0.004])
     for k in range(300):
         move = mpc(x, [reference, 0.0])

@@ -1,0 +1,227 @@
+"""From a model, a cost and limits to the problem of a horizon: x⁺ = F(x, u, θ), then stages s⁺ = F(s, v, θ)."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import block_diag
+
+from koopmpc import checks
+from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.tracking import Outputs
+from koopmpc.data.delay import Delay
+from koopmpc.errors import DataError
+from koopmpc.plants.buffered import Buffered
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+
+ModelOrMap = BilinearPredictor | LinearPredictor | StepMap
+_SHARED = ("lifting", "embedding", "dt", "states", "inputs", "disturbances")
+
+
+@dataclass(frozen=True)
+class LearnedMap:
+    """x⁺ = F(x, u, θ) + E w + d, θ being the matrices of the model: another model of the same lifting is another θ.
+
+    Of a predictor F is C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), lifted afresh each step, and θ holds C A, C B and C Nᵢ. Under
+    an embedding x is the point ζ of the plant's state and its past, the state first; F also shifts the past, which
+    neither w nor d moves. A StepMap has no θ.
+
+    Attributes
+    ----------
+    model
+        What the map was made of.
+    E
+        (nx, nw) gain of the measured disturbances.
+    nx, ny, nu, nw
+        Entries of x, of the plant's state, of u and of w.
+    embedding
+        What makes x of the plant's state and its past; None where x is that state.
+    """
+
+    model: ModelOrMap
+    F: ca.Function
+    theta: Float[np.ndarray, " nt"]
+    E: Float[np.ndarray, "nx nw"]
+    nx: int
+    ny: int
+    nu: int
+    nw: int
+    embedding: Delay | None
+
+    def updated(self, model: ModelOrMap) -> "LearnedMap":
+        """Return the map of another predictor with the same lifting.
+
+        Raises
+        ------
+        DataError
+            The models differ in more than their matrices, or one is a StepMap, which has none.
+        """
+        if isinstance(model, StepMap) or isinstance(self.model, StepMap):
+            raise DataError("a StepMap has no matrices that could be exchanged; make a new controller")
+        if type(model) is not type(self.model):
+            raise DataError(
+                f"the controller was made for a {type(self.model).__name__}, and got a {type(model).__name__}; "
+                "pass a predictor of the same kind, or make a new controller"
+            )
+        for name in _SHARED:
+            if getattr(model, name, None) != getattr(self.model, name, None):
+                raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
+        return replace(self, model=model, theta=_theta(model), E=_gain(model, self.nx))
+
+    def step(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nx"]:
+        """Return F(x, u, θ)."""
+        return self._buffered(x, u, self.theta)[0]
+
+    def advance(
+        self,
+        z: Float[np.ndarray, " nx"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+        d: Float[np.ndarray, " nx"],
+    ) -> Float[np.ndarray, " nx"]:
+        """Return F(z, u, θ) + E w + d, as observers ask for it."""
+        return self.step(z, u) + self.E @ w + d
+
+    @cached_property
+    def _buffered(self) -> Buffered:
+        return Buffered(self.F)
+
+
+def learned_map(model: ModelOrMap) -> LearnedMap:
+    """Return the map of a predictor or of a StepMap.
+
+    Raises
+    ------
+    DataError
+        The model is something else.
+    """
+    kinds = (BilinearPredictor, LinearPredictor, StepMap)
+    checks.kind(model, "model", kinds, "fit one with bilinear_edmd or edmd, or pass a StepMap")
+    ny = len(model.states)
+    if isinstance(model, StepMap):
+        x, u, none = ca.MX.sym("x", ny), ca.MX.sym("u", model.nu), ca.MX.sym("theta", 0)
+        F = ca.Function("F", [x, u, none], [ca.densify(model.F(x, u))])
+        F = F.expand("F") if model.F.is_a("SXFunction") else F
+        return LearnedMap(model, F, np.zeros(0), np.zeros((ny, 0)), ny, ny, model.nu, 0, None)
+    nu, nz, nx = model.nu, model.nz, len(model.point_names)
+    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
+    A, B = ca.SX.sym("CA", ny, nz), ca.SX.sym("CB", ny, nu)
+    theta, z = [A, B], model.lifting.symbolic(x)
+    for i in range(nu if isinstance(model, BilinearPredictor) else 0):
+        theta.append(ca.SX.sym(f"CN{i}", ny, nz))
+        A = A + u[i] * theta[-1]
+    x_next = A @ z + B @ u
+    if model.embedding is not None:
+        x_next = model.embedding.symbolic(x, u, x_next)
+    F = ca.Function("F", [x, u, ca.vertcat(*map(ca.vec, theta))], [ca.densify(x_next)], {"cse": True})
+    E = _gain(model, nx)
+    return LearnedMap(model, F, _theta(model), E, nx, ny, nu, E.shape[1], model.embedding)
+
+
+def _theta(model: LinearPredictor | BilinearPredictor) -> Float[np.ndarray, " nt"]:
+    parts = [model.A, model.B, *(model.N if isinstance(model, BilinearPredictor) else ())]
+    return np.concatenate([(model.C @ part).ravel("F") for part in parts])
+
+
+def _gain(model: LinearPredictor | BilinearPredictor, nx: int) -> Float[np.ndarray, "nx nw"]:
+    if isinstance(model, BilinearPredictor):
+        return np.zeros((nx, 0))
+    E = np.zeros((nx, model.nw))
+    E[: model.nx] = model.C @ model.E
+    return E
+
+
+class StagedProblem(NamedTuple):
+    """s⁺ = F(s, v, θ) over N stages, what is tracked and limited of s, and the weights.
+
+    Without rates s = x and v = u. Where changes of the inputs are weighed or limited, or moves are blocked, the change
+    v_k = u_k − u_{k−1} is the input of s = [x; u_{k−1}; v_{k−1}] with s⁺ = [F(x, u_{k−1} + v); u_{k−1} + v; v]. Then
+    `tracked` is [of(x); u_{k−1}], Q holds the weights of both, R is R_delta, the limits of u are limits of s, and a
+    held input is v = 0. The part v_{k−1} holds the inputs `soft_rates`, whose changes have soft limits.
+
+    Attributes
+    ----------
+    inputs
+        Limits of v, which are hard.
+    box, softness
+        Limits of `limited`, and what it costs to break them.
+    free
+        Whether a stage has an input; else v is zero there.
+    held_from
+        The stage whose input each stage takes.
+    """
+
+    F: ca.Function
+    tracked: ca.Function
+    limited: ca.Function
+    Q: Float[np.ndarray, "nr nr"]
+    R: Float[np.ndarray, "nu nu"]
+    inputs: Interval
+    box: Interval
+    softness: Softness
+    free: Bool[np.ndarray, " N"]
+    held_from: Int[np.ndarray, " N"]
+    with_rates: bool
+    soft_rates: Int[np.ndarray, " nsoft"]
+
+    @property
+    def nx(self) -> int:
+        """Entries of s."""
+        return self.F.size1_in(0)
+
+
+class StageTargets(NamedTuple):
+    """Reference rows of s_1 … s_N, reference inputs, and the terminal cost ‖M of(s_N) + L s_N − m‖²."""
+
+    R: Float[np.ndarray, "N nr"]
+    U: Float[np.ndarray, "N nu"]
+    M: Float[np.ndarray, "nt nr"]  # nt = ns + nr
+    L: Float[np.ndarray, "nt ns"]
+    m: Float[np.ndarray, " nt"]
+
+
+def staged_problem(F: ca.Function, outputs: Outputs, blocks: tuple[int, ...]) -> StagedProblem:
+    """Return the problem of a horizon that is cut into blocks of held inputs, F being that of a `LearnedMap`."""
+    o, N = outputs, sum(blocks)
+    starts = np.cumsum([0, *blocks[:-1]])
+    free = np.zeros(N, dtype=np.bool_)
+    free[starts] = True
+    held_from = np.repeat(starts, blocks)
+    if not o.with_rates and len(blocks) == N:
+        none = np.zeros(0, dtype=np.intp)
+        return StagedProblem(
+            F, o.tracked, o.limited, o.Q, o.R, o.inputs, o.box, o.softness, free, held_from, False, none
+        )
+    nx, nu = F.size1_in(0), F.size1_in(1)
+    unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
+    rates = unlimited if o.rates is None else o.rates
+    given = np.isfinite(rates.low) | np.isfinite(rates.high)
+    soft = np.flatnonzero(given & np.isfinite(o.rate_softness.linear))
+    low, high = rates.low.copy(), rates.high.copy()
+    low[soft], high[soft] = -np.inf, np.inf
+
+    ns = nx + nu + len(soft)
+    sym, v, theta = ca.MX.sym("s", ns), ca.MX.sym("v", nu), ca.MX.sym("theta", F.size1_in(2))
+    u = sym[nx : nx + nu] + v
+    after = ca.Function("F", [sym, v, theta], [ca.vertcat(F(sym[:nx], u, theta), u, v[soft.tolist(), 0])])
+    s = ca.SX.sym("s", ns)
+    x, last = s[:nx], s[nx : nx + nu]
+    hard = np.full(nu, np.inf), np.zeros(nu)
+    return StagedProblem(
+        after.expand("F") if F.is_a("SXFunction") else after,
+        ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
+        ca.Function("limited", [s], [ca.vertcat(last, s[nx + nu :], o.limited(x))]),
+        block_diag(o.Q, o.R),
+        np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
+        Interval(low, high),
+        Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.box[i]]) for i in (0, 1))),
+        Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1))),
+        free,
+        held_from,
+        True,
+        soft,
+    )

@@ -1,0 +1,286 @@
+"""What BilinearMPC and NonlinearMPC share: a step from the measurement, over the targets of its stages, to a Move."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.base import MPCBase, PlanMemory, admitted, hard
+from koopmpc.control.cost import Cost
+from koopmpc.control.initial_condition import InitialCondition, Sizes, numbers
+from koopmpc.control.limits import Interval, Limits, beyond
+from koopmpc.control.linear.horizon import blocked
+from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
+from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
+from koopmpc.control.target import root
+from koopmpc.control.tracking import HUGE, outputs, reference_rows
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.measured import MeasuredState
+from koopmpc.plants.step_map import StepMap
+
+GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
+
+
+class StagePlan(NamedTuple):
+    """The plan of a step in the s and v of its stages, how it was found, and the soft limit's violation.
+
+    `free` is the first input of the program without limits, where it is known.
+    """
+
+    S: Float[np.ndarray, "N1 ns"]
+    V: Float[np.ndarray, "N nu"]
+    status: Status
+    iterations: int
+    slack: float = 0.0
+    free: Float[np.ndarray, " nu"] | None = None
+
+
+class Preview(NamedTuple):
+    """Reference rows, the reference inputs and their slopes, which rows equal the last one, and the last target."""
+
+    R: Float[np.ndarray, "N1 nr"]
+    U: Float[np.ndarray, "N nu"]
+    slopes: Float[np.ndarray, "N nu nx"]
+    held: Bool[np.ndarray, " N"]
+    target: TerminalTarget
+
+
+class StagedMPC(MPCBase):
+    """An MPC on x⁺ = F(x, u) + E w + d, whose solver works stage by stage; parameters as in `BilinearMPC`."""
+
+    _e: Float[np.ndarray, "N nx"]  # e_k = E w_k + d of the step
+    _warm: bool  # whether the next step starts from the plan of the last one
+
+    def __init__(
+        self,
+        model: ModelOrMap,
+        cost: Cost,
+        limits: Limits | None,
+        horizon: int,
+        moves: int | Sequence[int] | None,
+        estimator: LiftedDisturbance | None,
+        latency: int,
+        time_limit: float | None,
+    ) -> None:
+        self._map = given = learned_map(model)
+        super().__init__(model.dt, given.nu, cost, limits, horizon, latency, time_limit)
+        self._blocks = blocked(moves, self._N)
+        self._outputs = o = outputs(model.states, given.nu, self.cost, self.limits, given.nx)
+        self._problem = staged_problem(given.F, o, self._blocks)
+        self._with_rates = self._problem.with_rates
+        self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
+        self._hard_rates = hard(o.rates, o.rate_softness.linear)
+        self._R_root = root(o.R)
+        self._memory = PlanMemory(o.inputs, self._N, o.rates)
+        self._estimator = estimator
+        if estimator is not None:
+            advice = "LiftedKalman filters a linear predictor's z; here y is the whole state"
+            checks.kind(estimator, "estimator", LiftedDisturbance, advice)
+        self._disturbed = estimator is not None or given.nw > 0
+        self._initial = InitialCondition(
+            given,
+            MeasuredState(given) if estimator is None else estimator.watch(given),
+            Sizes(given.nx, given.nu, given.nw, self._N),
+            self._latency,
+            with_rates=self._with_rates,
+            estimated=estimator is not None,
+            remembers=given.embedding is not None,
+        )
+
+    @property
+    def model(self) -> ModelOrMap:
+        """The model as it was given."""
+        return self._map.model
+
+    @property
+    def step_map(self) -> StepMap:
+        """The model as a map, x⁺ = F(x, u)."""
+        return self.model if isinstance(self.model, StepMap) else self.model.step_map()
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
+        self._memory.reset(u_prev)
+        self._initial.reset(x0, self._memory.last())
+        self._planned = self._warm = self._moved = False
+        self._forget_targets()
+        self._e[:] = 0.0
+
+    def update(self, model: ModelOrMap) -> None:
+        """Go on with new A, B, N, C and E of the same lifting: the plan and the last input are kept.
+
+        Raises
+        ------
+        DataError
+            The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
+        """
+        self._map = self._map.updated(model)
+        self._terminal.update(self._map)
+        self._initial.update(self._map)
+        self._initial.observer.update(self._map)
+        self._forget_targets()
+
+    def _forget_targets(self) -> None:
+        """Have the next step find its targets anew."""
+        self._reference: bytes | None = None
+        self._target: TerminalTarget | None = None
+
+    def plan(self) -> Plan | None:
+        """Return the plan of the last call; None where it had none."""
+        return Plan(self._X[:, : self._map.ny].copy(), self._U.copy()) if self._planned else None
+
+    def __call__(
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+    ) -> Move:
+        """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
+        start = perf_counter()
+        initial = self._initial
+        initial.take(y, self._memory.last(), applied, w)
+        x, u_prev = initial.z, self._known_input()
+        target = numbers(reference, "reference")
+        known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
+        if not (known and self._aim(target)):
+            return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
+        first, conflict = self._first_inputs(u_prev)
+        found = self._solve(x, u_prev, first, start + self._allowed)
+        status = Status.FAILED if self.solver_fails else found.status
+        if status not in GOOD:
+            return self._lose(applied, status, found.iterations, start, found.free)
+        self._planned = self._warm = True
+        self._X, self._U = self._trajectory(found.S, found.V)
+        slack, u = found.slack, self._U[0]
+        if self._hard_rates is not None:
+            u[:] = admitted(u, self._outputs.inputs, self._hard_rates, u_prev)
+            if conflict:
+                slack = max(slack, beyond(u - u_prev, self._hard_rates))
+        self._memory.keep(self._U.ravel())
+        return self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
+
+    @abstractmethod
+    def _solve(
+        self,
+        x: Float[np.ndarray, " nx"],
+        u_prev: Float[np.ndarray, " nu"],
+        first: Interval,
+        deadline: float,
+    ) -> StagePlan:
+        """Return the plan from x on, with v_0 inside `first`."""
+
+    @abstractmethod
+    def _track(self, targets: StageTargets) -> None:
+        """Hand new targets to the solver."""
+
+    def _disturb(self) -> bool:
+        """Write down e_k = E w_k + d; return whether it is finite."""
+        initial = self._initial
+        e = initial.W @ self._map.E.T
+        if initial.d.size:
+            e = e + initial.d
+        if not np.abs(e).max() < HUGE:
+            return False
+        self._moved = self._moved or bool((e[-1] != self._e[-1]).any())
+        self._e[:] = e
+        return True
+
+    def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
+        """Hand the targets of a reference to the solver where they have changed; return whether it is finite."""
+        key = reference.tobytes()
+        if key == self._reference and not self._moved:
+            return True
+        if key != self._reference:
+            R = reference_rows(self._previewed(reference), self._N, len(self._outputs.Q))
+            self._reference = None
+            if not np.isfinite(R).all():
+                return False
+            *targets, end = (self._terminal(row) for row in R)
+            self._preview = Preview(
+                R,
+                np.array([target.u for target in targets]),
+                np.array([target.slope for target in targets]),
+                (R[:-1] == R[-1]).all(axis=1),
+                end,
+            )
+            self._reference = key
+        R, U, slopes, held, end = self._preview
+        if self._disturbed:  # the last disturbance of the preview stays
+            e = self._e[-1]
+            end = self._target = self._terminal.disturbed(R[-1], e, self._target)
+            U = np.clip(U + slopes @ e, *self._outputs.inputs)
+            U[held] = end.u
+        self._track(self._staged(R[1:], U, end))
+        self._moved = False
+        return True
+
+    def _staged(
+        self, R: Float[np.ndarray, "N nr"], U: Float[np.ndarray, "N nu"], target: TerminalTarget
+    ) -> StageTargets:
+        """Return the targets of the stages, of reference rows, reference inputs and a terminal target."""
+        M, L, V, m = target.M, target.L, target.V, target.m
+        if not self._with_rates:
+            return StageTargets(R, U, M, L, m)
+        (n, nr), nx, nu, ns = M.shape, L.shape[1], U.shape[1], self._problem.nx
+        M_s, L_s, m_s = np.zeros((ns + nr + nu, nr + nu)), np.zeros((ns + nr + nu, ns)), np.zeros(ns + nr + nu)
+        last = slice(nx, nx + nu)
+        M_s[:n, :nr], L_s[:n, :nx], L_s[:n, last], m_s[:n] = M, L, V, m
+        L_s[n : n + nu, last], m_s[n : n + nu] = self._R_root, self._R_root @ U[-1]
+        return StageTargets(np.hstack([R, U]), np.zeros_like(U), M_s, L_s, m_s)
+
+    def _first_inputs(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, bool]:
+        """Return the limits of v_0, and whether rates were widened: where they exclude the limits of u, these win."""
+        low, high = self._problem.inputs
+        if not self._with_rates:
+            return self._problem.inputs, False
+        inputs = self._outputs.inputs
+        widened = Interval(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
+        return widened, bool((widened.low < low - 1e-9).any() or (widened.high > high + 1e-9).any())
+
+    def _start(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " ns"]:
+        """Return s_0."""
+        return np.concatenate([x, u_prev, np.zeros(len(self._problem.soft_rates))]) if self._with_rates else x
+
+    def _stages(
+        self,
+        X: Float[np.ndarray, "N1 nx"],
+        U: Float[np.ndarray, "N nu"],
+        u_prev: Float[np.ndarray, " nu"],
+    ) -> tuple[Float[np.ndarray, "N1 ns"], Float[np.ndarray, "N nu"]]:
+        """Return a plan of states and inputs in s and v, its inputs inside their limits and held in each block."""
+        low, high = self._outputs.inputs
+        U = np.minimum(np.maximum(U, low), high)
+        if not self._with_rates:
+            return X, U
+        before = np.vstack([u_prev, U[self._problem.held_from]])
+        V = np.diff(before, axis=0)
+        late = np.vstack([np.zeros(self._nu), V])[:, self._problem.soft_rates]
+        return np.hstack([X, before, late]), V
+
+    def _trajectory(
+        self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]
+    ) -> tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]:
+        """Return the states and the inputs of a plan, the inputs inside their limits."""
+        nx, (low, high) = self._map.nx, self._outputs.inputs
+        if self._with_rates:
+            V = S[0, nx : nx + self._nu] + np.cumsum(V * self._problem.free[:, None], axis=0)
+        return S[:, :nx], np.minimum(np.maximum(V, low), high)
+
+    def _lose(
+        self,
+        applied: ArrayLike | None,
+        status: Status,
+        iterations: int,
+        start: float,
+        free: Float[np.ndarray, " nu"] | None = None,
+    ) -> Move:
+        """Return what stands in for a failed step; the next one starts anew, unless there was no time."""
+        self._warm = status is Status.TIME_LIMIT
+        known = free is not None and bool((np.abs(free) < HUGE).all())
+        return self._fail(free if known else None, applied, status, iterations, start)
