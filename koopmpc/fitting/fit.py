@@ -156,7 +156,7 @@ def fit_data(
     pictures = drawn(selection, report, plain, split.held_out, place, failures)
     recording = place / "model.rrd"
     try:
-        record_model(selection.predictor, recording, split.held_out, report=report)
+        record_model(selection.predictor, split.held_out, recording, report=report)
     except Exception as error:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(error).__name__}: {error}")
     whole = Fitted(

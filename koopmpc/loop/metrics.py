@@ -1,4 +1,4 @@
-"""metrics: what a Run amounts to, from the Run alone."""
+"""metrics: the closed-loop figures of a Run, from the Run alone: cost, tracking, violation, settling, times."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,26 +22,34 @@ class Metrics(Value):
     Attributes
     ----------
     cost
-        Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, and with R_delta
-        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}; no dt; NaN where the run has no Cost or no state.
+        J = Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, and with R_delta also
+        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}. It is not multiplied by dt. It is NaN where the run has no Cost, or its plant hides the state.
     tracking_rmse
-        Root-mean-square of each tracked output's error over k = 1 … T, in its unit.
+        (nr,) root-mean-square of each tracked output's error of(x_k) − r_k over k = 1 … T, in its unit.
     final_error
-        Each tracked output's error at T.
+        (nr,) each tracked output's error at T, in its unit.
     violation
         Largest violation of any state, output or rate limit, in the unit of that limit.
     input_violation
-        Largest violation of any input limit; a controller keeps it at zero.
+        Largest violation of any input limit, in its unit; every controller of this library keeps it at zero.
     effort
-        Σ ‖u_k‖² dt.
+        Σ_{k=0}^{T−1} ‖u_k‖² dt.
     settling_time
-        Time after which the weighted error stays within 2 % of its first value [s]; inf where it never does.
+        Time after which ‖of(x_k) − r_k‖_Q stays within 2 % of its first value [s]; inf where it never does.
     solve_time_p50, solve_time_p99, solve_time_max
-        Of the wall-clock time of a step [s].
+        Median, 99 % quantile and maximum of the wall-clock time of a step [s].
     late
-        Steps whose solve_time exceeded dt.
-    status, fallback
-        How many steps ended with each name.
+        Number of steps whose solve_time exceeded dt.
+    status
+        Number of steps that ended with each status, by its name. As intended: UNCONSTRAINED (no limit was active),
+        OPTIMAL (a QP or NLP was solved), SOFTENED (solved, and a soft limit gave way), SATURATED (a feedback law was
+        clipped). Otherwise: MAX_ITERATIONS, INFEASIBLE, FAILED (the solver gave no answer), BAD_MEASUREMENT (NaN or
+        inf in y or the reference), and TIME_LIMIT (the step took longer than allowed, whether or not its answer
+        was used).
+    fallback
+        Number of steps whose input each fallback gave, by its name: NONE (the controller's own answer),
+        SHIFTED_PLAN (the last plan, moved on by one step), CLIPPED_LQR (the unconstrained optimum, clipped), HOLD
+        (the last input again).
     """
 
     cost: float
@@ -91,7 +99,30 @@ def duration(seconds: float) -> str:
 
 @np.errstate(invalid="ignore", over="ignore")  # a state that diverged, a sensor that showed inf: the cost says so
 def metrics(run: Run) -> Metrics:
-    """Return the closed-loop figures of `run`: cost, tracking, violation, effort, settling and solve times."""
+    """Return the closed-loop figures of `run`, above all J = Σ ‖of(x_k) − r_k‖²_Q + Σ ‖u_k − u_reference_k‖²_R.
+
+    The errors of states that the run names as angles are wrapped to (−π, π]. Where the plant hides its state and
+    measures all of it, the measurements take the state's place. Without a Cost the error is x_k − r_k, and Q = I
+    judges the settling time.
+
+    Parameters
+    ----------
+    run
+        A closed loop of T steps, from `simulate` or `load_run`. Its own cost, limits and u_reference judge it.
+
+    Returns
+    -------
+    metrics
+        The figures; `Metrics` has the equation and the unit of each.
+
+    Raises
+    ------
+    DataError
+        `run` is not a Run.
+    ShapeError
+        The reference has another number of columns than the outputs that the cost tracks, or than the states where
+        there is no cost; a weight or a limit has another size than what it is for.
+    """
     checks.kind(run, "run", Run, "simulate returns one")
     error = tracking_error(run)
     nr, nu = error.shape[1], run.U.shape[1]

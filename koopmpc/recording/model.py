@@ -2,7 +2,6 @@
 """record_model: a predictor and how far it can be trusted, as one Rerun log."""
 
 import re
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,8 @@ from koopmpc.errors import DataError
 from koopmpc.figures.plane import Axes, Plane, plane_through
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
-from koopmpc.recording.views.blueprint import PALETTE
+from koopmpc.recording.format.writer import PATIENCE, file_recording, times
+from koopmpc.recording.views.blueprint import color, framed
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
 from koopmpc.scene import Color
 from koopmpc.validate.forecast import Forecast, forecast
@@ -24,72 +24,20 @@ from koopmpc.validate.report import TrustReport
 from koopmpc.validate.scoring import Predictor, Score, score
 
 _TRUTH: Color = (225, 228, 232)
-_PREDICTED = PALETTE[0]
+_PREDICTED = color(0)
 _BAND: Color = (70, 125, 185)
-
-
-class Series:
-    """One entity: rows of several curves at steps of dt, with names, colours and widths."""
-
-    def __init__(self, values: np.ndarray, first: int, dt: float, curves: list[tuple[str, Color, float]]) -> None:
-        self.values, self.first, self.dt, self.curves = values, first, dt, curves
-
-    def send(self, rec: Any, entity: str, *, steps: bool = False) -> None:
-        """Write the style and the columns."""
-        import rerun as rr
-
-        names, colors, widths = (list(part) for part in zip(*self.curves, strict=True))
-        more: dict[str, Any] = {"interpolation_mode": "StepAfter"} if steps else {}
-        drawn = [drawable(name) for name in names]
-        rec.log(entity, rr.SeriesLines(names=drawn, colors=colors, widths=widths, **more), static=True)
-        k = self.first + np.arange(len(self.values))
-        nanoseconds = np.rint(k * self.dt * 1e9).astype("timedelta64[ns]")
-        columns = rr.Scalars.columns(scalars=self.values.ravel()).partition([len(names)] * len(k))
-        rec.send_columns(
-            entity,
-            [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)],
-            columns,
-        )
-
-
-def forecast_series(ahead: Forecast, i: int) -> Series:
-    """Return truth, prediction and, where it is finite, the band of the i-th state."""
-    curves = [("truth", _TRUTH, 2.0), ("prediction", _PREDICTED, 2.0)]
-    columns = [ahead.truth[:, i], ahead.predicted[:, i]]
-    known = np.isfinite(ahead.predicted[:, i])
-    if ahead.band and np.isfinite(ahead.low[known, i]).all() and np.isfinite(ahead.high[known, i]).all():
-        curves += [(f"{ahead.band}, low", _BAND, 1.0), (f"{ahead.band}, high", _BAND, 1.0)]
-        columns += [ahead.low[:, i], ahead.high[:, i]]
-    return Series(np.column_stack(columns), 0, ahead.dt, curves)
-
-
-def input_series(ahead: Forecast) -> Series:
-    """Return the inputs of the forecast, each held for a step."""
-    curves = [(name, PALETTE[(1 + j) % len(PALETTE)], 2.0) for j, name in enumerate(ahead.inputs)]
-    return Series(ahead.U, 0, ahead.dt, curves)
-
-
-def error_series(score: Score, i: int, dt: float) -> Series:
-    """Return the root-mean-square error of the i-th state and the 5 and 95 % quantiles of its errors."""
-    values = np.column_stack([score.rmse[:, i], score.low[:, i], score.high[:, i]])
-    curves = [
-        ("RMSE", _PREDICTED, 2.5),
-        ("5 % of the errors", _BAND, 1.0),
-        ("95 % of the errors", _BAND, 1.0),
-    ]
-    return Series(values, 1, dt, curves)
-
-
 _ESCAPED, _BEFORE = re.compile(r"([|*_`])"), r"\\\1"  # what Markdown would not take as it stands
-_FLUSH = 10.0  # longest wait for the file [s]
 _SHOWN = 6  # plots of states in one column
 _EIGENFUNCTIONS = 2  # drawn unless told
+
+Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], one value a step
+Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
 
 
 def record_model(
     predictor: Predictor,
-    path: str | Path,
     episodes: Episodes,
+    path: str | Path,
     *,
     report: TrustReport | None = None,
     horizon: int | None = None,
@@ -106,10 +54,10 @@ def record_model(
     ----------
     predictor
         Linear or bilinear; a bilinear one has no eigenfunctions.
-    path
-        The .rrd to write; its folders are made.
     episodes
         Held out of the fit; the first ones are forecast from their start.
+    path
+        The .rrd to write; its folders are made.
     report
         Of `trust`: its residuals, errors and bands are shown, and its text.
     horizon
@@ -141,13 +89,8 @@ def record_model(
     ahead = [forecast(predictor, episode, horizon, bands=bands) for episode in list(episodes)[:count]]
     residuals = None if report is None else report.residuals
     pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
-    with checks.writing(Path(path), "ab"):
-        pass  # Rerun makes no folders, and says nothing of what it cannot write
-    rec = rr.RecordingStream("koopmpc-model", recording_id=uuid.uuid4())
-    rec.set_sinks(
-        rr.FileSink(str(path)),
-        default_blueprint=_blueprint(predictor, ahead, pictures, surface, told=residuals is not None),
-    )
+    layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)
+    rec = file_recording(path, "koopmpc-model", layout)
     rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
     text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
     rec.log("report", text, static=True)
@@ -156,16 +99,50 @@ def record_model(
         rec.log(entity, archetype, static=True)
     for r, one in enumerate(ahead):
         for i in range(predictor.nx):
-            forecast_series(one, i).send(rec, f"rollout/{r}/state/{i}")
+            _send(rec, f"rollout/{r}/state/{i}", _forecast_curves(one, i), predictor.dt)
         if predictor.nu:
-            input_series(one).send(rec, f"rollout/{r}/inputs", steps=True)
+            inputs = [(name, color(1 + j), 2.0, one.U[:, j]) for j, name in enumerate(one.inputs)]
+            _send(rec, f"rollout/{r}/inputs", inputs, predictor.dt, interpolation_mode="StepAfter")
     for i in range(predictor.nx):
-        error_series(errors, i, predictor.dt).send(rec, f"error/{i}")
-    rec.flush(timeout_sec=_FLUSH)
+        _send(rec, f"error/{i}", _error_curves(errors, i), predictor.dt, first=1)
+    rec.flush(timeout_sec=PATIENCE)
     rec.disconnect()
 
 
-Picture = tuple[str, str, dict[str, Any]]
+def _forecast_curves(ahead: Forecast, i: int) -> list[Curve]:
+    """Return truth, prediction and, where it is finite, the band of the i-th state."""
+    curves: list[Curve] = [
+        ("truth", _TRUTH, 2.0, ahead.truth[:, i]),
+        ("prediction", _PREDICTED, 2.0, ahead.predicted[:, i]),
+    ]
+    known = np.isfinite(ahead.predicted[:, i])
+    if ahead.band and np.isfinite(ahead.low[known, i]).all() and np.isfinite(ahead.high[known, i]).all():
+        curves += [
+            (f"{ahead.band}, low", _BAND, 1.0, ahead.low[:, i]),
+            (f"{ahead.band}, high", _BAND, 1.0, ahead.high[:, i]),
+        ]
+    return curves
+
+
+def _error_curves(score: Score, i: int) -> list[Curve]:
+    """Return the root-mean-square error of the i-th state and the 5 and 95 % quantiles of its errors."""
+    return [
+        ("RMSE", _PREDICTED, 2.5, score.rmse[:, i]),
+        ("5 % of the errors", _BAND, 1.0, score.low[:, i]),
+        ("95 % of the errors", _BAND, 1.0, score.high[:, i]),
+    ]
+
+
+def _send(rec: Any, entity: str, curves: Sequence[Curve], dt: float, *, first: int = 0, **style: Any) -> None:
+    """Write curves over the steps first, first + 1, … as one entity: their style once, and their columns."""
+    import rerun as rr
+
+    names, colors, widths, columns = (list(part) for part in zip(*curves, strict=True))
+    drawn = [drawable(name) for name in names]
+    rec.log(entity, rr.SeriesLines(names=drawn, colors=colors, widths=widths, **style), static=True)
+    values = np.column_stack(columns)
+    scalars = rr.Scalars.columns(scalars=values.ravel()).partition([len(names)] * len(values))
+    rec.send_columns(entity, times(first + np.arange(len(values)), dt), scalars)
 
 
 def _pictures(
@@ -258,14 +235,10 @@ def _blueprint(
     if surface is not None:
         views = [plane_view(entity, title, surface) for entity, title, _ in pictures]
         rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
-    return rrb.Blueprint(
+    return framed(
         rrb.Horizontal(
             left,
             rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]),
             column_shares=[1.0, 1.2],
-        ),
-        rrb.TimePanel(timeline="sim_time", state="collapsed"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
+        )
     )

@@ -16,7 +16,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.errors import DataError
 from koopmpc.loop.run import About, Run, Step, StepRows
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.base import Predictor
 from koopmpc.recording.format.rows import block_of_run, block_of_steps
 from koopmpc.recording.format.writer import Writer
 from koopmpc.recording.viewer import PORT, find_viewer, why_none
@@ -82,9 +82,7 @@ class BackgroundWriter:
 _PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
 
 
-def record(
-    run: Run, path: str | Path, *, scene: Scene | None = None, model: LinearPredictor | BilinearPredictor | None = None
-) -> None:
+def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Predictor | None = None) -> None:
     """Write `run` as a complete Rerun log; `load_run(path)` equals `run` to the bit.
 
     Parameters
@@ -153,7 +151,7 @@ class Recorder:
         angles: Sequence[int] = (),
         metadata: Mapping[str, Any] | None = None,
         scene: Scene | None = None,
-        model: LinearPredictor | BilinearPredictor | None = None,
+        model: Predictor | None = None,
         live: bool = False,
         port: int = PORT,
     ) -> None:

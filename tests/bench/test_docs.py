@@ -43,15 +43,16 @@ def test_the_example_of_the_documentation_runs_and_reaches(tmp_path):
     assert push["lqr"].metrics.cost > 1.02 * oracle.cost
 
 
-def test_the_example_of_faults_runs(capsys):
+def test_the_examples_of_faults_run(capsys):
     text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
-    (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    source = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     found = {}
     exec(source, found)
     run = found["run"]
     assert np.isnan(run.Y).any()
     assert np.abs(run.U[20:]).max() <= 12.5
     assert len(run.metadata["faults"]) == 3
+    assert found["Bias"](0.5).start(None, None).measured(0, 1.0) == 1.5
     assert "BAD_MEASUREMENT" in capsys.readouterr().out
 
 

@@ -24,7 +24,7 @@ def report() -> km.validate.TrustReport:
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory, report: km.validate.TrustReport) -> Path:
     path = tmp_path_factory.mktemp("model") / "deep" / "model.rrd"
-    km.recording.record_model(turning(0.9), path, DATA, report=report, which=[0], rollouts=2)
+    km.recording.record_model(turning(0.9), DATA, path, report=report, which=[0], rollouts=2)
     return path
 
 
@@ -94,7 +94,7 @@ def test_the_report_is_a_page(log: Path, report: km.validate.TrustReport) -> Non
 
 def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None:
     data = episodes(3, noise=0.05)
-    km.recording.record_model(turning(), tmp_path / "a.rrd", data)
+    km.recording.record_model(turning(), data, tmp_path / "a.rrd")
     errors = km.score(turning(), data, 30)
     ahead = forecast(turning(), data[2], 30, bands=errors)
     curves = _read(tmp_path / "a.rrd", "/rollout/2/**").vectors("/rollout/2/state/1")
@@ -109,26 +109,26 @@ def test_what_has_no_eigenfunctions_says_so(tmp_path: Path) -> None:
     )
     defective = km.LinearPredictor([[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
     for model, words in ((bilinear, "has no eigenfunctions"), (defective, "A is defective")):
-        km.recording.record_model(model, tmp_path / "a.rrd", data, horizon=5)
+        km.recording.record_model(model, data, tmp_path / "a.rrd", horizon=5)
         assert words in _read(tmp_path / "a.rrd", "/report").static("/report", "text")
     one = km.LinearPredictor([[0.9]], [[1.0]], [[1.0]], km.State(), DT, STATES[:1], INPUTS)
     small = km.Episodes([type(e)(X=e.X[:, :1], U=e.U) for e in data], DT, STATES[:1], INPUTS)
-    km.recording.record_model(one, tmp_path / "b.rrd", small, horizon=5)
+    km.recording.record_model(one, small, tmp_path / "b.rrd", horizon=5)
     assert "has one state" in _read(tmp_path / "b.rrd", "/report").static("/report", "text")
     with pytest.raises(km.errors.DataError, match="a bilinear predictor has no eigenfunctions; leave `which` out"):
-        km.recording.record_model(bilinear, tmp_path / "a.rrd", data, which=[0])
+        km.recording.record_model(bilinear, data, tmp_path / "a.rrd", which=[0])
     with pytest.raises(km.errors.DataError, match="A is defective"):
-        km.recording.record_model(defective, tmp_path / "a.rrd", data, which=[0])
+        km.recording.record_model(defective, data, tmp_path / "a.rrd", which=[0])
 
 
 def test_messages(tmp_path: Path) -> None:
     with pytest.raises(km.errors.DataError, match="episode 0 has 30 steps, the horizon is 31"):
-        km.recording.record_model(turning(), tmp_path / "a.rrd", DATA, horizon=31)
+        km.recording.record_model(turning(), DATA, tmp_path / "a.rrd", horizon=31)
     with pytest.raises(km.errors.DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
-        km.recording.record_model(turning(), tmp_path / "a.rrd", DATA, which=[2])
+        km.recording.record_model(turning(), DATA, tmp_path / "a.rrd", which=[2])
     (tmp_path / "file").write_text("")
     with pytest.raises(km.errors.LogError, match="cannot be written"):
-        km.recording.record_model(turning(), tmp_path / "file" / "a.rrd", DATA)
+        km.recording.record_model(turning(), DATA, tmp_path / "file" / "a.rrd")
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_the_viewer_draws_every_view(log: Path, tmp_path: Path) -> None:
 def test_names_that_markdown_would_change_stand_as_they_are(tmp_path: Path) -> None:
     data = episodes(2)
     model = km.edmd(data, km.State() + km.State() * km.State())
-    km.recording.record_model(model, tmp_path / "a.rrd", data, horizon=5)
+    km.recording.record_model(model, data, tmp_path / "a.rrd", horizon=5)
     page = _read(tmp_path / "a.rrd", "/report").static("/report", "text")
     assert r"angle^2, angle\*rate, rate^2" in page
 
@@ -164,7 +164,7 @@ def test_names_that_markdown_would_change_stand_as_they_are(tmp_path: Path) -> N
 def test_a_model_that_runs_away_is_recorded_too(tmp_path: Path) -> None:
     data = episodes(3)
     wild = turning(1e12)
-    km.recording.record_model(wild, tmp_path / "a.rrd", data, rollouts=1)
+    km.recording.record_model(wild, data, tmp_path / "a.rrd", rollouts=1)
     curves = _read(tmp_path / "a.rrd", "/rollout/0/**").vectors("/rollout/0/state/0")
     assert np.array_equal(curves[:, :2], _two(forecast(wild, data[0], 30)), equal_nan=True)
     assert np.isnan(curves[-1, 1])

@@ -15,7 +15,7 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import About, Run
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import (
     application_of,
     drawable,
@@ -30,7 +30,38 @@ from koopmpc.recording.views.eigenvalues import draw_eigenvalues
 from koopmpc.recording.views.scenes import Drawing, Extent, Names, draw, draw_ahead, stages
 from koopmpc.scene import Scene
 
-_FLUSH = 3.0  # longest wait for a sink [s]
+_FLUSH = 3.0  # longest wait for a sink of a running loop [s]
+PATIENCE = 10.0  # longest wait for a file that is written at once [s]
+
+
+def file_recording(path: str | Path, application: str, layout: Any) -> Any:
+    """Return a recording that writes to `path`, whose folders are made.
+
+    Raises
+    ------
+    LogError
+        The path cannot be written.
+    """
+    import rerun as rr
+
+    _require_writable(path)
+    rec = rr.RecordingStream(application, recording_id=uuid.uuid4())
+    rec.set_sinks(rr.FileSink(str(path)), default_blueprint=layout)
+    return rec
+
+
+def times(k: np.ndarray, dt: float) -> list[Any]:
+    """Return the two timelines of rows at steps `k`: step, and sim_time = k dt to the nanosecond."""
+    import rerun as rr
+
+    nanoseconds = np.rint(k * dt * 1e9).astype("timedelta64[ns]")
+    return [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)]
+
+
+def _require_writable(path: str | Path) -> None:
+    """Make the folders of `path` and open it once: Rerun does not, and says nothing of what it cannot write."""
+    with checks.writing(path, "ab"):
+        pass
 
 
 class Writer:
@@ -47,7 +78,7 @@ class Writer:
         path: Path | None,
         viewer: str | None = None,
         scene: Scene | None = None,
-        model: LinearPredictor | BilinearPredictor | None = None,
+        model: Predictor | None = None,
         steps: int | None = None,
     ) -> None:
         """Check what is told; `viewer` is the address of a viewer that is up."""
@@ -65,8 +96,7 @@ class Writer:
         self._u: np.ndarray | None = None
         self._names = Names()
         if path is not None:
-            with checks.writing(path, "ab"):
-                pass  # Rerun makes no folders, and says nothing of what it cannot write
+            _require_writable(path)
 
     def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""
@@ -87,7 +117,7 @@ class Writer:
                 self._style(entity, style)
         for entity, drawing in drawings.items():
             self._style(entity, drawing.style)
-            self._rec.send_columns(entity, self._times(k), drawing.columns)
+            self._rec.send_columns(entity, times(k, self._about.dt), drawing.columns)
         if len(rows.planned):
             self._vectors("prediction/x", rows.planned, rows.plan_X)
             self._vectors("prediction/u", rows.planned, rows.plan_U)
@@ -110,7 +140,7 @@ class Writer:
             scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
             self._sum("/solver/time_ms:seconds", np.ascontiguousarray(rows.solve_time).data)
             self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
-            self._rec.send_columns("solver/time_ms", self._times(k[:m]), [*scalars, *exact])
+            self._rec.send_columns("solver/time_ms", times(k[:m], self._about.dt), [*scalars, *exact])
             self._statuses(rows)
         self.flush()  # what was logged waits to be sent; columns do not
         self._vectors("state", k, rows.X)
@@ -166,12 +196,6 @@ class Writer:
         extent = self._extent if self._scene is not None else None
         return blueprint(self._about, extent=extent, model=self._model)
 
-    def _times(self, k: np.ndarray) -> list[Any]:
-        import rerun as rr
-
-        nanoseconds = np.rint(k * self._about.dt * 1e9).astype("timedelta64[ns]")
-        return [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)]
-
     def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray) -> None:
         """Write one vector a row; higher dimensions go flat, their last width kept beside them."""
         import rerun as rr
@@ -183,7 +207,7 @@ class Writer:
         self._sum(f"/{entity}:scalars", np.ascontiguousarray(values).data)
         if values.ndim > 2:
             self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
-        self._rec.send_columns(entity, self._times(k), columns)
+        self._rec.send_columns(entity, times(k, self._about.dt), columns)
 
     def _sum(self, column: str, data: Any) -> None:
         self._sums[column] = zlib.crc32(data, self._sums.get(column, 0))
@@ -204,13 +228,13 @@ class Writer:
         if changed:
             words = [_word(*pairs[i]) for i in changed]
             self._sum("/solver/status:state", "".join(words).encode())
-            times = self._times(rows.k + np.array(changed))
-            self._rec.send_columns("solver/status", times, rr.StateChange.columns(state=words))
+            at = times(rows.k + np.array(changed), self._about.dt)
+            self._rec.send_columns("solver/status", at, rr.StateChange.columns(state=words))
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
         if fallen:
             texts = [f"step {rows.k + i}: {_word(*pairs[i])}" for i in fallen]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
-            self._rec.send_columns("log", self._times(rows.k + np.array(fallen)), columns)
+            self._rec.send_columns("log", times(rows.k + np.array(fallen), self._about.dt), columns)
 
     def _drawings(self, rows: LogBlock) -> dict[str, Drawing]:
         """Return the scene of every row, and of a few stages of its plan, by entity."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc.loop.run import About
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.format.rows import LogBlock
 from koopmpc.recording.views.eigenvalues import eigenvalue_views
@@ -87,7 +87,7 @@ def _lines(names: Sequence[str], colors: Sequence[Color], width: float, **more: 
 _SEPARATE = 4  # up to so many states have a plot each
 
 
-def blueprint(about: About, *, extent: Extent | None, model: LinearPredictor | BilinearPredictor | None) -> Any:
+def blueprint(about: About, *, extent: Extent | None, model: Predictor | None) -> Any:
     """Return the layout of one run: what the data cannot fill has no view.
 
     `extent` is what the animation shows, None where there is no scene.
@@ -117,8 +117,15 @@ def blueprint(about: About, *, extent: Extent | None, model: LinearPredictor | B
     )
     lower = texts if model is None else rrb.Horizontal(eigenvalue_views(model)[0], texts)
     right = lower if extent is None else rrb.Vertical(_animation(extent), lower, row_shares=[3.0, 2.0])
+    return framed(rrb.Horizontal(left, right, column_shares=[1.0, 1.0]))
+
+
+def framed(views: Any) -> Any:
+    """Return the layout of a log: `views` over the timeline sim_time, all other panels out of the way."""
+    import rerun.blueprint as rrb
+
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[1.0, 1.0]),
+        views,
         rrb.TimePanel(timeline="sim_time", state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

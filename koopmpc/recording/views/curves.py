@@ -2,7 +2,6 @@
 """record_curves: trajectories and what models make of them, one tab a figure, and a page to read, in one .rrd."""
 
 import re
-import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,8 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError
 from koopmpc.recording.description import drawable
-from koopmpc.recording.views.blueprint import color
-
-_FLUSH = 10.0  # longest wait for the file [s]
+from koopmpc.recording.format.writer import PATIENCE, file_recording, times
+from koopmpc.recording.views.blueprint import color, framed
 
 
 @dataclass(frozen=True)
@@ -73,10 +71,7 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
     if twice is not None:
         raise DataError(f"two tabs are called {twice!r}; name each by a title of its own")
     tables = [_tables(tab) for tab in tabs]
-    with checks.writing(Path(path), "ab"):
-        pass  # Rerun makes no folders, and says nothing of what it cannot write
-    rec = rr.RecordingStream(application, recording_id=uuid.uuid4())
-    rec.set_sinks(rr.FileSink(str(path)), default_blueprint=_blueprint(tabs, slugs))
+    rec = file_recording(path, application, _blueprint(tabs, slugs))
     rec.log("page", rr.TextDocument(drawable(page), media_type="text/markdown"), static=True)
     for tab, slug, curves in zip(tabs, slugs, tables, strict=True):
         for j, column in enumerate(tab.columns):
@@ -86,9 +81,8 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
                     continue  # a timeline without a row ends the viewer
                 entity = f"{slug}/{_slug(column)}/{i}_{_slug(name)}"  # drawn in this order: the truth below
                 rec.log(entity, rr.SeriesLines(names=drawable(name), colors=color(i), widths=2.0), static=True)
-                times = [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=k * tab.dt)]
-                rec.send_columns(entity, times, rr.Scalars.columns(scalars=X[k, j]))
-    rec.flush(timeout_sec=_FLUSH)
+                rec.send_columns(entity, times(k, tab.dt), rr.Scalars.columns(scalars=X[k, j]))
+    rec.flush(timeout_sec=PATIENCE)
     rec.disconnect()
 
 
@@ -112,16 +106,12 @@ def _blueprint(tabs: Sequence[Curves], slugs: Sequence[str]) -> Any:
         ]
         return rrb.Vertical(*views, name=drawable(tab.title))
 
-    return rrb.Blueprint(
+    return framed(
         rrb.Horizontal(
             rrb.Tabs(*(plots(tab, slug) for tab, slug in zip(tabs, slugs, strict=True))),
             rrb.TextDocumentView(origin="page", name="Report"),
             column_shares=[3.0, 2.0],
-        ),
-        rrb.TimePanel(timeline="sim_time", state="collapsed"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
+        )
     )
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from koopmpc.figures.plane import Plane, eigenfunctions_on
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.base import Predictor
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.views.scenes import BACKGROUND
 from koopmpc.validate.residuals import ResidualDMD
@@ -46,9 +47,7 @@ _BELOW, _ABOVE = 1e-2, 1e1  # shares of the tolerance that the shades go from an
 _LIGHT = 0.85  # of the shades: the rest is too light for points
 
 
-def draw_eigenvalues(
-    model: LinearPredictor | BilinearPredictor, residuals: ResidualDMD | None = None
-) -> dict[str, Any]:
+def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> dict[str, Any]:
     """Return static archetypes by entity. Rerun's y points down.
 
     Without residuals eigenvalues outside the unit circle are red. With them a point is the darker the smaller its
@@ -89,13 +88,13 @@ def draw_eigenvalues(
     return drawn
 
 
-def reach(model: LinearPredictor | BilinearPredictor) -> float:
+def reach(model: Predictor) -> float:
     """Return how far the picture goes: over the unit circle, and over eigenvalues not far outside."""
     values = np.asarray(model.eigenvalues)
     return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)
 
 
-def eigenvalue_views(model: LinearPredictor | BilinearPredictor, *, residuals: bool = False) -> list[Any]:
+def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
     """Return the view of the unit circle, and a closer one where the eigenvalues crowd."""
     size, values = reach(model), np.asarray(model.eigenvalues)
     views = [_view("Eigenvalues of A and the unit circle", 0.0, 0.0, size)]
