@@ -23,7 +23,8 @@ class Metrics(Value):
     ----------
     cost
         J = Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, and with R_delta also
-        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}. It is not multiplied by dt. It is NaN where the run has no Cost, or its plant hides the state.
+        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}. It is not multiplied by dt. It is NaN where the run has no Cost, or
+        where its plant hides the state.
     tracking_rmse
         (nr,) root-mean-square of each tracked output's error of(x_k) − r_k over k = 1 … T, in its unit.
     final_error

@@ -1,10 +1,12 @@
 """Episodes in files, to the bit: .npz, .parquet and .csv; and plain tables, as users have them."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import reduce
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -17,17 +19,7 @@ from koopmpc.errors import DataError, LogError
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
 _WRITERS = {".parquet": parquet.write, ".csv": csv.write}
-_READERS: dict[str, Callable[[Path], Episodes]] = {}  # of kinds of file that another room opens
-
-
-def reads(suffix: str) -> Callable[[Callable[[Path], Episodes]], Callable[[Path], Episodes]]:
-    """Return a decorator: `load_episodes` opens files of this suffix with the function."""
-
-    def register(reader: Callable[[Path], Episodes]) -> Callable[[Path], Episodes]:
-        _READERS[suffix] = reader
-        return reader
-
-    return register
+_READERS = {".rrd": ("koopmpc.recording.format.reader", "run_episodes")}  # imported when such a file is opened
 
 
 def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
@@ -111,7 +103,8 @@ def _read(file: Path, told: Told) -> Episodes:
     if not told.nothing:
         raise DataError(f"{file} says itself what it holds; leave out dt, states and inputs")
     if suffix in _READERS:
-        return _READERS[suffix](file)
+        module, reader = _READERS[suffix]
+        return cast("Episodes", getattr(import_module(module), reader)(file))
     try:
         X, U, steps, text = _own(file, suffix, about)
         named = json.loads(text)

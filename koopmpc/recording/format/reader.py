@@ -9,7 +9,6 @@ import numpy as np
 from koopmpc.control.move import Fallback, Status
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.sampling import Signals, episodes_from
-from koopmpc.data.files.storage import reads
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
@@ -146,7 +145,6 @@ def _plans(log: LogColumns, steps: int) -> Plans | None:
     return Plans(*parts)
 
 
-@reads(".rrd")
 def run_episodes(path: Path) -> Episodes:
     """Return the inputs and states of a run's log, or its measurements where the plant hides them all, as episodes.
 
