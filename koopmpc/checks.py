@@ -189,3 +189,19 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return ``", did you mean 'pendulum'?"`` for the known name nearest to `name`; empty where none is near."""
     close = get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f", did you mean {close[0]!r}?" if close else ""
+
+
+def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
+    """Return `value` as float64, itself where it is one already, for this is the control path.
+
+    Raises
+    ------
+    DataError
+        It is no array of numbers.
+    """
+    try:
+        if value is not None:
+            return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        pass
+    return array(value, name, finite=False)  # pyright: ignore[reportArgumentType]

@@ -18,11 +18,11 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import Equilibria
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.nonlinear.problem import learned_map
-from koopmpc.control.tracking import outputs
+from koopmpc.control.tracking import state_tracking
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import ProblemError
-from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.measured import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.plants.dynamics import Dynamics
@@ -81,7 +81,7 @@ class Prepared:
         plant = truth if isinstance(truth, StepMap) else self.step_map
         if problem.cost.u_target == "zero":
             return np.zeros((steps, plant.nu))
-        seen = outputs(plant.states, plant.nu, problem.cost, problem.limits_of(case))
+        seen = state_tracking(plant.states, plant.nu, problem.cost, problem.limits_of(case))
         equilibria = Equilibria(learned_map(plant), problem.cost, seen)
         rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
         distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)

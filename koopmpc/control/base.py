@@ -1,7 +1,10 @@
-"""MPCBase: what every controller with a plan shares: its horizon, its deadline, and what a failed step returns."""
+"""MPCBase: what predictive controllers share: where a plan starts, its deadline, and what a failed step does."""
 
 import copy
+from collections import deque
+from collections.abc import Sequence
 from time import perf_counter
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,113 +12,143 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import InitialCondition
-from koopmpc.control.limits import Interval, Limits
-from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.errors import DataError
-from koopmpc.estimate.observer import StateObserver
+from koopmpc.control.limits import Limits, admitted
+from koopmpc.control.move import Fallback, Move, Status, blocked
+from koopmpc.control.tracking import Tracking, checked
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.estimate.measured import Measured
+from koopmpc.estimate.observer import Estimator, StateModel, StateObserver, state_model
 from koopmpc.lifting.buffered import HUGE
+from koopmpc.predict.predictors import LinearPredictor
 
 
-def admitted(
-    u: Float[np.ndarray, " nu"], inputs: Interval, rates: Interval | None, last: Float[np.ndarray, " nu"]
-) -> Float[np.ndarray, " nu"]:
-    """Return the input inside its limits, and as far as they allow within a change inside `rates` from the last."""
-    if rates is not None:
-        u = np.clip(u, last + rates.low, last + rates.high)
-    return np.clip(u, *inputs)
+class InitialCondition:
+    """known = [z; u_{−1}; w_0 … w_{N−1}; d; 1] of the step at which an input computed now acts, L steps from now.
 
-
-def hard(rates: Interval | None, linear: Float[np.ndarray, " nu"]) -> Interval | None:
-    """Return the rate limits that are hard, whose `linear` slack weight is inf, ±inf in place of the others."""
-    if rates is None or not np.isinf(linear).any():
-        return None
-    ends = zip(rates, (-np.inf, np.inf), strict=True)
-    return Interval(*(np.where(np.isinf(linear), end, free) for end, free in ends))
-
-
-class PlanMemory:
-    """Remembers the last good plan and the last input; whatever it returns is inside the limits of the inputs.
+    z is predicted over these L steps, z ← F(z, u) + E w + d with the inputs that are still to act. u_{−1} is there
+    where the change of inputs counts, d where it is estimated. The parts are views: `z`, `u_prev`, `W`, `d`, and
+    `drive`, which is W and d.
 
     Parameters
     ----------
-    inputs
-        The input limits.
-    N
-        Steps of a plan.
-    rates
-        Limits of the change of the input; the input limits win.
-    move_of
-        (N,) which of the plan's moves each step takes; by default each has its own.
+    model, observer
+        The model predicts; the observer gives z and d of the step of y.
+    N, latency
+        Steps of the plan; L ≥ 0.
+    with_rates, estimated
+        Whether u_{−1} is needed, and whether the observer finds d.
     """
 
+    _VIEWS = ("z", "u_prev", "drive", "W", "d")
+
     def __init__(
-        self,
-        inputs: Interval,
-        N: int,
-        rates: Interval | None = None,
-        move_of: Int[np.ndarray, " N"] | None = None,
+        self, model: StateModel, observer: StateObserver, N: int, latency: int, *, with_rates: bool, estimated: bool
     ) -> None:
-        self._inputs, self._N, self._nu = inputs, N, len(inputs.low)
-        self._rates = rates
-        self._move_of = np.arange(N) if move_of is None else move_of
-        self._plan: Float[np.ndarray, " nv"] | None = None
-        self._age = 0
-        self._given: Float[np.ndarray, " nu"] | None = None  # the last input, where it is not the plan's first
-        self.reset()
+        self._model, self.observer, self._latency = model, observer, latency
+        self._sizes = model.nz, model.nu, model.nw, N
+        self._with_rates, self._estimated = with_rates, estimated
+        self._plain = not (estimated or latency or model.embedding is not None)
+        self._shape = (observer.ny,)
+        self.known = np.zeros(model.nz + model.nu * with_rates + N * model.nw + model.nz * estimated + 1)
+        self.known[-1] = 1.0
+        self._ahead = np.zeros((latency + 1, model.nw))
+        self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
+        self._see()
 
-    def reset(self, u_prev: ArrayLike | None = None) -> None:
-        """Forget the plan; the last input is `u_prev`, or zero moved inside the limits."""
-        self._plan, self._age = None, 0
-        if u_prev is None:
-            self._given = np.clip(np.zeros(self._nu), *self._inputs)
-        else:
-            self._given = checks.array(u_prev, "u_prev", (self._nu,))
+    def _see(self) -> None:
+        """Make the views; a copy makes its own."""
+        nz, nu, nw, N = self._sizes
+        first = nz + nu * self._with_rates
+        self.z = self.known[:nz]
+        self.u_prev = self.known[nz:first]
+        self.drive = self.known[first:-1]
+        self.W, self.d = self.drive[: N * nw].reshape(N, nw), self.drive[N * nw :]
 
-    def keep(self, plan: Float[np.ndarray, " nv"]) -> None:
-        """Keep a good plan (by reference, for speed): its first entries are the moves."""
-        self._plan, self._age, self._given = plan, 0, None
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
 
-    def last(self) -> Float[np.ndarray, " nu"]:
-        """Return the last input that was returned; not to be written to."""
-        if self._given is not None or self._plan is None:
-            return self._given if self._given is not None else np.zeros(self._nu)
-        return self._plan[: self._nu]
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
 
-    def before(self, applied: ArrayLike | None) -> Float[np.ndarray, " nu"]:
-        """Return what the plant got last: `applied` where it is usable, else the last input returned."""
-        if applied is not None:
-            got = np.asarray(applied, dtype=np.float64)
-            if got.shape == (self._nu,) and (np.abs(got) < HUGE).all():
-                return got
-        return self.last()
+    def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
+        """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
+        self.observer.reset(x0)
+        self.drive[:] = 0.0
+        self._sent.extend([last.copy()] * (self._latency + 1))
+        self._w = np.zeros(self._sizes[2])
 
-    def instead(
-        self, free: Float[np.ndarray, " nu"] | None, applied: ArrayLike | None
-    ) -> tuple[Float[np.ndarray, " nu"], Fallback]:
-        """Return the input of a failed step and where it comes from.
+    def update(self, model: LinearPredictor | StateModel) -> None:
+        """Go on with another model of the same sizes."""
+        self._model = state_model(model)
+        self.observer.update(model)
+
+    def take(
+        self, y: ArrayLike, last: Float[np.ndarray, " nu"], applied: ArrayLike | None, w: ArrayLike | None
+    ) -> None:
+        """Take y_k and write down where the plan starts; z is NaN where y cannot be used.
 
         Parameters
         ----------
-        free
-            The unconstrained optimum, where it is known.
+        last
+            The input that was computed last.
         applied
-            What the plant really got last, where it is not the last input returned.
+            What acted since the last call; by default the input that was computed L + 1 calls ago.
+        w
+            Measured disturbances (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
-        before = self.before(applied)
-        if self._plan is not None and self._age + 1 < self._N:
-            self._age += 1
-            first = self._nu * int(self._move_of[self._age])
-            u, how = self._plan[first : first + self._nu], Fallback.SHIFTED_PLAN
-        else:
-            self._plan = None
-            u, how = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
-        self._given = admitted(u, self._inputs, self._rates, before)
-        return self._given.copy(), how
+        measured, observer = checks.numbers(y, "y"), self.observer
+        got = None if applied is None else checks.numbers(applied, "applied")
+        if got is not None and got.shape != last.shape:
+            raise ShapeError(f"applied has shape {got.shape}, expected {last.shape}")
+        if measured.shape != self._shape:
+            what = "measurement of the estimator" if self._estimated else "state"
+            raise ShapeError(f"y has shape {measured.shape}, expected {self._shape}, one value a {what}")
+        if self._with_rates:  # what acts before the plan's first input
+            self.u_prev[:] = last if got is None or self._latency else got
+        if self.W.size or w is not None:
+            self._preview(w)
+        if self._plain:
+            observer.observe(measured, last, self._w)
+            self.z[:] = observer.z
+            return
+        self._sent.append(last.copy())
+        acted = self._sent[0]
+        if got is not None and (np.abs(got) < HUGE).all():
+            acted = got
+        good = observer.observe(measured, acted, self._w)
+        now = self._ahead[0]
+        self._w = np.where(np.abs(now) < HUGE, now, self._w)  # a disturbance that is not known stays as it was
+        z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
+        for i in range(self._latency):
+            z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d)
+        self.z[:] = z
+        if self._estimated:
+            self.d[:] = d
+
+    def _preview(self, w: ArrayLike | None) -> None:
+        """Write down the preview of the measured disturbances."""
+        if w is None:
+            self.W[:] = self._ahead[:] = 0.0
+            return
+        rows, (_, _, nw, N) = checks.numbers(w, "w"), self._sizes
+        if nw == 0:
+            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
+        steps = N + self._latency
+        if rows.shape != (nw,) and (rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0):
+            raise ShapeError(f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{steps - 1}")
+        if rows.ndim == 2 and len(rows) != steps:
+            rows = rows[np.minimum(np.arange(steps), len(rows) - 1)]
+        self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
+        self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
 
 class MPCBase:
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
+
+    A subclass calls `_begin` once its tracking is known, `_keep` with every good plan, and ends a step with `_move`
+    or `_fail`. A failed step returns the next input of the last good plan, then the unconstrained input clipped, then
+    the last input; always inside the limits of the inputs, and of their rates as far as those allow.
 
     Parameters
     ----------
@@ -125,12 +158,13 @@ class MPCBase:
         What to minimise, within what; None for no limits.
     horizon, latency
         Steps of the plan, and until its first input acts.
+    moves
+        How many inputs the plan has, or the lengths of the blocks of steps in which each is held.
     time_limit
         Wall-clock time a step may take [s]; None for any.
     """
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
-    _memory: PlanMemory
     _initial: InitialCondition
 
     def __init__(
@@ -141,16 +175,39 @@ class MPCBase:
         limits: Limits | None,
         horizon: int,
         latency: int,
+        moves: int | Sequence[int] | None,
         time_limit: float | None,
     ) -> None:
         self.cost, self.limits = checked(cost, limits)
-        self._dt, self._nu = dt, nu
         if nu == 0:
             raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
+        self._dt, self._nu = dt, nu
         self._N, self._latency = checks.count(horizon, "horizon"), checks.count(latency, "latency", 0)
+        self._blocks = blocked(moves, self._N)
         self._time_limit = time_limit
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
-        self._planned = False
+
+    def _begin(
+        self,
+        model: LinearPredictor | StateModel,
+        tracking: Tracking[Any],
+        estimator: Estimator | None,
+        *,
+        with_rates: bool,
+        move_of: Int[np.ndarray, " N"] | None = None,
+    ) -> None:
+        """Set up the initial condition and the fallback; `move_of` says which of a plan's moves each step takes."""
+        if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator | None):
+            raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
+        self._estimator = estimator
+        self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
+        self._with_rates = with_rates
+        self._move_of = np.arange(self._N) if move_of is None else move_of
+        estimated = estimator is not None
+        observer = estimator.start(model) if estimated else Measured(model)
+        self._initial = InitialCondition(
+            state_model(model), observer, self._N, self._latency, with_rates=with_rates, estimated=estimated
+        )
 
     def __copy__(self) -> "MPCBase":
         """Return a copy that shares nothing with this one that moves in a step."""
@@ -176,13 +233,34 @@ class MPCBase:
         """The estimate now: its z, and its disturbance d."""
         return self._initial.observer
 
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Forget all earlier steps, so that a run repeats to the bit.
+
+        Rates count from `u_prev`, zero moved inside the limits by default; it is held if the first step fails. A
+        filter starts at x0, by default at zero.
+        """
+        zero = np.clip(np.zeros(self._nu), *self._inputs)
+        self._kept: Float[np.ndarray, " nv"] | None = None
+        self._age, self._planned = 0, False
+        self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self._nu,))
+        self._initial.reset(x0, self._given)
+
+    def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
+        """Keep a good plan (by reference, for speed): its first entries are the moves."""
+        self._kept, self._age, self._planned = plan, 0, True
+        self._given = plan[: self._nu]
+
+    def _known_input(self) -> Float[np.ndarray, " nu"]:
+        """Return the input that rates count from: what was applied, where it can be used."""
+        u_prev = self._initial.u_prev
+        if not u_prev.size:
+            return self._given
+        if not (np.abs(u_prev) < HUGE).all():
+            u_prev[:] = self._given
+        return u_prev
+
     def _move(
-        self,
-        u: Float[np.ndarray, " nu"],
-        status: Status,
-        iterations: int,
-        start: float,
-        slack: float = 0.0,
+        self, u: Float[np.ndarray, " nu"], status: Status, iterations: int, start: float, slack: float = 0.0
     ) -> Move:
         """Return a good step; a late one says so."""
         taken = perf_counter() - start
@@ -197,40 +275,29 @@ class MPCBase:
         iterations: int,
         start: float,
     ) -> Move:
-        """Return what stands in for a failed step, with the status that says why: a late one says that it is late."""
+        """Return what stands in for a failed step, with the status that says why: a late one says that it is late.
+
+        Parameters
+        ----------
+        free
+            The unconstrained optimum, where it is known.
+        applied
+            What the plant really got last, where it is not the last input returned.
+        """
         self._planned = False
-        u, fallback = self._memory.instead(free, applied)
+        before = self._given
+        if applied is not None:
+            got = np.asarray(applied, dtype=np.float64)
+            if got.shape == (self._nu,) and (np.abs(got) < HUGE).all():
+                before = got
+        if self._kept is not None and self._age + 1 < self._N:
+            self._age += 1
+            first = self._nu * int(self._move_of[self._age])
+            u, fallback = self._kept[first : first + self._nu], Fallback.SHIFTED_PLAN
+        else:
+            self._kept = None
+            u, fallback = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
+        self._given = admitted(u, self._inputs, self._rates, before)
         taken = perf_counter() - start
-        return Move(u, status if taken <= self._allowed else Status.TIME_LIMIT, fallback, taken, iterations)
-
-    def _known_input(self) -> Float[np.ndarray, " nu"]:
-        """Return the input that rates count from: what was applied, where it can be used."""
-        u_prev = self._initial.u_prev
-        if not u_prev.size:
-            return self._memory.last()
-        if not (np.abs(u_prev) < HUGE).all():
-            u_prev[:] = self._memory.last()
-        return u_prev
-
-    def _previewed(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Return the reference from the step on at which the plan starts."""
-        if self._latency and reference.ndim == 2 and len(reference):
-            return reference[min(self._latency, len(reference) - 1) :]
-        return reference
-
-
-def checked(cost: object, limits: object) -> tuple[Cost, Limits]:
-    """Return the cost and the limits, no limits for None.
-
-    Raises
-    ------
-    DataError
-        One is something else, perhaps the other.
-    """
-    if not isinstance(cost, Cost):
-        raise DataError(f"cost is a {type(cost).__name__}; pass a Cost, and the Limits after it")
-    if limits is None:
-        return cost, Limits()
-    if not isinstance(limits, Limits):
-        raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
-    return cost, limits
+        status = status if taken <= self._allowed else Status.TIME_LIMIT
+        return Move(self._given.copy(), status, fallback, taken, iterations)

@@ -17,7 +17,7 @@ Slack = tuple[ArrayLike, ArrayLike]
 
 
 class Interval(NamedTuple):
-    """low ≤ v ≤ high, ±inf where there is no limit."""
+    """low ≤ v ≤ high, entry by entry; ±inf where there is no limit."""
 
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
@@ -154,6 +154,15 @@ def softened(slacks: Float[np.ndarray, "N ng"], outputs: Interval) -> float:
 def beyond(value: Float[np.ndarray, " n"], box: Interval) -> float:
     """Return how far the value that is farthest outside its limits is outside; 0 where all are inside."""
     return float(np.maximum(box.low - value, value - box.high).max(initial=0.0))
+
+
+def admitted(
+    u: Float[np.ndarray, " nu"], inputs: Interval, rates: Interval | None, last: Float[np.ndarray, " nu"]
+) -> Float[np.ndarray, " nu"]:
+    """Return the input inside its limits, and as far as they allow within a change inside `rates` from the last."""
+    if rates is not None:
+        u = np.clip(u, last + rates.low, last + rates.high)
+    return np.clip(u, *inputs)
 
 
 def _given(low: ArrayLike | None, high: ArrayLike | None) -> bool:

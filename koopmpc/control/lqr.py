@@ -7,13 +7,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import admitted
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
-from koopmpc.control.linear.horizon import one_step
+from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.control.riccati import stationary
-from koopmpc.control.tracking import reference_rows, tracking
+from koopmpc.control.riccati import one_step, stationary
+from koopmpc.control.target import reference_rows, targets_of
+from koopmpc.control.tracking import lifted_tracking
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.measured import Measured
 from koopmpc.lifting.buffered import HUGE
@@ -51,11 +50,12 @@ class LQR:
         advice = "fit one with edmd, or linearise with LinearPredictor.local"
         checks.kind(predictor, "predictor", LinearPredictor, advice)
         self.predictor, self.cost, self.limits = predictor, cost, limits
-        track = tracking(predictor, cost, Limits() if limits is None else limits)
-        step = one_step(predictor.A, predictor.B, track.C.T @ track.Q @ track.C, track.R, track.R_delta)
+        track = lifted_tracking(predictor, cost, Limits() if limits is None else limits)
+        C = track.tracked
+        step = one_step(predictor.A, predictor.B, C.T @ track.Q @ C, track.R, track.R_delta)
         self.gain = stationary(step.A, step.B, step.Q, step.R, ITERATIONS, step.M)
         self._K, self._K_rate = np.split(self.gain.K, [predictor.nz], axis=1)  # the second is of u_{k−1} − u_r
-        self._targets, self._inputs, self._nr = track.targets, track.inputs, len(track.C)
+        self._targets, self._inputs, self._nr = targets_of(predictor, cost, track), track.inputs, len(C)
         self._rates = track.rates
         self._observer = Measured(predictor)
         self._reference_key: bytes | None = None
@@ -101,10 +101,10 @@ class LQR:
         start = perf_counter()
         x = checks.array(y, "y", (self.predictor.nx,), finite=False)
         target = np.asarray(reference, dtype=np.float64)
-        push = None if w is None else self._push(np.asarray(w, dtype=np.float64))
-        key = target.tobytes() if push is None else target.tobytes() + push.tobytes()
+        e = None if w is None else self._disturbance(np.asarray(w, dtype=np.float64))
+        key = target.tobytes() if e is None else target.tobytes() + e.tobytes()
         if key != self._reference_key:
-            self._aim(target, push)
+            self._aim(target, e)
             self._reference_key = key
         if applied is not None:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
@@ -122,7 +122,7 @@ class LQR:
         self._last = u
         return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
 
-    def _push(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nz"]:
+    def _disturbance(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nz"]:
         """Return E w, NaN where w cannot be."""
         row = w[0] if w.ndim == 2 and len(w) else w
         if row.shape != (self.predictor.nw,):
@@ -131,17 +131,17 @@ class LQR:
             )
         return self.predictor.E @ np.where(np.abs(row) < HUGE, row, np.nan)
 
-    def _aim(self, reference: Float[np.ndarray, "..."], push: Float[np.ndarray, " nz"] | None) -> None:
+    def _aim(self, reference: Float[np.ndarray, "..."], e: Float[np.ndarray, " nz"] | None) -> None:
         """Set the feedforward u_r + K z_r."""
         row = reference_rows(reference, 0, self._nr)
-        if not np.isfinite(row).all() or (push is not None and not np.isfinite(push).all()):
+        if not np.isfinite(row).all() or (e is not None and not np.isfinite(e).all()):
             self._feedforward = np.full(self.nu, np.nan)
             return
         found = self._targets
-        alpha = found.coordinates(row, push)[0]
+        alpha = found.coordinates(row, e)[0]
         z_r, u_r = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
-        if push is not None:
-            z_r, u_r = z_r + found.z_push @ push, u_r + found.u_push @ push
+        if e is not None:
+            z_r, u_r = z_r + found.z_disturbance @ e, u_r + found.u_disturbance @ e
         self._feedforward = u_r + self._K @ z_r
         if self._K_rate.size:
             self._feedforward += self._K_rate @ u_r

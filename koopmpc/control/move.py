@@ -1,26 +1,33 @@
-"""What a controller returns: a Move, with a Status for every outcome; and the protocol of a controller."""
+"""What a controller returns: a Move, with a Status for every outcome; the protocol of a controller; blocks of moves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc import checks
+from koopmpc.errors import DataError
 from koopmpc.values import Value
 
 
 class Status(Enum):
-    """How a step ended. The first four are as intended; the others come with a Fallback."""
+    """How a step ended.
+
+    The first four are as intended; the others come with a Fallback, but for TIME_LIMIT, where an answer that was found
+    too late is used all the same: its Fallback is NONE.
+    """
 
     UNCONSTRAINED = 0  # the unconstrained optimum meets every limit
     OPTIMAL = 1  # a QP or NLP was solved to its tolerance
     SOFTENED = 2  # solved, and a soft limit gave way by more than the tolerance
     SATURATED = 3  # a feedback law was clipped to the input limits
-    MAX_ITERATIONS = 4
-    TIME_LIMIT = 5
-    INFEASIBLE = 6
+    MAX_ITERATIONS = 4  # the solver ended before its tolerance
+    TIME_LIMIT = 5  # the step took longer than it may
+    INFEASIBLE = 6  # no plan meets the hard limits
     BAD_MEASUREMENT = 7  # NaN or inf in y or in the reference
     FAILED = 8  # the solver gave no usable answer
 
@@ -99,6 +106,43 @@ class Controller(Protocol):
         """Forget the last plan; `u_prev` is the input that is held if the first step fails."""
         ...
 
-    def __call__(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None) -> Move:
-        """Return the next input for measurement y; `applied` is what the plant really got last."""
+    def __call__(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+    ) -> Move:
+        """Return the next input for measurement y.
+
+        Parameters
+        ----------
+        y
+            (ny,) measurement: the state, or what the estimator takes.
+        reference
+            (nr,), or rows r_k … r_{k+horizon}, the last repeated.
+        applied
+            (nu,) what the plant really got last; by default the last u returned.
+        w
+            (nw,) measured disturbances, or rows from step k on, the last repeated; zero by default.
+        """
         ...
+
+
+def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:
+    """Return the lengths of the blocks: N ones, M moves of which the last is held, or `moves` itself.
+
+    Raises
+    ------
+    DataError
+        There are more moves than steps, or the lengths do not sum to N.
+    """
+    if moves is None:
+        return (1,) * N
+    if isinstance(moves, Sequence):
+        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
+        if sum(lengths) != N:
+            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
+        return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
+    M = checks.count(moves, "moves")
+    if M > N:
+        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
+    return (1,) * (M - 1) + (N - M + 1,)

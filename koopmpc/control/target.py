@@ -5,10 +5,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import checks
+from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.osqp import OSQP
+from koopmpc.control.tracking import LiftedTracking
+from koopmpc.errors import ShapeError
+from koopmpc.estimate.observer import constant_index
+from koopmpc.lifting.buffered import HUGE
+from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000}
@@ -19,26 +26,26 @@ KEPT = 10_000  # coordinates remembered before the memory starts anew
 class Targets:
     """All equilibria z = A z + B u + e as z = z₀ + z_e e + Z α, u = u₀ + u_e e + W α, and a reference's α.
 
-    e is what disturbances push, zero by default. With a Constant observable its coordinate is 1 in z₀ and 0 in Z.
+    e is what disturbances add to z⁺, zero by default. With a Constant observable its coordinate is 1 in z₀ and 0 in Z.
     α(r, e) minimises ‖C z − r‖²_Q; where u, or a limited output G z, would leave its limits, it minimises the same
-    inside them: low ≤ rows α + from_push e ≤ high.
+    inside them: low ≤ rows α + from_disturbance e ≤ high.
     """
 
     z0: Float[np.ndarray, " nz"]
     Z: Float[np.ndarray, "nz na"]
     u0: Float[np.ndarray, " nu"]
     W: Float[np.ndarray, "nu na"]
-    z_push: Float[np.ndarray, "nz nz"]
-    u_push: Float[np.ndarray, "nu nz"]
+    z_disturbance: Float[np.ndarray, "nz nz"]
+    u_disturbance: Float[np.ndarray, "nu nz"]
     from_reference: Float[np.ndarray, "na nr"]
     offset: Float[np.ndarray, " na"]
     rows: Float[np.ndarray, "nl na"]
-    rows_push: Float[np.ndarray, "nl nz"]
+    rows_disturbance: Float[np.ndarray, "nl nz"]
     low: Float[np.ndarray, " nl"]
     high: Float[np.ndarray, " nl"]
     hard: int
     weighted: Float[np.ndarray, "nr na"]
-    from_push: Float[np.ndarray, "na nz"]
+    from_disturbance: Float[np.ndarray, "na nz"]
     _known: dict[bytes, Float[np.ndarray, " na"]] = field(default_factory=dict[bytes, Float[np.ndarray, " na"]])
     _solvers: dict[int, QPSolver] = field(default_factory=dict[int, QPSolver])
 
@@ -47,14 +54,14 @@ class Targets:
     ) -> Float[np.ndarray, "T na"]:
         """Return α for each row of references as if there were no limits."""
         alpha = R @ self.from_reference.T + self.offset
-        return alpha if e is None else alpha + self.from_push @ e
+        return alpha if e is None else alpha + self.from_disturbance @ e
 
     def coordinates(
         self, R: Float[np.ndarray, "T nr"], e: Float[np.ndarray, " nz"] | None = None
     ) -> Float[np.ndarray, "T na"]:
         """Return α for each row of references, inside the limits."""
         alpha = self.nearest(R, e)
-        pushed = np.zeros(len(self.rows)) if e is None else self.rows_push @ e
+        pushed = np.zeros(len(self.rows)) if e is None else self.rows_disturbance @ e
         values = alpha @ self.rows.T
         slack = margin(values)
         low, high = self.low - pushed, self.high - pushed
@@ -92,6 +99,13 @@ class Targets:
             qp = QP(H, np.zeros(len(H)), self.rows[:count], -free, free)
             self._solvers[count] = OSQP(qp, PRECISE)
         return self._solvers[count]
+
+
+def targets_of(predictor: LinearPredictor, cost: Cost, tracking: LiftedTracking) -> Targets:
+    """Return the equilibria of a predictor under a cost and limits."""
+    track, hold = tracking, cost.u_target == "equilibrium"
+    A, B, constant = predictor.A, predictor.B, constant_index(predictor)
+    return targets(A, B, track.tracked, track.Q, track.inputs, track.limited, track.outputs, constant, hold=hold)
 
 
 def targets(
@@ -134,24 +148,38 @@ def targets(
     weighted = S @ C @ Z
     back = np.linalg.pinv(weighted, rcond=TOLERANCE) @ S
     rows, values = np.vstack([W, G @ Z]), np.concatenate([u0, G @ z0])
-    rows_push = np.vstack([pushed[nz:], G @ pushed[:nz]])
+    rows_disturbance = np.vstack([pushed[nz:], G @ pushed[:nz]])
     return Targets(
         z0=z0,
         Z=Z,
         u0=u0 * float(hold),
         W=W * float(hold),
-        z_push=pushed[:nz],
-        u_push=pushed[nz:] * float(hold),
+        z_disturbance=pushed[:nz],
+        u_disturbance=pushed[nz:] * float(hold),
         from_reference=back,
         offset=-back @ C @ z0,
         rows=rows,
-        rows_push=rows_push,
+        rows_disturbance=rows_disturbance,
         low=np.concatenate([inputs.low, outputs.low]) - values,
         high=np.concatenate([inputs.high, outputs.high]) - values,
         hard=nu,
         weighted=weighted,
-        from_push=-back @ C @ pushed[:nz],
+        from_disturbance=-back @ C @ pushed[:nz],
     )
+
+
+def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:
+    """Return rows first … first + N of a reference (nr,) that is held or (M, nr) whose last row is repeated.
+
+    What is beyond 1e30 comes back as NaN: it is no reference, and its square overflows.
+    """
+    R = checks.array(reference, "reference", finite=False)
+    if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
+        raise ShapeError(
+            f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{first + N}"
+        )
+    R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
+    return np.ascontiguousarray(R[np.minimum(np.arange(first, first + N + 1), len(R) - 1)])
 
 
 def margin(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

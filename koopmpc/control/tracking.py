@@ -1,33 +1,33 @@
-"""What LQR and KoopmanMPC share: a predictor's matrices under a cost and limits, and targets."""
+"""What a controller tracks and limits, with its weights: matrices of a lifted model, or functions of a state."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Generic, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Interval, Limits, Softness
-from koopmpc.control.target import Targets, targets
-from koopmpc.errors import ShapeError
-from koopmpc.estimate.observer import constant_index
+from koopmpc.control.limits import Interval, LimitRows, Limits, Softness
+from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, rows
-from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
+Read = TypeVar("Read", Float[np.ndarray, "n nz"], ca.Function)
+
 
 @dataclass(frozen=True)
-class Tracking:
-    """A predictor under a cost and limits: tracked outputs C z, limited outputs G z, weights and targets.
+class Tracking(Generic[Read]):
+    """The weights and limits of a problem, on what `tracked` and `limited` read from the model's state.
 
-    R_delta and `rates` are None where the change of the inputs is free.
+    Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
+    `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. R_delta and
+    `rates` are None where the change of the inputs is free.
     """
 
-    C: Float[np.ndarray, "nr nz"]
-    G: Float[np.ndarray, "ng nz"]
+    tracked: Read
+    limited: Read
     Q: Float[np.ndarray, "nr nr"]
     R: Float[np.ndarray, "nu nu"]
     R_delta: Float[np.ndarray, "nu nu"] | None
@@ -36,11 +36,27 @@ class Tracking:
     rate_softness: Softness
     outputs: Interval
     softness: Softness
-    targets: Targets
+
+    @property
+    def with_rates(self) -> bool:
+        """Whether the change of the inputs counts."""
+        return self.R_delta is not None or self.rates is not None
+
+    @property
+    def hard_rates(self) -> Interval | None:
+        """The rate limits that are hard, with ±inf in place of the others; None where none is."""
+        hard = np.isinf(self.rate_softness.linear)
+        if self.rates is None or not hard.any():
+            return None
+        return Interval(np.where(hard, self.rates.low, -np.inf), np.where(hard, self.rates.high, np.inf))
 
 
-def tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> Tracking:
-    """Return the matrices of `cost` and `limits` on the lifted coordinates of `predictor`.
+LiftedTracking: TypeAlias = Tracking[Float[np.ndarray, "n nz"]]
+StateTracking: TypeAlias = Tracking[ca.Function]
+
+
+def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> LiftedTracking:
+    """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
 
     Raises
     ------
@@ -49,29 +65,48 @@ def tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> Tracking
     ShapeError
         A weight or a limit has another size than what it weighs or limits.
     """
-    C, nu = observed(predictor, cost.of), predictor.nu
-    Q, R = cost.matrices(len(C), nu)
-    G = predictor.C
+    C, G, nx = observed(predictor, cost.of), predictor.C, predictor.nx
     if limits.of is not None:
         G = np.vstack([G, observed(predictor, limits.of)])
-    kept, outputs, softness = limits.rows(predictor.nx, len(G) - predictor.nx)
-    G = np.ascontiguousarray(G[kept])
-    inputs = limits.inputs(nu)
-    hold = cost.u_target == "equilibrium"
-    constant = constant_index(predictor)
-    found = targets(predictor.A, predictor.B, C, Q, inputs, G, outputs, constant, hold=hold)
+    given = limits.rows(nx, len(G) - nx)
+    return _tracking(C, np.ascontiguousarray(G[given.kept]), cost, limits, given, len(C), predictor.nu)
+
+
+def state_tracking(
+    states: tuple[str, ...], nu: int, cost: Cost, limits: Limits, size: int | None = None
+) -> StateTracking:
+    """Return what `cost` tracks and `limits` bound, as functions of these states.
+
+    The functions take `size` values, the states first; by default the states alone.
+    """
+    nx = len(states)
+    point = ca.SX.sym("x", nx if size is None else size)
+    x, of = point[:nx], cost.of.bind(states)
+    bound = None if limits.of is None else limits.of.bind(states)
+    values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
+    given = limits.rows(nx, 0 if bound is None else bound.nz)
+    kept = np.flatnonzero(given.kept).tolist()
+    tracked = ca.Function("tracked", [point], [ca.densify(of.symbolic(x))])
+    limited = ca.Function("limited", [point], [ca.densify(values[kept, 0])])
+    return _tracking(tracked, limited, cost, limits, given, of.nz, nu)
+
+
+def _tracking(
+    tracked: Read, limited: Read, cost: Cost, limits: Limits, given: LimitRows, nr: int, nu: int
+) -> Tracking[Read]:
+    """Return the record of these maps with the weights and limits in the sizes that they have here."""
+    Q, R = cost.matrices(nr, nu)
     return Tracking(
-        C,
-        G,
+        tracked,
+        limited,
         Q,
         R,
         cost.rate(nu),
-        inputs,
+        limits.inputs(nu),
         limits.rates(nu),
         limits.rate_softness(nu),
-        outputs,
-        softness,
-        found,
+        given.box,
+        given.softness,
     )
 
 
@@ -83,65 +118,18 @@ def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr n
     return np.eye(predictor.nz)[rows(predictor.lifting, wanted)]
 
 
-def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int) -> Float[np.ndarray, "N1 nr"]:
-    """Return N + 1 rows of a reference (nr,) that is held or (M, nr) whose last row is repeated.
+def checked(cost: object, limits: object) -> tuple[Cost, Limits]:
+    """Return the cost and the limits, no limits for None.
 
-    What is beyond 1e30 comes back as NaN: it is no reference, and its square overflows.
+    Raises
+    ------
+    DataError
+        One is something else, perhaps the other.
     """
-    R = checks.array(reference, "reference", finite=False)
-    if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
-        raise ShapeError(f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{N}")
-    R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
-    return np.ascontiguousarray(R[np.minimum(np.arange(N + 1), len(R) - 1)])
-
-
-class Outputs(NamedTuple):
-    """Functions of x with their weights and limits: tracked of(x) (nr, Q), limited g(x) (ng, box), and the inputs'.
-
-    softness says what it costs to leave the box, row by row; a linear weight of inf makes a row hard. R_delta and
-    `rates` are None where the change of the inputs is free.
-    """
-
-    tracked: ca.Function
-    limited: ca.Function
-    Q: Float[np.ndarray, "nr nr"]
-    R: Float[np.ndarray, "nu nu"]
-    inputs: Interval
-    box: Interval
-    softness: Softness
-    R_delta: Float[np.ndarray, "nu nu"] | None
-    rates: Interval | None
-    rate_softness: Softness
-
-    @property
-    def with_rates(self) -> bool:
-        """Whether the change of the inputs counts."""
-        return self.R_delta is not None or self.rates is not None
-
-
-def outputs(states: tuple[str, ...], nu: int, cost: Cost, limits: Limits, size: int | None = None) -> Outputs:
-    """Return what `cost` tracks and `limits` bound, of these states and of `nu` inputs; rows without limit go.
-
-    The functions take `size` values, the states first; by default the states alone.
-    """
-    nx = len(states)
-    point = ca.SX.sym("x", nx if size is None else size)
-    x = point[:nx]
-    of = cost.of.bind(states)
-    Q, R = cost.matrices(of.nz, nu)
-    bound = None if limits.of is None else limits.of.bind(states)
-    values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    rows = limits.rows(nx, 0 if bound is None else bound.nz)
-    kept = np.flatnonzero(rows.kept).tolist()
-    return Outputs(
-        ca.Function("tracked", [point], [ca.densify(of.symbolic(x))]),
-        ca.Function("limited", [point], [ca.densify(values[kept, 0])]),
-        Q,
-        R,
-        limits.inputs(nu),
-        rows.box,
-        rows.softness,
-        cost.rate(nu),
-        limits.rates(nu),
-        limits.rate_softness(nu),
-    )
+    if not isinstance(cost, Cost):
+        raise DataError(f"cost is a {type(cost).__name__}; pass a Cost, and the Limits after it")
+    if limits is None:
+        return cost, Limits()
+    if not isinstance(limits, Limits):
+        raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
+    return cost, limits

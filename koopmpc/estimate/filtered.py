@@ -47,7 +47,7 @@ class Augmented:
         self.to_d[kept, n:] = Bd[kept] + shift - A @ shift
 
 
-class Model(NamedTuple):
+class FilterModel(NamedTuple):
     """What a filter runs on: the augmented system, the covariance P before a measurement, and that of y."""
 
     system: Augmented
@@ -62,7 +62,7 @@ class Kalman:
     """
 
     def __init__(
-        self, model: Callable[[LinearPredictor], Model], predictor: LinearPredictor, delay: int, patience: int
+        self, model: Callable[[LinearPredictor], FilterModel], predictor: LinearPredictor, delay: int, patience: int
     ) -> None:
         self._model, self._delay, self._patience = model, delay, patience
         self._inputs: deque[Float[np.ndarray, " nuw"]] = deque()

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.filtered import Augmented, Kalman, Model
-from koopmpc.estimate.observer import constant_index, places
+from koopmpc.estimate.filtered import Augmented, FilterModel, Kalman
+from koopmpc.estimate.observer import StateModel, constant_index, places
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
@@ -109,19 +109,24 @@ class LiftedKalman(Value):
         checks.count(self.delay, "delay", 0)
         checks.count(self.patience, "patience", 0)
 
-    def start(self, predictor: LinearPredictor) -> Kalman:
+    def start(self, model: LinearPredictor | StateModel) -> Kalman:
         """Return the observer of one controller.
 
         Raises
         ------
         DataError
-            The disturbance, or the state, is not detectable from the outputs.
+            The model is no linear predictor; or the disturbance, or the state, is not detectable from the outputs.
         ObservableError, ShapeError
             The lifting lacks an output; H has another width than z.
         """
-        return Kalman(self._model, predictor, self.delay, self.patience)
+        if not isinstance(model, LinearPredictor):
+            raise DataError(
+                "LiftedKalman filters the lifted state of a linear predictor, and this controller plans in the state "
+                "itself; pass a LiftedDisturbance"
+            )
+        return Kalman(self._model, model, self.delay, self.patience)
 
-    def _model(self, predictor: LinearPredictor) -> Model:
+    def _model(self, predictor: LinearPredictor) -> FilterModel:
         """Return the filter's matrices for a predictor, or say why there are none."""
         nz, nu = predictor.nz, predictor.nu
         H = self._matrix(predictor)
@@ -146,7 +151,7 @@ class LiftedKalman(Value):
         n = len(kept)
         Q = scipy.linalg.block_diag(checks.weight(self.process, "process", n), checks.weight(self.drift, "drift", ny))
         R = checks.weight(self.noise, "noise", ny)
-        return Model(model, _stationary(model.F, model.M, Q, R), R)
+        return FilterModel(model, _stationary(model.F, model.M, Q, R), R)
 
     def _matrix(self, predictor: LinearPredictor) -> Float[np.ndarray, "ny nz"]:
         if isinstance(self.outputs, tuple):

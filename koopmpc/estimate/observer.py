@@ -1,5 +1,6 @@
-"""What a controller asks of an estimator: the lifted state z and the disturbance d of z⁺ = A z + B u + d."""
+"""What a controller asks about its present: the lifted state z and the disturbance d of z⁺ = A z + B u + d."""
 
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +15,104 @@ from koopmpc.predict.predictors import LinearPredictor
 
 
 @runtime_checkable
+class StateModel(Protocol):
+    """z⁺ = F(z, u) + E w + d of a controller: a lifted linear model, or a map whose z is the state itself."""
+
+    @property
+    def ny(self) -> int:
+        """Number of the plant's states, which y holds where all is measured."""
+        ...
+
+    @property
+    def nz(self) -> int:
+        """Number of entries of z."""
+        ...
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        ...
+
+    @property
+    def nw(self) -> int:
+        """Number of measured disturbances."""
+        ...
+
+    @property
+    def lifting(self) -> Lifting | None:
+        """The ψ of z = ψ(ζ); None where z is ζ."""
+        ...
+
+    @property
+    def embedding(self) -> Delay | None:
+        """What makes ζ of the plant's state and its past; None where ζ is that state."""
+        ...
+
+    def advance(
+        self,
+        z: Float[np.ndarray, " nz"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+        d: Float[np.ndarray, " nz"],
+    ) -> Float[np.ndarray, " nz"]:
+        """Return z⁺."""
+        ...
+
+
+@dataclass(frozen=True)
+class LiftedModel:
+    """z⁺ = A z + B u + E w + d of a linear predictor, z = ψ(ζ)."""
+
+    predictor: LinearPredictor
+
+    @property
+    def ny(self) -> int:
+        """Number of the plant's states."""
+        return self.predictor.nx
+
+    @property
+    def nz(self) -> int:
+        """Number of observables."""
+        return self.predictor.nz
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return self.predictor.nu
+
+    @property
+    def nw(self) -> int:
+        """Number of measured disturbances."""
+        return self.predictor.nw
+
+    @property
+    def lifting(self) -> Lifting:
+        """The ψ of z = ψ(ζ)."""
+        return self.predictor.lifting
+
+    @property
+    def embedding(self) -> Delay | None:
+        """What makes ζ of the plant's state and its past."""
+        return self.predictor.embedding
+
+    def advance(
+        self,
+        z: Float[np.ndarray, " nz"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+        d: Float[np.ndarray, " nz"],
+    ) -> Float[np.ndarray, " nz"]:
+        """Return z⁺."""
+        model = self.predictor
+        return model.A @ z + model.B @ u + model.E @ w + d
+
+
+def state_model(model: LinearPredictor | StateModel) -> StateModel:
+    """Return the model itself, or that of a linear predictor."""
+    return LiftedModel(model) if isinstance(model, LinearPredictor) else model
+
+
+@runtime_checkable
 class StateObserver(Protocol):
     """The estimate of one run: z and d hold until the next `observe`."""
 
@@ -24,20 +123,20 @@ class StateObserver(Protocol):
 
     @property
     def z(self) -> Float[np.ndarray, " nz"]:
-        """The lifted state now."""
+        """The state of the model now, lifted where the model is."""
         ...
 
     @property
     def d(self) -> Float[np.ndarray, " nz"]:
-        """The disturbance of z⁺ = A z + B u + d, held constant over the horizon."""
+        """The disturbance of z⁺ = F(z, u) + E w + d, held constant over the horizon."""
         ...
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget everything; the run starts at x0, where it is known."""
         ...
 
-    def update(self, predictor: Any) -> None:
-        """Go on with another model, of the kind and the lifting that it was started with."""
+    def update(self, model: Any) -> None:
+        """Go on with another model, of the kind and the lifting that the observer was started with."""
         ...
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
@@ -49,8 +148,15 @@ class StateObserver(Protocol):
 class Estimator(Protocol):
     """A rule of estimation: `LiftedDisturbance`, `LiftedKalman`, or a user's own."""
 
-    def start(self, predictor: LinearPredictor) -> StateObserver:
-        """Return the observer of one controller."""
+    def start(self, model: Any) -> StateObserver:
+        """Return the observer of one controller.
+
+        Parameters
+        ----------
+        model
+            The LinearPredictor of a KoopmanMPC; of the other controllers, which plan in the state's own coordinates,
+            their `StateModel`.
+        """
         ...
 
 
@@ -109,8 +215,3 @@ class History:
         zeta = embedding.shifted(self._zeta, u, x)
         self._zeta = zeta if known else embedding.shifted(self._zeta, u, self._zeta[: self._nx])
         return zeta
-
-
-def history_of(embedding: Delay | None) -> History | None:
-    """Return the history that an observer keeps; None without an embedding."""
-    return None if embedding is None else History(embedding)

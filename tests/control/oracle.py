@@ -95,6 +95,9 @@ def oracle(model, cost, limits, z0, R, targets, *, P, u_prev, W=None, d=None, bl
 
 def targets_of(mpc, R, e=None):
     """(z_r, u_r) of each row of R, as the controller finds them; the laws of a target have their own tests."""
-    found = mpc._map.track.targets
-    z_push, u_push = (0.0, 0.0) if e is None else (found.z_push @ e, found.u_push @ e)
-    return [(found.z0 + z_push + found.Z @ a, found.u0 + u_push + found.W @ a) for a in found.coordinates(R, e)]
+    found = mpc._map.targets
+    z_disturbance, u_disturbance = (0.0, 0.0) if e is None else (found.z_disturbance @ e, found.u_disturbance @ e)
+    return [
+        (found.z0 + z_disturbance + found.Z @ a, found.u0 + u_disturbance + found.W @ a)
+        for a in found.coordinates(R, e)
+    ]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
 from koopmpc.control.nonlinear.problem import learned_map
-from koopmpc.control.tracking import outputs
+from koopmpc.control.tracking import state_tracking
 from tests.control.test_bilinear_mpc import pendulum
 
 COST = km.Cost(Q=[1, 0.1], R=0.1)
@@ -24,7 +24,7 @@ def two_tanks() -> km.StepMap:
 
 
 def equilibria(model, limits: km.Limits, cost: km.Cost = COST) -> Equilibria:
-    seen = outputs(model.states, model.nu, cost, limits)
+    seen = state_tracking(model.states, model.nu, cost, limits)
     return Equilibria(learned_map(model), cost, seen)
 
 
@@ -47,7 +47,7 @@ def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
     assert np.allclose(near.u, far.u, atol=1e-4)
     at = each.linearise(near.x, near.u)
     assert np.allclose(at.F + e, near.x, atol=1e-9)
-    for values, box in ((near.u, each._outputs.inputs), (at.g, each._outputs.box)):
+    for values, box in ((near.u, each._outputs.inputs), (at.g, each._outputs.outputs)):
         assert (values >= box.low - 1e-8).all()
         assert (values <= box.high + 1e-8).all()
     again = each.near(near, row, e, CLOSE)

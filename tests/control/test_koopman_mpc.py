@@ -70,8 +70,8 @@ def test_it_equals_cvxpy_along_a_closed_loop(name, nu):
     for k in range(9):
         rows = signal[k : k + N + 1]
         move = mpc(x, rows)
-        alpha = mpc._map.track.targets.coordinates(rows)
-        found = mpc._map.track.targets
+        alpha = mpc._map.targets.coordinates(rows)
+        found = mpc._map.targets
         targets = [(found.z0 + found.Z @ a, found.u0 + found.W @ a) for a in alpha]
         U = cvxpy_plan(model, cost, limits, x, rows, targets)
         if U is None:
@@ -97,7 +97,7 @@ def test_limits_on_observables_equal_cvxpy():
     for _ in range(8):
         move = mpc(x, reference)
         seen.add(move.status)
-        found = mpc._map.track.targets
+        found = mpc._map.targets
         alpha = found.coordinates(np.zeros((11, 2)))
         targets = [(found.z0 + found.Z @ a, found.u0 + found.W @ a) for a in alpha]
         U = cvxpy_plan(model, cost, limits, model.lift(x), np.zeros((11, 2)), targets, of=H)

@@ -12,7 +12,7 @@ import koopmpc as km
 from koopmpc.control.nonlinear.equilibrium import TerminalTargets
 from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.control.riccati import stationary
-from koopmpc.control.tracking import outputs
+from koopmpc.control.tracking import state_tracking
 
 SOLVERS = ["ipopt", "fatrop", "sqpmethod"]
 
@@ -90,7 +90,7 @@ def test_several_starts_leave_a_local_optimum() -> None:
 
 def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() -> None:
     plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = outputs(plant.states, plant.nu, cost, km.Limits(-2, 2))
+    read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
     target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
 
     def end(x: np.ndarray) -> float:
@@ -113,6 +113,6 @@ def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_goal() ->
 def test_the_goal_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
     """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
     plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = outputs(plant.states, plant.nu, cost, km.Limits(-2, 2))
+    read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
     target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
     assert np.cos(target.equilibrium.x[0]) < -0.99

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.linear.horizon import one_step
-from koopmpc.control.riccati import Stage, _iterate, _leap, recursion, stationary
+from koopmpc.control.riccati import Stage, _iterate, _leap, one_step, recursion, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)

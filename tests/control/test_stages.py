@@ -364,7 +364,7 @@ show(lambda: BilinearMPC(flat, cost, limits, 5)("now", [0, 0]))
         "DataError the model has no inputs",
         "DataError cost is a Limits",
         "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
-        "DataError estimator is a LiftedKalman, expected a LiftedDisturbance",
+        "DataError LiftedKalman filters the lifted state of a linear predictor, and this controller plans in the state",
         "DataError w was passed, but the predictor has no E",
         "DataError y is not an array of numbers: got str",
     ]

@@ -75,9 +75,9 @@ def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordina
             z = Z[k]
             np.dot(h.A, X[:nz], out=z)
             z += Bu
-            push = h.push(k)
-            if push is not None:
-                z[:, nx : nx + nf] += push
+            moved = h.disturbance(k)
+            if moved is not None:
+                z[:, nx : nx + nf] += moved
             X[:nz] = z
             k += 1
     rows = [U.reshape(n, -1)]

@@ -7,15 +7,14 @@ condensed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
-from koopmpc import checks
 from koopmpc.control.riccati import Stage
 from koopmpc.control.target import Targets
-from koopmpc.errors import DataError
 
 
 class SignalLayout(NamedTuple):
@@ -78,7 +77,7 @@ class Horizon:
         """The places in f."""
         return SignalLayout(self.N, self.E.shape[1], len(self.A) if self.disturbed else 0)
 
-    def push(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
+    def disturbance(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
         """Return E w_k + d as a matrix on f; None where there is neither."""
         if not self.disturbed and not self.E.shape[1]:
             return None
@@ -87,44 +86,6 @@ class Horizon:
         e[:, signals.w(k)] = self.E
         e[:, signals.d] = np.eye(len(self.A), signals.nd)
         return e
-
-
-def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:
-    """Return the lengths of the blocks: N ones, M moves of which the last is held, or `moves` itself.
-
-    Raises
-    ------
-    DataError
-        There are more moves than steps, or the lengths do not sum to N.
-    """
-    if moves is None:
-        return (1,) * N
-    if isinstance(moves, Sequence):
-        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
-        if sum(lengths) != N:
-            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
-        return lengths
-    if not isinstance(cast(object, moves), int | np.integer):
-        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
-    M = checks.count(moves, "moves")
-    if M > N:
-        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
-    return (1,) * (M - 1) + (N - M + 1,)
-
-
-def one_step(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    R_delta: Float[np.ndarray, "nu nu"] | None,
-) -> Stage:
-    """Return one step with the cost ‖z‖²_Q + ‖u‖²_R, on [z; u_{k−1}] with ‖u − u_{k−1}‖²_{R_delta} where given."""
-    nz, nu = B.shape
-    if R_delta is None:
-        return Stage(A, B, Q, None, R)
-    M = np.vstack([np.zeros((nz, nu)), -R_delta])
-    return Stage(_stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)]), _stacked(Q, R_delta), M, R + R_delta)
 
 
 def stages(horizon: Horizon, targets: Targets) -> list[Stage]:
@@ -154,17 +115,17 @@ def _stage(
 ) -> Stage:
     """Return the stage of a block from step k on, r what is known of its linear term in u."""
     nz, nu = h.B.shape
-    (A, B), q, e = powers[-1], None, h.push(k)
+    (A, B), q, e = powers[-1], None, h.disturbance(k)
     for i, (Ai, Bi) in enumerate(powers[1:-1], 1):
-        push = h.push(k + i)
-        if e is not None and push is not None:
+        moved = h.disturbance(k + i)
+        if e is not None and moved is not None:
             missed = h.C.T @ (h.Q @ (h.C @ e))
             q = np.zeros((h.size, h.signals.size)) if q is None else q
             q[:nz] += Ai.T @ missed
             r = r + Bi.T @ missed
-            e = h.A @ e + push
+            e = h.A @ e + moved
     if h.with_rates:
-        A, B = _stacked(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
+        A, B = block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
         e = None if e is None else np.vstack([e, np.zeros((nu, h.signals.size))])
     return Stage(A, B, *_weights(h, powers[:-1]), e, q, r)
 
@@ -177,9 +138,9 @@ def end(horizon: Horizon, targets: Targets) -> Float[np.ndarray, "nx nf"]:
         return p
     z_r = np.zeros((nz, h.signals.size))
     z_r[:, -1] = targets.z0
-    push = h.push(h.N - 1)
-    if push is not None:
-        z_r += targets.z_push @ push
+    moved = h.disturbance(h.N - 1)
+    if moved is not None:
+        z_r += targets.z_disturbance @ moved
     p -= h.P_N[:, :nz] @ z_r
     if h.with_rates:
         p -= h.P_N[:, nz:] @ _input(h, targets)
@@ -190,8 +151,8 @@ def _input(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
     """Return u_r less what the coordinates of the target add; the last disturbance of the preview stays."""
     u_r = np.zeros((len(targets.u0), h.signals.size))
     u_r[:, -1] = targets.u0
-    push = h.push(h.N - 1)
-    return u_r if push is None else u_r + targets.u_push @ push
+    moved = h.disturbance(h.N - 1)
+    return u_r if moved is None else u_r + targets.u_disturbance @ moved
 
 
 def _weights(
@@ -206,12 +167,4 @@ def _weights(
     if not h.with_rates:
         return Q, M if len(powers) > 1 else None, R
     R_delta = np.zeros((nu, nu)) if h.R_delta is None else h.R_delta
-    return _stacked(Q, R_delta), np.vstack([M, -R_delta]), R + R_delta
-
-
-def _stacked(X: Float[np.ndarray, "nz nz"], Y: Float[np.ndarray, "nu nu"]) -> Float[np.ndarray, "nx nx"]:
-    """Return the block diagonal of X and Y."""
-    nz, nx = len(X), len(X) + len(Y)
-    whole = np.zeros((nx, nx))
-    whole[:nz, :nz], whole[nz:, nz:] = X, Y
-    return whole
+    return block_diag(Q, R_delta), np.vstack([M, -R_delta]), R + R_delta

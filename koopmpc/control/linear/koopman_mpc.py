@@ -2,25 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from time import perf_counter
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import MPCBase, PlanMemory, admitted, hard
+from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import InitialCondition, LiftedModel, Sizes, numbers
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
-from koopmpc.control.linear.horizon import blocked
 from koopmpc.control.linear.plan_map import PlanMap
 from koopmpc.control.linear.qp import Constrained
 from koopmpc.control.move import Move, Plan, Status
-from koopmpc.control.tracking import reference_rows
+from koopmpc.control.target import reference_rows
 from koopmpc.errors import DataError
-from koopmpc.estimate.measured import Measured
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
@@ -100,10 +97,7 @@ class KoopmanMPC(MPCBase):
         if coordinates not in ("auto", "riccati", "plain"):
             raise DataError(f'coordinates is {coordinates!r}; pass "auto", "riccati" or "plain"')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
-        if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator | None):
-            raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
-        super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, time_limit)
-        self._blocks = blocked(moves, self._N)
+        super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, moves, time_limit)
         self.predictor = predictor
         self._disturbed = estimator is not None
         self._map = PlanMap(
@@ -116,24 +110,11 @@ class KoopmanMPC(MPCBase):
         )
         track = self._map.track
         self._constrained = Constrained(self._map.hard, self._map.soft, solver, settings)
-        self._with_rates = self._map.horizon.with_rates
-        self._hard_rates = hard(track.rates, track.rate_softness.linear)
-        self._move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
-        self._memory = PlanMemory(track.inputs, self._N, track.rates, self._move_of)
-
-        observer = Measured(predictor) if estimator is None else estimator.start(predictor)
-        self._initial = InitialCondition(
-            LiftedModel(predictor),
-            observer,
-            Sizes(predictor.nz, self._nu, predictor.nw, self._N),
-            self._latency,
-            with_rates=self._with_rates,
-            estimated=self._disturbed,
-            remembers=predictor.embedding is not None,
-        )
+        move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
+        self._begin(predictor, track, estimator, with_rates=track.with_rates, move_of=move_of)
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
-        self._reference = np.zeros((self._N + 1, len(track.C)))
+        self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
         self._see()
         self.reset()
@@ -158,15 +139,9 @@ class KoopmanMPC(MPCBase):
         return self._map.maps.coordinates
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget all earlier steps, so that a run repeats to the bit.
-
-        `u_prev`, zero moved inside the limits by default, is where rates count from, and is held if the first step
-        fails. A filter starts at x0, by default at zero.
-        """
-        self._memory.reset(u_prev)
+        """Forget all earlier steps; see `MPCBase`."""
+        super().reset(x0, u_prev)
         self._constrained.reset()
-        self._planned = False
-        self._initial.reset(x0, self._memory.last())
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
@@ -192,8 +167,7 @@ class KoopmanMPC(MPCBase):
         self.predictor = predictor
         self._constrained.update(self._map.hard, self._map.soft)
         self._reference_key = None
-        self._initial.update(LiftedModel(predictor))
-        self.observer.update(predictor)
+        self._initial.update(predictor)
 
     def __call__(
         self,
@@ -218,8 +192,8 @@ class KoopmanMPC(MPCBase):
         """
         start = perf_counter()
         origin = self._initial
-        origin.take(y, self._memory.last(), applied, w)
-        target = numbers(reference, "reference")
+        origin.take(y, self._given, applied, w)
+        target = checks.numbers(reference, "reference")
         key = target.tobytes()
         if key != self._reference_key:
             self._aim(target)
@@ -251,19 +225,18 @@ class KoopmanMPC(MPCBase):
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the last column."""
-        self._reference = reference_rows(self._previewed(reference), self._N, self._reference.shape[1])
+        self._reference = reference_rows(reference, self._N, self._reference.shape[1], self._latency)
         self._map.aim(self._reference)
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._constrained.cool()
-        self._keep(t)
+        self._take(t)
         return self._move(t[: self._nu].copy(), Status.UNCONSTRAINED, 0, start)
 
-    def _keep(self, t: Float[np.ndarray, " nt"]) -> None:
+    def _take(self, t: Float[np.ndarray, " nt"]) -> None:
         """Make t the plan; the array of the plan before it is free for the next step."""
         self._plan, self._spare = t, self._plan
-        self._memory.keep(t)
-        self._planned = True
+        self._keep(t)
 
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Go on where the plan breaks a limit, its target does, or something is not finite."""
@@ -271,7 +244,7 @@ class KoopmanMPC(MPCBase):
         u_prev = origin.u_prev
         changed = self._with_rates and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
         if changed:
-            u_prev[:] = self._memory.last()
+            u_prev[:] = self._given
             np.dot(plan.matrix, origin.known, out=t)
         if not t.dot(t) < HUGE * HUGE:
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
@@ -297,7 +270,7 @@ class KoopmanMPC(MPCBase):
         u = U[: self._nu]
         if self._hard_rates is not None:
             u[:] = admitted(u, inputs, self._hard_rates, u_prev)
-        self._keep(t)
+        self._take(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
         return self._move(u.copy(), status, found.iterations, start, gave_way)
 

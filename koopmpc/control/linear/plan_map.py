@@ -7,11 +7,11 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits, Softness
 from koopmpc.control.linear.condense import Condensed, Coordinates, condense
-from koopmpc.control.linear.horizon import Horizon, end, one_step, stages
+from koopmpc.control.linear.horizon import Horizon, end, stages
 from koopmpc.control.linear.qp import Group, Program, Units, program, units
-from koopmpc.control.riccati import recursion, stationary
-from koopmpc.control.target import margin
-from koopmpc.control.tracking import Tracking, tracking
+from koopmpc.control.riccati import one_step, recursion, stationary
+from koopmpc.control.target import margin, targets_of
+from koopmpc.control.tracking import LiftedTracking, lifted_tracking
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.lifting.state import State
@@ -49,9 +49,9 @@ class PlanMap:
         disturbed: bool,
         coordinates: Coordinates,
     ) -> None:
-        self.track = track = tracking(predictor, cost, limits)
+        self.track = track = lifted_tracking(predictor, cost, limits)
         self.horizon = horizon = _horizon(predictor, cost, track, blocks, disturbed=disturbed)
-        found = track.targets
+        self.targets = found = targets_of(predictor, cost, track)
         law = recursion(stages(horizon, found), horizon.P_N, end(horizon, found))
         self.maps = condense(horizon, law, found, coordinates)
         self.moves = len(blocks) * predictor.nu
@@ -63,16 +63,16 @@ class PlanMap:
 
         low, high = _bounds(track, horizon)
         nv = len(low)
-        last, first = horizon.push(horizon.N - 1), np.zeros((nv, 0))
-        self._push = np.zeros((predictor.nz, 0)) if last is None else last[:, :-1]
-        ng = self._push.shape[1]
+        last, first = horizon.disturbance(horizon.N - 1), np.zeros((nv, 0))
+        self._disturbance = np.zeros((predictor.nz, 0)) if last is None else last[:, :-1]
+        ng = self._disturbance.shape[1]
         checked = np.zeros(len(found.low), dtype=np.bool_)
         if ng:
             checked = np.isfinite(found.low) | np.isfinite(found.high)
-            from_push = found.from_push @ self._push
+            from_disturbance = found.from_disturbance @ self._disturbance
             every = self.maps.from_target.reshape(nv, horizon.N + 1, -1).sum(axis=1)
-            first = self.maps.from_drive + every @ from_push
-            moved = (found.rows @ from_push + found.rows_push @ self._push)[checked]
+            first = self.maps.from_drive + every @ from_disturbance
+            moved = (found.rows @ from_disturbance + found.rows_disturbance @ self._disturbance)[checked]
             first = np.vstack([first, moved, moved])
             free = np.full(len(moved), np.inf)
             t_low, t_high = found.low[checked], found.high[checked]
@@ -88,11 +88,11 @@ class PlanMap:
 
     def aim(self, R: Float[np.ndarray, "N1 nr"]) -> None:
         """Write the part of the reference rows into the last column; NaN where a row is."""
-        column, maps, found = self.matrix[:, -1], self.maps, self.track.targets
+        column, maps, found = self.matrix[:, -1], self.maps, self.targets
         if not np.isfinite(R).all():
             column[:] = np.nan
             return
-        driven = self._push.shape[1] > 0
+        driven = self._disturbance.shape[1] > 0
         alpha = found.nearest(R) if driven else found.coordinates(R)
         v = maps.from_reference @ R.ravel() + maps.from_target @ alpha.ravel() + maps.offset
         column[: self.planned] = v
@@ -102,17 +102,22 @@ class PlanMap:
 
     def correction(self, R: Float[np.ndarray, "N1 nr"], g: Float[np.ndarray, " ng"]) -> Float[np.ndarray, " nv"]:
         """Return what v gains from targets that a limit moves."""
-        e, found = self._push @ g, self.track.targets
+        e, found = self._disturbance @ g, self.targets
         moved = found.coordinates(R, e) - found.nearest(R, e)
         return self.maps.from_target @ moved.ravel()
 
 
 def _horizon(
-    predictor: LinearPredictor, cost: Cost, track: Tracking, blocks: tuple[int, ...], *, disturbed: bool
+    predictor: LinearPredictor,
+    cost: Cost,
+    track: LiftedTracking,
+    blocks: tuple[int, ...],
+    *,
+    disturbed: bool,
 ) -> Horizon:
     """Return the horizon with the terminal weight that the cost asks for."""
-    A, B, C, nz, nx = predictor.A, predictor.B, track.C, predictor.nz, predictor.nx
-    with_rates = track.R_delta is not None or track.rates is not None
+    A, B, C, nz, nx = predictor.A, predictor.B, track.tracked, predictor.nz, predictor.nx
+    with_rates = track.with_rates
     size = nz + predictor.nu * with_rates
     bounded = track.rates is not None
     CQ_N = None
@@ -140,7 +145,7 @@ def _horizon(
         B=B,
         E=predictor.E,
         C=C,
-        G=track.G,
+        G=track.limited,
         Q=track.Q,
         R=track.R,
         R_delta=track.R_delta,
@@ -153,7 +158,7 @@ def _horizon(
     )
 
 
-def _bounds(track: Tracking, horizon: Horizon) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " nv"]]:
+def _bounds(track: LiftedTracking, horizon: Horizon) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " nv"]]:
     """Return the limits of v."""
     moves = len(horizon.blocks)
     ends: list[Float[np.ndarray, " nv"]] = []
@@ -164,7 +169,7 @@ def _bounds(track: Tracking, horizon: Horizon) -> tuple[Float[np.ndarray, " nv"]
     return ends[0], ends[1]
 
 
-def _program(maps: Condensed, track: Tracking, horizon: Horizon, measured: Units, *, soft_rows: bool) -> Program:
+def _program(maps: Condensed, track: LiftedTracking, horizon: Horizon, measured: Units, *, soft_rows: bool) -> Program:
     """Return the QP, whose next stages are a step on: of outputs the next, of moves the one that then holds."""
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
     starts = np.cumsum([0, *horizon.blocks[:-1]])

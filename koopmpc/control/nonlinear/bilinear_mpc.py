@@ -15,11 +15,21 @@ from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import SHORTEST, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
-from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.observer import Estimator
 
 FIRST = 10  # iterations of a first step, at most
 SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of 1 + its size
-_COPIED = ("_initial", "_memory", "_planned", "_warm", "_moved", "_X", "_U")  # what a copy takes over, with the plan
+_COPIED = (
+    "_initial",
+    "_kept",
+    "_age",
+    "_given",
+    "_planned",
+    "_warm",
+    "_moved",
+    "_X",
+    "_U",
+)  # what a copy takes over, with the plan
 
 
 class BilinearMPC(StagedMPC):
@@ -79,7 +89,7 @@ class BilinearMPC(StagedMPC):
         horizon: int = 20,
         *,
         sqp_iterations: int = 1,
-        estimator: LiftedDisturbance | None = None,
+        estimator: Estimator | None = None,
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,

@@ -13,11 +13,10 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval
-from koopmpc.control.linear.horizon import one_step
 from koopmpc.control.nonlinear.problem import LearnedMap
-from koopmpc.control.riccati import stationary
+from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.target import TOLERANCE, root
-from koopmpc.control.tracking import Outputs
+from koopmpc.control.tracking import StateTracking
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.plants.buffered import Buffered
@@ -75,7 +74,7 @@ class Equilibria:
     the least x and u.
     """
 
-    def __init__(self, model: LearnedMap, cost: Cost, outputs: Outputs) -> None:
+    def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking) -> None:
         self.model, self._outputs, o = model, outputs, outputs
         self.of_state = isinstance(cost.of, State) and cost.of.whole
         x, u, theta = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("t", len(model.theta))
@@ -89,7 +88,7 @@ class Equilibria:
         nlp = {"x": ca.vertcat(x, u), "p": ca.vertcat(r, theta, e), "f": f, "g": ca.vertcat(F + e - x, g)}
         self._solver = ca.nlpsol("equilibrium", "ipopt", nlp, _QUIET)
         self._weight, self._small = root(o.Q), np.sqrt(1e-6 * least)
-        self._low, self._high = (np.concatenate([o.inputs[i], o.box[i]]) for i in (0, 1))
+        self._low, self._high = (np.concatenate([o.inputs[i], o.outputs[i]]) for i in (0, 1))
 
     def linearise(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Linearisation:
         """Return the linearisation at (x, u)."""
@@ -160,7 +159,7 @@ class Equilibria:
         near: Equilibrium | None = None,
     ) -> Equilibrium:
         """Return the equilibrium that holds a reference row, by ipopt: from `near`, or from several guesses."""
-        model, inputs, box = self.model, self._outputs.inputs, self._outputs.box
+        model, inputs, box = self.model, self._outputs.inputs, self._outputs.outputs
         nx, e = model.nx, np.zeros(model.nx) if e is None else e
         u = np.clip(np.zeros(model.nu), *inputs)
         x = np.zeros(nx)
@@ -228,7 +227,7 @@ class TerminalTargets:
         Q_N weighs states, but the cost tracks something else.
     """
 
-    def __init__(self, model: LearnedMap, cost: Cost, outputs: Outputs, most: int) -> None:
+    def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking, most: int) -> None:
         self._cost, self._outputs, self._most = cost, outputs, most
         self.equilibria = Equilibria(model, cost, outputs)
         if cost.Q_N is not None:

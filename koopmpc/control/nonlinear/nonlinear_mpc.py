@@ -15,7 +15,7 @@ from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver, Shooting, Start
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.errors import DataError
-from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.observer import Estimator
 
 _HOLD = 5  # steps for which a random guess holds an input
 _WIDE = 1.0  # the range of random inputs where they have no limit
@@ -74,7 +74,7 @@ class NonlinearMPC(StagedMPC):
         solver: NLPSolver = "ipopt",
         starts: int = 1,
         settings: Mapping[str, Any] | None = None,
-        estimator: LiftedDisturbance | None = None,
+        estimator: Estimator | None = None,
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,

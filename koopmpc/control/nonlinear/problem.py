@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from koopmpc import checks
 from koopmpc.control.limits import Interval, Softness
-from koopmpc.control.tracking import Outputs
+from koopmpc.control.tracking import StateTracking
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plants.buffered import Buffered
@@ -51,6 +51,16 @@ class LearnedMap:
     nu: int
     nw: int
     embedding: Delay | None
+
+    @property
+    def nz(self) -> int:
+        """Number of entries of the state that a plan is made of: of x."""
+        return self.nx
+
+    @property
+    def lifting(self) -> None:
+        """None: a plan is made of states, and none of them is lifted."""
+        return None
 
     def updated(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.
@@ -184,7 +194,7 @@ class StageTargets(NamedTuple):
     m: Float[np.ndarray, " nt"]
 
 
-def staged_problem(F: ca.Function, outputs: Outputs, blocks: tuple[int, ...]) -> StagedProblem:
+def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ...]) -> StagedProblem:
     """Return the problem of a horizon that is cut into blocks of held inputs, F being that of a `LearnedMap`."""
     o, N = outputs, sum(blocks)
     starts = np.cumsum([0, *blocks[:-1]])
@@ -194,7 +204,7 @@ def staged_problem(F: ca.Function, outputs: Outputs, blocks: tuple[int, ...]) ->
     if not o.with_rates and len(blocks) == N:
         none = np.zeros(0, dtype=np.intp)
         return StagedProblem(
-            F, o.tracked, o.limited, o.Q, o.R, o.inputs, o.box, o.softness, free, held_from, False, none
+            F, o.tracked, o.limited, o.Q, o.R, o.inputs, o.outputs, o.softness, free, held_from, False, none
         )
     nx, nu = F.size1_in(0), F.size1_in(1)
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
@@ -218,7 +228,7 @@ def staged_problem(F: ca.Function, outputs: Outputs, blocks: tuple[int, ...]) ->
         block_diag(o.Q, o.R),
         np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
         Interval(low, high),
-        Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.box[i]]) for i in (0, 1))),
+        Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.outputs[i]]) for i in (0, 1))),
         Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1))),
         free,
         held_from,

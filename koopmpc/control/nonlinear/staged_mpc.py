@@ -10,18 +10,16 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import MPCBase, PlanMemory, admitted, hard
+from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost
-from koopmpc.control.initial_condition import InitialCondition, Sizes, numbers
-from koopmpc.control.limits import Interval, Limits, beyond
-from koopmpc.control.linear.horizon import blocked
+from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
-from koopmpc.control.target import root
-from koopmpc.control.tracking import HUGE, outputs, reference_rows
-from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.estimate.measured import MeasuredState
+from koopmpc.control.target import reference_rows, root
+from koopmpc.control.tracking import state_tracking
+from koopmpc.estimate.observer import Estimator
+from koopmpc.lifting.buffered import HUGE
 from koopmpc.plants.step_map import StepMap
 
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
@@ -64,34 +62,18 @@ class StagedMPC(MPCBase):
         limits: Limits | None,
         horizon: int,
         moves: int | Sequence[int] | None,
-        estimator: LiftedDisturbance | None,
+        estimator: Estimator | None,
         latency: int,
         time_limit: float | None,
     ) -> None:
         self._map = given = learned_map(model)
-        super().__init__(model.dt, given.nu, cost, limits, horizon, latency, time_limit)
-        self._blocks = blocked(moves, self._N)
-        self._outputs = o = outputs(model.states, given.nu, self.cost, self.limits, given.nx)
+        super().__init__(model.dt, given.nu, cost, limits, horizon, latency, moves, time_limit)
+        self._outputs = o = state_tracking(model.states, given.nu, self.cost, self.limits, given.nx)
         self._problem = staged_problem(given.F, o, self._blocks)
-        self._with_rates = self._problem.with_rates
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
-        self._hard_rates = hard(o.rates, o.rate_softness.linear)
         self._R_root = root(o.R)
-        self._memory = PlanMemory(o.inputs, self._N, o.rates)
-        self._estimator = estimator
-        if estimator is not None:
-            advice = "LiftedKalman filters a linear predictor's z; here y is the whole state"
-            checks.kind(estimator, "estimator", LiftedDisturbance, advice)
         self._disturbed = estimator is not None or given.nw > 0
-        self._initial = InitialCondition(
-            given,
-            MeasuredState(given) if estimator is None else estimator.watch(given),
-            Sizes(given.nx, given.nu, given.nw, self._N),
-            self._latency,
-            with_rates=self._with_rates,
-            estimated=estimator is not None,
-            remembers=given.embedding is not None,
-        )
+        self._begin(given, o, estimator, with_rates=self._problem.with_rates)
 
     @property
     def model(self) -> ModelOrMap:
@@ -105,9 +87,8 @@ class StagedMPC(MPCBase):
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
-        self._memory.reset(u_prev)
-        self._initial.reset(x0, self._memory.last())
-        self._planned = self._warm = self._moved = False
+        super().reset(x0, u_prev)
+        self._warm = self._moved = False
         self._forget_targets()
         self._e[:] = 0.0
 
@@ -122,7 +103,6 @@ class StagedMPC(MPCBase):
         self._map = self._map.updated(model)
         self._terminal.update(self._map)
         self._initial.update(self._map)
-        self._initial.observer.update(self._map)
         self._forget_targets()
 
     def _forget_targets(self) -> None:
@@ -144,9 +124,9 @@ class StagedMPC(MPCBase):
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
         initial = self._initial
-        initial.take(y, self._memory.last(), applied, w)
+        initial.take(y, self._given, applied, w)
         x, u_prev = initial.z, self._known_input()
-        target = numbers(reference, "reference")
+        target = checks.numbers(reference, "reference")
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
         if not (known and self._aim(target)):
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
@@ -155,14 +135,14 @@ class StagedMPC(MPCBase):
         status = Status.FAILED if self.solver_fails else found.status
         if status not in GOOD:
             return self._lose(applied, status, found.iterations, start, found.free)
-        self._planned = self._warm = True
+        self._warm = True
         self._X, self._U = self._trajectory(found.S, found.V)
         slack, u = found.slack, self._U[0]
         if self._hard_rates is not None:
             u[:] = admitted(u, self._outputs.inputs, self._hard_rates, u_prev)
             if conflict:
                 slack = max(slack, beyond(u - u_prev, self._hard_rates))
-        self._memory.keep(self._U.ravel())
+        self._keep(self._U.ravel())
         return self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
 
     @abstractmethod
@@ -197,7 +177,7 @@ class StagedMPC(MPCBase):
         if key == self._reference and not self._moved:
             return True
         if key != self._reference:
-            R = reference_rows(self._previewed(reference), self._N, len(self._outputs.Q))
+            R = reference_rows(reference, self._N, len(self._outputs.Q), self._latency)
             self._reference = None
             if not np.isfinite(R).all():
                 return False
