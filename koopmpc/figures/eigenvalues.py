@@ -4,10 +4,11 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from koopmpc.figures.style import SEQUENTIAL, figure, styled
-from koopmpc.validate.residuals import ResidualDMD, Residuals, eigenpairs
-from koopmpc.validate.scoring import Predictor
+from koopmpc.validate.residuals import ResidualDMD, eigenpairs
+from koopmpc.validate.scoring import AnyPredictor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ _CROWDED = 0.35  # share of the picture below which the eigenvalues get one of t
 
 
 @styled
-def spectrum(predictor: Predictor, residuals: Residuals | None = None) -> "Figure":
+def spectrum(predictor: AnyPredictor, residuals: ResidualDMD | ArrayLike | None = None) -> "Figure":
     """Draw the eigenvalues λ of A in the complex plane with |λ| = 1, and the residual of each eigenpair.
 
     The darker and larger a point the smaller its residual; an eigenvalue with a residual above the tolerance is a

@@ -22,8 +22,8 @@ from koopmpc.figures.style import (
 )
 from koopmpc.lifting.base import Chosen
 from koopmpc.loop.run import Run
-from koopmpc.validate.forecast import Bands, forecast
-from koopmpc.validate.scoring import Predictor
+from koopmpc.validate.bands import Bands, forecast
+from koopmpc.validate.scoring import AnyPredictor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +34,7 @@ _STATE, _INPUT = 1.05, 0.75  # heights of a panel [in]
 
 @styled
 def rollout(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     episode: Episode,
     horizon: int | None = None,
     bands: Bands | None = None,

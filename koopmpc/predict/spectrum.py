@@ -13,6 +13,7 @@ from scipy.linalg import lstsq
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
@@ -115,7 +116,7 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
     return np.sqrt(error / size)
 
 
-def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes) -> None:
+def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes | Source) -> None:
     """Raise where data and predictor differ in states, inputs, the disturbances that it knows, or dt."""
     known = predictor.disturbances if isinstance(predictor, LinearPredictor) else ()
     for mine, theirs, what in (

@@ -19,9 +19,9 @@ from koopmpc.recording.format.writer import PATIENCE, file_recording, times
 from koopmpc.recording.views.blueprint import color, framed
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
 from koopmpc.scene import Color
-from koopmpc.validate.forecast import Forecast, forecast
+from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.report import TrustReport
-from koopmpc.validate.scoring import Predictor, Score, score
+from koopmpc.validate.scoring import AnyPredictor, Score, score
 
 _TRUTH: Color = (225, 228, 232)
 _PREDICTED = color(0)
@@ -35,7 +35,7 @@ Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
 
 
 def record_model(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     episodes: Episodes,
     path: str | Path,
     *,
@@ -146,7 +146,7 @@ def _send(rec: Any, entity: str, curves: Sequence[Curve], dt: float, *, first: i
 
 
 def _pictures(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     episodes: Episodes,
     report: TrustReport | None,
     which: Sequence[int] | None,
@@ -180,7 +180,7 @@ def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int
     return moving[:_EIGENFUNCTIONS] or [0]
 
 
-def _page(predictor: Predictor, report: TrustReport | None, note: str) -> str:
+def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str:
     lines = [f"# Model of {', '.join(predictor.states)}", ""]
     if report is not None:
         lines += ["```", str(report), "```", ""]
@@ -208,7 +208,7 @@ def _page(predictor: Predictor, report: TrustReport | None, note: str) -> str:
 
 
 def _blueprint(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     ahead: Sequence[Forecast],
     pictures: Sequence[Picture],
     surface: Plane | None,

@@ -16,7 +16,7 @@ from koopmpc.identify.regression import regression
 from koopmpc.identify.solve import Rows, path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
-from koopmpc.validate.scoring import Predictor, forecast_errors
+from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 from koopmpc.values import Value
 
 _STARTS = 256  # forecasts a fold
@@ -119,7 +119,7 @@ def tried(trial: Trial) -> Tried:
     )
 
 
-def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[Predictor]:
+def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
     task, nz, nu = regression(total, "select"), total.nz, like.nu
     P, T, which = task.rows.P, task.rows.T[:, :nz], total.products
@@ -127,7 +127,7 @@ def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[f
     rows = Rows(P, T - P @ start, task.rows.rest[:nz], task.rows.samples)
     C = task.C
     assert C is not None, "an extended regression has its C"
-    models: list[Predictor] = []
+    models: list[AnyPredictor] = []
     for solution in path(rows, ridges):
         K = solution.K + start
         A, B = K[:nz].T, K[nz : nz + nu].T
@@ -173,7 +173,7 @@ def _spread(episodes: Episodes) -> Float[np.ndarray, " nx"]:
 
 
 def _errors(
-    trial: Trial, models: list[Predictor], fold: Episodes, spread: Float[np.ndarray, " nx"]
+    trial: Trial, models: list[AnyPredictor], fold: Episodes, spread: Float[np.ndarray, " nx"]
 ) -> Float[np.ndarray, "models horizon"]:
     points = models[0].embed(fold)
     late = trial.first - trial.candidate.delays

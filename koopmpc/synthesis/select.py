@@ -20,7 +20,7 @@ from koopmpc.synthesis.candidates import Candidate, expanded, jumps, usual
 from koopmpc.synthesis.cross_validation import Trial, ridges_of, tried
 from koopmpc.synthesis.folds import folded, sampled, usual_horizon
 from koopmpc.synthesis.selection import Row, Selection, choice, row_of
-from koopmpc.validate.scoring import Predictor
+from koopmpc.validate.scoring import AnyPredictor
 
 Progress = Callable[[str, int, int | None], None]
 RIDGES = (0.0, 1e-9, 1e-7, 1e-5, 1e-3)
@@ -134,7 +134,7 @@ def select(
         )
     linear = choice(rows, "linear") if any(row.kind == "linear" for row in rows) else chosen
 
-    def refit(row: Row) -> Predictor:
+    def refit(row: Row) -> AnyPredictor:
         told = None if progress is None else partial(progress, f"fit of {row.title}")
         if row.kind == "linear":
             return edmd(

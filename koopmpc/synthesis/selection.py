@@ -9,7 +9,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.cross_validation import EXACT, Tried
-from koopmpc.validate.scoring import Predictor
+from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
 PLAIN = "linear: x, 1"  # [x 1] as it is, the one that others have to beat
@@ -101,7 +101,7 @@ class Selection(Value):
         What was done to the data, in sentences.
     """
 
-    predictor: Predictor
+    predictor: AnyPredictor
     linear: LinearPredictor | None
     leaderboard: tuple[Row, ...]
     chosen: int

@@ -6,30 +6,31 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.validate.bands import ConformalBand as ConformalBand
+    from koopmpc.validate.bands import Forecast as Forecast
     from koopmpc.validate.bands import conformal as conformal
-    from koopmpc.validate.excitation import Persistency as Persistency
-    from koopmpc.validate.excitation import feedback_share as feedback_share
-    from koopmpc.validate.excitation import persistency as persistency
+    from koopmpc.validate.bands import forecast as forecast
+    from koopmpc.validate.identifiability import Persistency as Persistency
+    from koopmpc.validate.identifiability import feedback_share as feedback_share
+    from koopmpc.validate.identifiability import persistency as persistency
     from koopmpc.validate.regions import Coverage as Coverage
     from koopmpc.validate.regions import coverage as coverage
     from koopmpc.validate.report import TrustReport as TrustReport
     from koopmpc.validate.report import trust as trust
+    from koopmpc.validate.residuals import Invariance as Invariance
     from koopmpc.validate.residuals import ResidualDMD as ResidualDMD
+    from koopmpc.validate.residuals import invariance as invariance
     from koopmpc.validate.residuals import residual_dmd as residual_dmd
     from koopmpc.validate.scoring import Score as Score
     from koopmpc.validate.scoring import score as score
-    from koopmpc.validate.subspace import Invariance as Invariance
-    from koopmpc.validate.subspace import invariance as invariance
 else:
     __getattr__, __dir__, __all__ = attach(
         __name__,
         {
-            "bands": "ConformalBand conformal",
-            "excitation": "Persistency feedback_share persistency",
+            "bands": "ConformalBand Forecast conformal forecast",
+            "identifiability": "Persistency feedback_share persistency",
             "regions": "Coverage coverage",
             "report": "TrustReport trust",
-            "residuals": "ResidualDMD residual_dmd",
+            "residuals": "Invariance ResidualDMD invariance residual_dmd",
             "scoring": "Score score",
-            "subspace": "Invariance invariance",
         },
     )

@@ -1,32 +1,36 @@
-"""Split-conformal prediction bands: |x_{k+h} − x̂_{k+h}| ≤ q s_h for all states and steps at once, nine times in ten."""
+"""Split-conformal bands |x_{k+h} − x̂_{k+h}| ≤ q s_h, and one forecast with its band beside what happened."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
-from koopmpc.validate.scoring import Predictor, comparable, forecast_errors, score
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.validate.scoring import AnyPredictor, Score, comparable, forecast_errors, score
 from koopmpc.values import Value
 
-_SCALED = 0.25  # share of the episodes that the scale is taken from
+Rng = np.random.Generator | int
+
+_SCALED = 0.25  # share of the episodes that give the scale
 _NORMAL = 1.959964  # two-sided 95 % of a normal law
 
 
 @dataclass(frozen=True, eq=False)
 class Covered(Value):
-    """How many forecasts lay in a band throughout.
+    """How many forecasts lay in a band at all of their steps.
 
     Attributes
     ----------
     share
-        Of the episodes.
+        Share of the episodes whose forecast did.
     low, high
-        Wilson's 95 % interval of it.
+        Wilson's 95 % interval of that share.
     episodes
-        How many, one forecast each.
+        Number of episodes, with one forecast each.
     """
 
     share: float
@@ -52,7 +56,7 @@ class ConformalBand(Value):
     level
         1 − α.
     episodes
-        n, those of the calibration.
+        n, the number of calibration episodes.
     relift
         The forecasts lift x̂ anew at every step.
     states
@@ -77,7 +81,7 @@ class ConformalBand(Value):
         """Calibration episodes from which the band is finite: 9 for 90 %."""
         return int(np.ceil(self.level / (1 - self.level) - 1e-9))
 
-    def measured(self, predictor: Predictor, episodes: Episodes, *, rng: np.random.Generator | int = 0) -> Covered:
+    def measured(self, predictor: AnyPredictor, episodes: Episodes, *, rng: Rng = 0) -> Covered:
         """Return the share of these episodes whose forecast, from one random start each, stays in the band."""
         n = len(episodes)
         inside = self._scores(predictor, episodes, rng) <= self.quantile
@@ -85,18 +89,14 @@ class ConformalBand(Value):
         middle, reach = (p + w / 2) / (1 + w), np.sqrt(w * (p * (1 - p) + w / 4)) / (1 + w)
         return Covered(p, float(max(middle - reach, 0.0)), float(min(middle + reach, 1.0)), n)
 
-    def recalibrated(
-        self, predictor: Predictor, episodes: Episodes, *, rng: np.random.Generator | int = 0
-    ) -> "ConformalBand":
+    def recalibrated(self, predictor: AnyPredictor, episodes: Episodes, *, rng: Rng = 0) -> "ConformalBand":
         """Return the band of the same scale whose q comes from these episodes: its promise holds for their law."""
         scores = np.sort(self._scores(predictor, episodes, rng))
         rank = int(np.ceil((len(scores) + 1) * self.level - 1e-9))
         quantile = float(scores[rank - 1]) if rank <= len(scores) else np.inf
         return replace(self, quantile=quantile, episodes=len(scores))
 
-    def _scores(
-        self, predictor: Predictor, episodes: Episodes, rng: np.random.Generator | int
-    ) -> Float[np.ndarray, " n"]:
+    def _scores(self, predictor: AnyPredictor, episodes: Episodes, rng: Rng) -> Float[np.ndarray, " n"]:
         """Return max over h and states of |x − x̂| / s, one forecast an episode."""
         horizon, source = len(self.scale), checks.generator(rng)
         points = comparable(predictor, episodes, horizon)
@@ -107,13 +107,13 @@ class ConformalBand(Value):
 
 
 def conformal(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     episodes: Episodes,
     horizon: int,
     *,
     level: float = 0.9,
     relift: bool = False,
-    rng: np.random.Generator | int = 0,
+    rng: Rng = 0,
 ) -> ConformalBand:
     """Return the band x̂_{k+h} ± q s_h that holds a whole forecast with probability ≥ level, whatever the law.
 
@@ -164,3 +164,133 @@ def conformal(
     floor = np.maximum(np.finfo(float).eps * size, np.finfo(float).tiny)  # a perfect model has no error to scale by
     unset = ConformalBand(np.maximum(scale, floor), np.inf, level, len(calibration), relift, predictor.states)
     return unset.recalibrated(predictor, calibration, rng=source)
+
+
+Bands = ConformalBand | Score | ArrayLike
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast(Value):
+    """The prediction x̂_{k+h} of x_{k+h} from x_k and u_k … u_{k+h−1}, h = 0 … horizon.
+
+    Attributes
+    ----------
+    U
+        (T, nu) inputs as applied.
+    truth, predicted
+        (T+1, nx), row 0 is x_k; a prediction that leaves the finite numbers is NaN from there on.
+    low, high
+        (T+1, nx) ends of the band, at the prediction where there is none.
+    band
+        What the band is, in words; empty where there is none.
+    dt, states, inputs
+        Sample time [s] and names of the predictor.
+    """
+
+    U: Float[np.ndarray, "T nu"]
+    truth: Float[np.ndarray, "T+1 nx"]
+    predicted: Float[np.ndarray, "T+1 nx"]
+    low: Float[np.ndarray, "T+1 nx"]
+    high: Float[np.ndarray, "T+1 nx"]
+    band: str
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+    @property
+    def time(self) -> Float[np.ndarray, " T1"]:
+        """Time ahead of every row [s]."""
+        return np.arange(len(self.truth)) * self.dt
+
+
+def forecast(
+    predictor: AnyPredictor,
+    episode: Episode,
+    horizon: int | None = None,
+    *,
+    bands: Bands | None = None,
+    start: int = 0,
+    relift: bool = False,
+) -> Forecast:
+    """Return x̂_{k+h} for h = 0 … horizon beside the episode's x_{k+h}.
+
+    Parameters
+    ----------
+    predictor
+        A model of the states and inputs of the episode.
+    episode
+        An episode, best one that is not of the fit.
+    horizon
+        Steps ahead; to the end of the episode by default.
+    bands
+        A conformal band, a score (its 5 and 95 % quantiles of the error), or half-widths (horizon, nx) in the
+        state's unit; for the horizon or longer.
+    start
+        k; with an embedding counted from the first moment whose past is known.
+    relift
+        Predict by the map of `step_map`, which lifts x̂ anew at every step.
+
+    Raises
+    ------
+    ShapeError
+        The episode, or the bands, do not fit the predictor.
+    DataError
+        The episode ends before the horizon; the conformal band is for predictions that are lifted otherwise.
+    """
+    nx, nu = episode.X.shape[1], episode.U.shape[1]
+    if (nx, nu) != (predictor.nx, predictor.nu):
+        raise ShapeError(
+            f"the episode has {nx} states and {nu} inputs, the predictor {predictor.nx} and {predictor.nu}; "
+            "pass an episode of the same plant"
+        )
+    start = checks.count(start, "start", least=0)
+    if predictor.embedding is not None:
+        episode = predictor.embed(Episodes([episode], predictor.dt, predictor.states, predictor.inputs))[0]
+    left = len(episode) - start
+    steps = checks.count(left if horizon is None else horizon, "horizon")
+    if steps > left:
+        raise DataError(
+            f"the episode has {left} steps from step {start} on, the horizon is {steps}; shorten the horizon"
+        )
+    U, x, W = episode.U[start : start + steps], episode.X[start], episode.W[start : start + steps]
+    with np.errstate(over="ignore", invalid="ignore"):
+        if relift:
+            predicted = predictor.step_map().rollout(x, U)[:, :nx]
+        else:
+            known = (W,) if isinstance(predictor, LinearPredictor) and predictor.nw else ()
+            predicted = predictor.rollout(x, U, *known)
+    lost = ~np.logical_and.accumulate(np.isfinite(predicted).all(axis=1))
+    predicted[lost] = np.nan
+    below, above, words = _offsets(bands, steps, nx, relift)
+    truth = episode.X[start : start + steps + 1, :nx]
+    U, truth, predicted = map(np.ascontiguousarray, (U, truth, predicted))
+    low, high = predicted + below, predicted + above
+    return Forecast(U, truth, predicted, low, high, words, predictor.dt, predictor.states, predictor.inputs)
+
+
+def _offsets(bands: Bands | None, steps: int, nx: int, relift: bool) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return how far the band reaches below and above the prediction, in rows h = 0 … steps, and what the band is."""
+    if bands is None:
+        return np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx)), ""
+    if isinstance(bands, ConformalBand):
+        if bands.relift != relift:
+            raise DataError(
+                f"the band is for predictions with relift={bands.relift}; pass relift={bands.relift} here too"
+            )
+        below, above = -bands.width, bands.width
+        finite = "" if np.isfinite(bands.quantile) else f", infinite: calibrate on {bands.needed} episodes"
+        words = f"{100 * bands.level:g} % conformal band{finite}"
+    elif isinstance(bands, Score):
+        below, above, words = bands.low, bands.high, "5 to 95 % of the errors"
+    else:
+        above = checks.array(bands, "bands", (None, nx), infinite=True, finite=False)
+        if (above < 0).any():
+            raise DataError(f"bands holds {above.min():g}; half-widths are 0 or above")
+        below, words = -above, "band"
+    if len(above) < steps or above.shape[1] != nx:
+        raise ShapeError(
+            f"bands has {len(above)} rows of {above.shape[1]}, expected {steps} of {nx}; "
+            "make it for the horizon, or shorten that"
+        )
+    zero = np.zeros((1, nx))
+    return np.vstack([zero, below[:steps]]), np.vstack([zero, above[:steps]]), words

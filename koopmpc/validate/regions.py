@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import short
+from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
 _SAID = 0.05  # share of the pair's box from which an empty rectangle is worth a sentence
@@ -29,7 +29,7 @@ class Region(Value):
     low, high
         (2,) its corners; infinite where it reaches the edge of the box that was looked at.
     share
-        Of the area of that box.
+        Share of the area of that box.
     """
 
     names: tuple[str, str]
@@ -38,12 +38,10 @@ class Region(Value):
     share: float
 
     def __str__(self) -> str:
-        """Return e.g. ``"theta in [1.2, 2.1] with omega > 3 was never visited"``."""
-        parts = [
-            _interval(short(name), float(low), float(high))
-            for name, low, high in zip(self.names, self.low, self.high, strict=True)
-        ]
-        return f"{' with '.join(part for part in parts if part)} was never visited"
+        """Return e.g. ``"theta in [1.2, 2.1] rad with omega > 3 rad/s was never visited"``."""
+        ends = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
+        parts = [quantity(name, _interval(low, high)) for name, low, high in ends if np.isfinite([low, high]).any()]
+        return f"{' with '.join(parts)} was never visited"
 
 
 def empty_regions(
@@ -81,12 +79,10 @@ def _edges(first: int, last: int, bins: int, low: float, high: float) -> tuple[f
     return (-np.inf if first == 0 else low + first * width), (np.inf if last == bins else low + last * width)
 
 
-def _interval(name: str, low: float, high: float) -> str:
-    if np.isinf(low) and np.isinf(high):
-        return ""
+def _interval(low: float, high: float) -> str:
     if np.isinf(high):
-        return f"{name} > {low:.3g}"
-    return f"{name} < {high:.3g}" if np.isinf(low) else f"{name} in [{low:.3g}, {high:.3g}]"
+        return f"> {low:.3g}"
+    return f"< {high:.3g}" if np.isinf(low) else f"in [{low:.3g}, {high:.3g}]"
 
 
 _ROWS = 4096  # samples that are binned at once
@@ -104,7 +100,7 @@ class Coverage(Value):
     names
         States, then inputs.
     nx
-        How many are states.
+        Number of states.
     low, high
         (n,) the box that is looked at: the range of the data, wider where asked for.
     seen_low, seen_high
@@ -115,7 +111,7 @@ class Coverage(Value):
         (n(n−1)/2, bins, bins) samples in each cell of each pair of coordinates, in the order (0, 1), (0, 2), …;
         none for more than 40 coordinates.
     samples
-        M.
+        M, the number of samples.
     """
 
     names: tuple[str, ...]
@@ -130,7 +126,7 @@ class Coverage(Value):
 
     @property
     def bins(self) -> int:
-        """Bins of a coordinate."""
+        """Number of bins of each coordinate."""
         return self.counts.shape[1]
 
     @property
@@ -221,7 +217,8 @@ def coverage(
         (nx + nu,) the box in which the model will be used, infinite where there is none; where the data reach
         beyond it, their range counts. By default the range of the data.
     bins
-        Of each coordinate; by default 10, fewer where a cell of a pair would hold fewer than 10 samples on average.
+        Number of bins of each coordinate; by default 10, or fewer where a cell of a pair would hold fewer than 10
+        samples on average.
 
     Raises
     ------

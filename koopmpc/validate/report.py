@@ -1,28 +1,29 @@
-"""Whether to trust a predictor: all checks on held-out episodes in one call and one report."""
+"""Whether to trust a predictor: all checks on held-out episodes in one call, and the report of them."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from rich.table import Table
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
-from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import second_moments
+from koopmpc.lifting.base import short
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.bands import conformal
-from koopmpc.validate.excitation import feedback_share, persistency
+from koopmpc.validate.identifiability import explained_inputs, persistency
 from koopmpc.validate.regions import Coverage, coverage
-from koopmpc.validate.residuals import residual_dmd
-from koopmpc.validate.scoring import Predictor, score
-from koopmpc.validate.subspace import invariance
-from koopmpc.validate.text import written
+from koopmpc.validate.residuals import eigen_residuals, moments_of, proximity_of
+from koopmpc.validate.scoring import AnyPredictor, score
+from koopmpc.validate.text import labelled, observable, percent, quantity, table, written
 from koopmpc.validate.verdict import Evidence, Finding, findings
 
-_ORDER = 20  # persistency of excitation is looked at up to here
+_ORDER = 20  # persistency of excitation is looked at up to this order
+_REGIONS = 3  # empty regions that are named
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +45,11 @@ class TrustReport(Evidence):
 
     def __str__(self) -> str:
         """Return the report: verdict, what to do, evidence."""
-        return written(self, self.findings)
+        return _layout(self)
 
 
 def trust(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     held_out: Episodes,
     horizon: int,
     *,
@@ -106,22 +107,22 @@ def trust(
     if len(held_out) < 2:
         raise DataError("there is 1 held-out episode; the conformal band needs 2 or more")
     band = conformal(predictor, held_out, horizon, level=level, rng=source)
-    total = _moments(predictor, held_out)
+    total = moments_of(held_out, predictor)
     fitted = held_out if train is None else train
     low, high = _range(held_out)
     seen = coverage(fitted) if train is None else coverage(fitted, low=low, high=high)
-    total_fitted = total if train is None else _moments(predictor, train)
+    total_fitted = total if train is None else moments_of(train, predictor)
     driven = fitted if isinstance(predictor, BilinearPredictor) else fitted.driven()
     order = min(_ORDER, max(len(episode) for episode in driven))
     return TrustReport(
         score=errors,
         holding=score(_hold(predictor), held_out, horizon),
         spread=(high - low)[: predictor.nx],
-        residuals=residual_dmd(predictor, total),
-        invariance=invariance(total),
+        residuals=eigen_residuals(predictor, total),
+        invariance=proximity_of(total),
         coverage=seen,
         persistency=persistency(driven, order) if driven.nu else None,
-        feedback=feedback_share(total_fitted) if driven.nu else None,
+        feedback=explained_inputs(total_fitted) if driven.nu else None,
         band=band,
         train_score=None if train is None else score(predictor, train, horizon),
         unseen=None if train is None else _unseen(seen, held_out),
@@ -133,15 +134,7 @@ def trust(
     )
 
 
-def _moments(predictor: Predictor, episodes: Episodes) -> Moments:
-    """Return the moments of these episodes in the predictor's lifting, by QR: residuals down to rounding."""
-    if isinstance(predictor, BilinearPredictor):
-        return second_moments(episodes, predictor.lifting, embedding=predictor.embedding, route="qr", bilinear=True)
-    driven = episodes.driven() if predictor.nw else episodes
-    return second_moments(driven, predictor.lifting, embedding=predictor.embedding, route="qr")
-
-
-def _hold(predictor: Predictor) -> LinearPredictor:
+def _hold(predictor: AnyPredictor) -> LinearPredictor:
     """Return x̂_{k+h} = x_k."""
     nx, nu = predictor.nx, predictor.nu
     return LinearPredictor(
@@ -159,3 +152,114 @@ def _range(episodes: Episodes) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
 def _unseen(seen: Coverage, episodes: Episodes) -> float:
     missed = [np.sum(~seen.seen(episode.X[:-1], episode.U)) for episode in episodes]
     return float(sum(missed) / sum(len(episode) for episode in episodes))
+
+
+def _layout(report: TrustReport) -> str:
+    """Return the verdict, each finding with what to do about it, and the evidence."""
+    return written(
+        _verdict(report),
+        labelled(
+            pair
+            for finding in report.findings
+            for pair in (("✗" if finding.grave else "!", finding.says), ("", f"→ {finding.do}"))
+        ),
+        "",
+        f"Errors x − x̂ of {report.score.starts} forecasts of held-out episodes. Of the 5 % and 95 % quantiles the one "
+        "of larger size is also shown as a share of the range of the state. The last column divides the RMSE by that "
+        "of the guess that nothing changes, x̂ = x_k.",
+        "",
+        _errors(report),
+        "",
+        labelled(_evidence(report)),
+    )
+
+
+def _verdict(report: TrustReport) -> str:
+    horizon, steps, dt = report.score.horizon, report.steps, report.dt
+    if steps == 0:
+        return f"DO NOT TRUST, not even for one step ({dt:g} s)"
+    if steps < horizon:
+        return f"DO NOT TRUST beyond {steps} of {horizon} steps ({steps * dt:.3g} s)"
+    care = " WITH CARE" if report.findings else ""
+    return f"TRUST{care} over {horizon} steps ({horizon * dt:.3g} s)"
+
+
+def _errors(report: TrustReport) -> Table:
+    """Return the errors of each state at a few horizons."""
+    of = report.score
+    ahead = sorted({1, max(of.horizon // 4, 1), max(of.horizon // 2, 1), of.horizon})
+    rows: list[list[str]] = []
+    for i, name in enumerate(of.states):
+        for h in ahead:
+            still = report.holding.rmse[h - 1, i]
+            numbers = (of.rmse[h - 1, i], of.low[h - 1, i], of.high[h - 1, i])
+            ratio = f"{numbers[0] / still:.2g}" if still > 0 else "–"
+            share = percent(report.error[h - 1, i])
+            rows.append([name if h == ahead[0] else "", str(h), *(f"{v:.3g}" for v in numbers), share, ratio])
+    return table(
+        (
+            "state",
+            "steps\nahead",
+            "RMSE",
+            "5 %\nquantile",
+            "95 %\nquantile",
+            "share of\nrange",
+            "RMSE over\nno change",
+        ),
+        rows,
+    )
+
+
+def _evidence(report: TrustReport) -> Iterator[tuple[str, str]]:
+    """Yield label and text of each line below the table."""
+    pairs, dictionary, seen = report.residuals, report.invariance, report.coverage
+    yield (
+        "spectrum",
+        f"{int(pairs.spurious.sum())} of {len(pairs.residuals)} eigenpairs are spurious (residual above "
+        f"{percent(pairs.tolerance)} a step), the median residual is {percent(float(np.median(pairs.residuals)))}; "
+        f"the spectral radius is {report.radius:.4g}",
+    )
+    worst = int(np.argmax(dictionary.errors))
+    yield (
+        "dictionary",
+        f"the observable with the largest error after one step is {observable(dictionary.names[worst])}, with "
+        f"{percent(dictionary.errors[worst])} of its size; the combination of observables with the largest has "
+        f"{percent(dictionary.proximity)}",
+    )
+    fill = seen.occupied
+    whose = "held-out" if report.train_score is None else "training"
+    filled = f"{percent(fill.min())} of the {seen.bins} bins of {short(seen.names[int(fill.argmin())])}, the fewest"
+    if fill.min() == 1:
+        filled = f"all {seen.bins} bins of each coordinate"
+    text = f"{seen.samples} {whose} samples fill {filled}"
+    if report.unseen is not None:
+        text += f"; {percent(report.unseen)} of the held-out samples lie where there are no training samples"
+    yield "coverage", text
+    for region in seen.empty[:_REGIONS]:
+        yield "", f"{region} ({percent(region.share)} of the area)"
+    if report.persistency is not None and report.feedback is not None:
+        order, asked = report.persistency.order, report.persistency.asked
+        shares = ", ".join(
+            f"{percent(share)} of {short(name)}" for name, share in zip(report.inputs, report.feedback, strict=True)
+        )
+        yield (
+            "inputs",
+            f"persistently exciting of order {order}{' or more' if order == asked else ''}; the observables explain "
+            f"{shares}",
+        )
+    band = report.band
+    widths = ", ".join(quantity(name, f"± {w:.3g}") for name, w in zip(band.states, band.width[-1], strict=True))
+    yield (
+        "band",
+        f"{percent(band.level)} of forecasts stay within a band at all of their steps, at the last one {widths}; "
+        f"calibrated on {band.episodes} episodes, and promised for inputs of the same distribution only",
+    )
+    loop, again = report.closed_loop, report.recalibrated
+    if loop is not None and again is not None:
+        text = (
+            f"{percent(loop.share)} of {loop.episodes} forecasts stay in that band "
+            f"(95 % interval {percent(loop.low)} to {percent(loop.high)})"
+        )
+        if np.isfinite(band.quantile):
+            text += f"; calibrated on them it is {again.quantile / band.quantile:.3g} times as wide"
+        yield "closed loop", text

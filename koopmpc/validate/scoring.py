@@ -14,7 +14,7 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.predict.spectrum import same_names
 from koopmpc.values import Value
 
-Predictor = LinearPredictor | BilinearPredictor
+AnyPredictor = LinearPredictor | BilinearPredictor
 
 _STARTS = 4096  # starts that are rolled out at once
 _FORECAST = 2**22  # numbers of one block of forecasts, 32 MB
@@ -62,7 +62,7 @@ class Score(Value):
         return float(np.sqrt(np.mean(self.relative**2)))
 
 
-def score(predictor: Predictor, episodes: Episodes, horizon: int, *, stride: int = 1, relift: bool = False) -> Score:
+def score(predictor: AnyPredictor, episodes: Episodes, horizon: int, *, stride: int = 1, relift: bool = False) -> Score:
     """Return the errors of x̂_{k+h} = C z_h, z_{i+1} = A z_i + B u_{k+i} + E w_{k+i}, z_0 = ψ(x_k), h = 1 … horizon.
 
     A bilinear predictor adds Σ uⱼ Nⱼ z_i. A prediction that leaves the finite numbers has an infinite error.
@@ -114,7 +114,7 @@ def score(predictor: Predictor, episodes: Episodes, horizon: int, *, stride: int
     return Score(rmse, relative, starts, predictor.states, low, median, high)
 
 
-def comparable(predictor: Predictor, episodes: Episodes, horizon: int) -> Episodes:
+def comparable(predictor: AnyPredictor, episodes: Episodes, horizon: int) -> Episodes:
     """Return the episodes of what ψ acts on; raise where one is too short for `horizon` steps from any start."""
     same_names(predictor, episodes)
     points = predictor.embed(episodes)
@@ -129,7 +129,7 @@ def comparable(predictor: Predictor, episodes: Episodes, horizon: int) -> Episod
 
 
 def forecast_errors(
-    predictor: Predictor,
+    predictor: AnyPredictor,
     points: Episodes,
     starts: Sequence[Int[np.ndarray, "_"]],
     horizon: int,

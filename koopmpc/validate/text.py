@@ -1,129 +1,64 @@
-"""A trust report as an engineer reads it in a terminal."""
+"""How reports are written: tables, labelled lines and paragraphs in 100 columns, laid out by rich."""
 
-import textwrap
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+from io import StringIO
 
-import numpy as np
+from rich import box
+from rich.console import Console, RenderableType
+from rich.table import Table
 
-from koopmpc.validate.regions import Region
-from koopmpc.validate.verdict import Evidence, Finding, percent, shown
-
-_WIDTH = 100
-_LABEL = 13  # columns of the labels
-_REGIONS = 3  # empty regions that are named
-
-
-def written(evidence: Evidence, found: Sequence[Finding]) -> str:
-    """Return the verdict, the findings each with what to do, and the evidence."""
-    lines = [_verdict(evidence, found)]
-    for finding in found:
-        lines += _wrapped(finding.says, "  ✗ " if finding.grave else "  ! ")
-        lines += _wrapped(finding.do, "    → ")
-    lines += ["", *_errors(evidence), ""]
-    for label, text in _checks(evidence):
-        lines += _wrapped(text, f"{label:<{_LABEL}}")
-    return "\n".join(lines)
+WIDTH = 100  # columns of a report
+_LONG = 32  # characters of an observable's name in a sentence
+_SCALED = re.compile(r"~[0-9a-f]{8}")  # how names tell one standardization from another
 
 
-def _verdict(evidence: Evidence, found: Sequence[Finding]) -> str:
-    horizon, steps, dt = evidence.score.horizon, evidence.steps, evidence.dt
-    if steps == 0:
-        return f"DO NOT TRUST, not even for one step ({dt:g} s)"
-    if steps < horizon:
-        return f"DO NOT TRUST beyond {steps} of {horizon} steps ({steps * dt:.3g} s)"
-    care = " WITH CARE" if found else ""
-    return f"TRUST{care} over {horizon} steps ({horizon * dt:.3g} s)"
-
-
-def _errors(evidence: Evidence) -> list[str]:
-    """Return a table of the errors at a few horizons."""
-    of = evidence.score
-    shown = sorted({1, max(of.horizon // 4, 1), max(of.horizon // 2, 1), of.horizon})
-    name_width = max(5, *map(len, of.states)) + 1
-    lines = [
-        f"errors x − x̂ of {of.starts} held-out forecasts, with their 5 and 95 % quantiles; the larger as a share",
-        "of the state's range; RMSE over that of x̂ = x_k, which needs no model",
-        f"{'state':<{name_width}}{'step':>5}{'RMSE':>10}{'5 %':>11}{'95 %':>11}{'of range':>10}{'/ hold':>9}",
-    ]
-    for i, name in enumerate(of.states):
-        for h in shown:
-            hold = evidence.holding.rmse[h - 1, i]
-            ratio = f"{of.rmse[h - 1, i] / hold:.2g}" if hold > 0 else "-"
-            lines.append(
-                f"{name if h == shown[0] else '':<{name_width}}{h:>5}{of.rmse[h - 1, i]:>10.3g}"
-                f"{of.low[h - 1, i]:>11.3g}{of.high[h - 1, i]:>11.3g}{percent(evidence.error[h - 1, i]):>10}{ratio:>9}"
-            )
-    return lines
-
-
-def _checks(evidence: Evidence) -> list[tuple[str, str]]:
-    """Return label and text of each line below the table."""
-    pairs = [_spectrum(evidence), _dictionary(evidence), _coverage(evidence)]
-    pairs += [("", f"{region} ({percent(region.share)} of their box)") for region in _regions(evidence)]
-    if evidence.persistency is not None and evidence.feedback is not None:
-        order, asked = evidence.persistency.order, evidence.persistency.asked
-        told = ", ".join(
-            f"{percent(share)} of {name}" for name, share in zip(evidence.inputs, evidence.feedback, strict=True)
-        )
-        more = " or more" if order == asked else ""
-        pairs.append(("inputs", f"exciting to order {order}{more}; ψ(x) explains {told}"))
-    return [*pairs, _band(evidence), *_closed_loop(evidence)]
-
-
-def _spectrum(evidence: Evidence) -> tuple[str, str]:
-    of = evidence.residuals
-    return "spectrum", (
-        f"{int(of.spurious.sum())} of {len(of.residuals)} eigenpairs spurious, median residual "
-        f"{percent(float(np.median(of.residuals)))} a step; spectral radius {evidence.radius:.4g}"
+def written(*parts: RenderableType) -> str:
+    """Return the parts below one another as plain text: no colours, no blanks at the ends of lines."""
+    stream = StringIO()
+    console = Console(
+        file=stream, width=WIDTH, color_system=None, markup=False, emoji=False, highlight=False, legacy_windows=False
     )
+    console.print(*parts, sep="\n")
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()).rstrip()
 
 
-def _dictionary(evidence: Evidence) -> tuple[str, str]:
-    of = evidence.invariance
-    worst = int(np.argmax(of.errors))
-    return "dictionary", (
-        f"worst observable {shown(of.names[worst])}, off by {percent(of.errors[worst])} in a step; "
-        f"worst function in its span {percent(of.proximity)}"
-    )
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> Table:
+    """Return a table whose first `left` columns hold words, and the others numbers; a heading may have two lines."""
+    made = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), pad_edge=False)
+    for i, heading in enumerate(headings):
+        made.add_column(heading, justify="left" if i < left else "right", no_wrap=True, vertical="bottom")
+    for row in rows:
+        made.add_row(*row)
+    return made
 
 
-def _coverage(evidence: Evidence) -> tuple[str, str]:
-    of = evidence.coverage
-    whose = "held-out" if evidence.train_score is None else "training"
-    least = int(np.argmin(of.occupied))
-    text = f"{of.samples} {whose} samples in {of.bins} bins each; fewest held: {percent(of.occupied[least])} of "
-    text += of.names[least]
-    if evidence.unseen is not None:
-        text += f"; {percent(evidence.unseen)} of the held-out samples lie where these never were"
-    return "coverage", text
+def labelled(pairs: Iterable[tuple[str, str]], indent: int = 0) -> Table:
+    """Return lines of text, each behind its label and broken beside it; an empty label continues the one before."""
+    made = Table.grid(padding=(0, 2, 0, 0), pad_edge=False)
+    made.add_column(no_wrap=True)
+    made.add_column()
+    for label, text in pairs:
+        made.add_row(" " * indent + label, text)
+    return made
 
 
-def _regions(evidence: Evidence) -> tuple[Region, ...]:
-    return evidence.coverage.empty[:_REGIONS]
+def percent(share: float) -> str:
+    """Return 0.123 as "12 %"."""
+    value = 100 * float(share)
+    if not value <= 1000:
+        return "> 1000 %"
+    return f"{value:.0f} %" if value >= 10 or value == round(value) else f"{value:.2g} %"
 
 
-def _band(evidence: Evidence) -> tuple[str, str]:
-    band = evidence.band
-    widths = ", ".join(f"{name} ± {w:.3g}" for name, w in zip(band.states, band.width[-1], strict=True))
-    return "band", (
-        f"{percent(band.level)} of whole forecasts stay within a band, at its last step {widths} "
-        f"({band.episodes} episodes); promised for inputs of the same law alone"
-    )
+def observable(name: str) -> str:
+    """Return an observable's name for a sentence: standardized states said in words, a long name cut in its middle."""
+    plain, scaled = _SCALED.subn("", name)
+    short = plain if len(plain) <= _LONG else f"{plain[: _LONG // 2]}…{plain[-_LONG // 2 + 1 :]}"
+    return f"{short} of the standardized states" if scaled else short
 
 
-def _closed_loop(evidence: Evidence) -> list[tuple[str, str]]:
-    loop, again = evidence.closed_loop, evidence.recalibrated
-    if loop is None or again is None:
-        return []
-    text = (
-        f"{percent(loop.share)} of {loop.episodes} forecasts stay in that band "
-        f"(95 % interval {percent(loop.low)} to {percent(loop.high)})"
-    )
-    if np.isfinite(evidence.band.quantile):
-        text += f"; calibrated on them it is {again.quantile / evidence.band.quantile:.3g} times as wide"
-    return [("closed loop", text)]
-
-
-def _wrapped(text: str, label: str) -> list[str]:
-    """Return `label` and beside it the text, broken at spaces to a terminal's width."""
-    return textwrap.wrap(text, _WIDTH, initial_indent=label, subsequent_indent=" " * len(label))
+def quantity(name: str, value: str) -> str:
+    """Return a value with the unit of a state or input: of ``"theta [rad]"`` and "± 1" it is "theta ± 1 rad"."""
+    short, bracket, unit = name.partition(" [")
+    return f"{short} {value} {unit.rstrip(']')}" if bracket else f"{short} {value}"

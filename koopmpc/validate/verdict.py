@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.lifting.base import short
 from koopmpc.validate.bands import ConformalBand, Covered
-from koopmpc.validate.excitation import Persistency
+from koopmpc.validate.identifiability import Persistency
 from koopmpc.validate.regions import Coverage
-from koopmpc.validate.residuals import ResidualDMD
+from koopmpc.validate.residuals import Invariance, ResidualDMD
 from koopmpc.validate.scoring import Score
-from koopmpc.validate.subspace import Invariance
+from koopmpc.validate.text import observable, percent
 from koopmpc.values import Value
 
 USABLE = 0.2  # share of a state's range beyond which the band of its errors is of no use
@@ -30,11 +31,12 @@ class Evidence(Value):
     residuals
         Residual of each eigenpair on the held-out episodes; for a linear predictor the same as `linearity_error`.
     invariance
-        Of the dictionary, on the held-out episodes.
+        Invariance of the dictionary on the held-out episodes.
     coverage
-        Of the training episodes where they were given, else of those held out.
+        Where the training episodes lie, or the held-out episodes where no training episodes were given.
     persistency, feedback
-        Of the inputs, on the same episodes as `coverage`; None without inputs.
+        Excitation of the inputs, and the share of them that ψ(x) explains, on the same episodes as `coverage`; None
+        without inputs.
     band
         Conformal band of the held-out episodes.
     train_score, unseen
@@ -48,7 +50,7 @@ class Evidence(Value):
     dt
         Sampling time [s].
     inputs
-        Those that `feedback` is about.
+        Names of the inputs that `feedback` is about.
     """
 
     score: Score
@@ -93,7 +95,6 @@ _UNSEEN = 0.05  # share of the held-out samples
 _GROWS = 2.0  # of a spurious eigenfunction over the horizon
 _EXPLAINED = 0.9  # share of an input's energy
 _NAMED = 3  # names in a sentence
-_LONG = 32  # characters of a name in a sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ class Finding(Value):
     Attributes
     ----------
     grave
-        It forbids the horizon; else it asks for care.
+        True where the model cannot be trusted over the whole horizon; False where care is needed.
     says
         What is wrong, with the number.
     do
@@ -128,10 +129,10 @@ def _errors(evidence: Evidence) -> list[Finding]:
         return []
     state = int(np.argmin(evidence.usable))
     name, there = evidence.score.states[state], evidence.error[:, state]
-    far = f"{percent(there[steps])} of its range at step {steps + 1}, {percent(there[-1])} at step {horizon}"
-    says = f"the 5 … 95 % band of the errors of {name} reaches {far}"
+    far = f"{percent(there[steps])} of its range at step {steps + 1} and {percent(there[-1])} at step {horizon}"
+    says = f"the errors of {short(name)} reach {far} (5 % and 95 % quantiles)"
     if there[steps] <= USABLE:
-        says += ", and holding its value predicts no worse"
+        says += ", and the guess that nothing changes is no worse"
     if evidence.unseen is not None and evidence.unseen > _UNSEEN:
         do = "collect data where the model will be used"
     elif _overfit(evidence):
@@ -151,14 +152,14 @@ def _spectrum(evidence: Evidence) -> list[Finding]:
         growth = np.abs(of.eigenvalues) ** evidence.score.horizon
     growing = bad & (growth > _GROWS)
     worst = int(np.argmax(np.where(growing, growth, 0.0) if growing.any() else of.residuals))
-    told = f"λ = {_complex(complex(of.eigenvalues[worst]))} with residual {percent(float(of.residuals[worst]))}"
+    told = f"λ = {_complex(complex(of.eigenvalues[worst]))} (residual {percent(float(of.residuals[worst]))})"
     says = f"{int(bad.sum())} of {len(bad)} eigenpairs are spurious (residual above {percent(of.tolerance)} a step)"
     if growing.any():
         n = int(growing.sum())
-        says += f", and {n} of them grow{'s' * (n == 1)}: {told} by {growth[worst]:.2g} over the horizon"
+        says += f", and {n} of them grow{'s' * (n == 1)}: {told} grows {growth[worst]:.2g}-fold over the horizon"
         return [Finding(False, says, "drop observables, raise the ridge, or truncate the rank")]
     do = "read no modes or frequencies from these; predictions may still be good"
-    return [Finding(False, f"{says}, the worst {told}", do)]
+    return [Finding(False, f"{says}; the worst is {told}", do)]
 
 
 def _dictionary(evidence: Evidence) -> list[Finding]:
@@ -167,7 +168,9 @@ def _dictionary(evidence: Evidence) -> list[Finding]:
     if not bad.size:
         return []
     worst = bad[np.argsort(-errors[bad], kind="stable")]
-    names = ", ".join(f"{shown(evidence.invariance.names[int(i)])} {percent(float(errors[i]))}" for i in worst[:_NAMED])
+    names = ", ".join(
+        f"{observable(evidence.invariance.names[int(i)])} {percent(float(errors[i]))}" for i in worst[:_NAMED]
+    )
     says = (
         f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "
         f"more than {percent(_INVARIANT)} of its size ({names}{', …' if bad.size > _NAMED else ''})"
@@ -206,18 +209,20 @@ def _inputs(evidence: Evidence) -> list[Finding]:
         found.append(
             Finding(
                 False,
-                f"the inputs excite to order {evidence.persistency.order} only: B cannot be told apart",
+                f"the inputs are exciting to order {evidence.persistency.order} only, so B cannot be identified",
                 "excite every input, with noise or PRBS",
             )
         )
     if evidence.feedback is not None:
         bad = np.flatnonzero(evidence.feedback > _EXPLAINED)
-        names = ", ".join(f"{evidence.inputs[int(i)]} {percent(float(evidence.feedback[i]))}" for i in bad[:_NAMED])
+        names = ", ".join(
+            f"{percent(float(evidence.feedback[i]))} of {short(evidence.inputs[int(i)])}" for i in bad[:_NAMED]
+        )
         if bad.size:
             found.append(
                 Finding(
                     False,
-                    f"feedback: ψ(x) explains most of the inputs ({names}), so A and B are hard to tell apart",
+                    f"feedback: the observables explain most of the inputs ({names}), so A and B are hard to separate",
                     "add noise to the inputs",
                 )
             )
@@ -233,7 +238,7 @@ def _band(evidence: Evidence) -> list[Finding]:
     return [
         Finding(
             False,
-            f"no band at {percent(band.level)}: {band.episodes} calibration episodes, "
+            f"there is no band at {percent(band.level)}: there are {band.episodes} calibration episodes, "
             f"at least {band.needed} are needed",
             "hold out more episodes, or ask for a lower level",
         )
@@ -251,7 +256,7 @@ def _closed_loop(evidence: Evidence) -> list[Finding]:
         Finding(
             False,
             f"in closed loop {percent(loop.share)} of the forecasts stay in the {percent(band.level)} band",
-            "use the band recalibrated on closed-loop episodes, or fit with closed-loop data",
+            "use the band that is recalibrated on closed-loop episodes, or fit with closed-loop data",
         )
     ]
 
@@ -259,19 +264,6 @@ def _closed_loop(evidence: Evidence) -> list[Finding]:
 def _overfit(evidence: Evidence) -> bool:
     train = evidence.train_score
     return train is not None and evidence.score.total > max(_OVERFIT * train.total, 1e-6)
-
-
-def percent(share: float) -> str:
-    """Return 0.123 as "12 %"."""
-    value = 100 * float(share)
-    if not value <= 1000:
-        return "> 1000 %"
-    return f"{value:.0f} %" if value >= 10 or value == round(value) else f"{value:.2g} %"
-
-
-def shown(name: str) -> str:
-    """Return the name, a long one with its middle left out."""
-    return name if len(name) <= _LONG else f"{name[: _LONG // 2]}…{name[-_LONG // 2 + 1 :]}"
 
 
 def _complex(value: complex) -> str:

@@ -5,7 +5,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.figures.style import save
-from koopmpc.validate.forecast import forecast
+from koopmpc.validate.bands import forecast
 from tests.figures.models import DT, INPUTS, STATES, curve, episodes, turning
 from tests.recording.runs import make_run
 

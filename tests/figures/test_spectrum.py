@@ -71,16 +71,14 @@ def test_messages() -> None:
     with pytest.raises(
         km.errors.ShapeError, match="there are 2 residuals and 4 eigenvalues; pass the residuals of this"
     ):
-        km.plot.spectrum(_diagonal(), km.validate.residual_dmd(turning(), km.moments.second_moments(data, km.State())))
+        km.plot.spectrum(_diagonal(), km.validate.residual_dmd(turning(), data))
     with pytest.raises(km.errors.DataError, match="the residuals are those of another predictor"):
-        km.plot.spectrum(turning(0.5), km.validate.residual_dmd(turning(), km.moments.second_moments(data, km.State())))
+        km.plot.spectrum(turning(0.5), km.validate.residual_dmd(turning(), data))
 
 
 def test_residuals_of_the_trust_report_are_taken_with_their_tolerance() -> None:
     data, model = episodes(3), turning()
-    made = km.plot.spectrum(
-        model, km.validate.residual_dmd(model, km.moments.second_moments(data, km.State()), tolerance=0.2)
-    )
+    made = km.plot.spectrum(model, km.validate.residual_dmd(model, data, tolerance=0.2))
     assert made.legends[0].get_texts()[0].get_text() == "residual ≤ 0.2"
     points = _named(made.axes[0], "eigenvalues")
     drawn = np.asarray(points.get_offsets())

@@ -10,7 +10,7 @@ from koopmpc.figures.plane import eigenfunctions_on, plane_through
 from koopmpc.recording.format.columns import LogColumns, read_columns
 from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from koopmpc.recording.views.eigenvalues import circle, sequence
-from koopmpc.validate.forecast import forecast
+from koopmpc.validate.bands import forecast
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 
 DATA = episodes(24, noise=0.05)

@@ -70,16 +70,16 @@ def test_the_words_say_where() -> None:
     rows = np.vstack([rows, [[0, -5], [3, 5]]])
     hole = (rows[:, 0] > 1.2) & (rows[:, 0] < 2.1) & (rows[:, 1] > 3)
     found = km.validate.coverage(cloud(rows[~hole], NAMES))
-    assert str(found.empty[0]) == "theta in [1.2, 2.1] with omega > 3 was never visited"
+    assert str(found.empty[0]) == "theta in [1.2, 2.1] rad with omega > 3 rad/s was never visited"
     assert found.empty[0].share == pytest.approx(0.06)
     assert not found.seen([1.65, 4])
     assert found.seen([1.65, 0])
     assert found.share([1.65, 4]) == pytest.approx(2 / 3)  # theta was seen, omega too, both at once not
     gap = km.validate.coverage(cloud(rows[(rows[:, 0] < 0.9) | (rows[:, 0] > 1.8)], NAMES))
-    assert str(gap.empty[0]) == "theta in [0.9, 1.8] was never visited"
+    assert str(gap.empty[0]) == "theta in [0.9, 1.8] rad was never visited"
     assert gap.occupied[0] == pytest.approx(0.7)
     wide = km.validate.coverage(cloud(rows[:-1], NAMES), low=[0, -5], high=[6, np.inf])
-    assert str(wide.empty[0]) == "theta > 3 was never visited"
+    assert str(wide.empty[0]) == "theta > 3 rad was never visited"
     assert wide.high[0] == 6
     assert not wide.seen([4, 0])
 

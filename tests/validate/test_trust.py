@@ -139,8 +139,8 @@ def test_a_model_that_remembers_sees_what_is_not_measured() -> None:
 def test_feedback_and_weak_inputs_ask_for_care(data) -> None:
     rng = np.random.default_rng(3)
     for gain, noise, expected in (
-        (1.0, 1e-2, "feedback: ψ(x) explains most of the inputs"),
-        (0, 0, "excite to order"),
+        (1.0, 1e-2, "feedback: the observables explain most of the inputs"),
+        (0, 0, "are exciting to order"),
     ):
         runs = []
         for _ in range(30):

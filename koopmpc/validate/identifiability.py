@@ -6,11 +6,16 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments, both_sides, orthonormal
 from koopmpc.identify.solve import norms, unit
+from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import Constant
+from koopmpc.validate.residuals import moments_of
+from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
 _WINDOWS = 4096  # windows of the inputs that are held at once
@@ -18,19 +23,19 @@ _WINDOWS = 4096  # windows of the inputs that are held at once
 
 @dataclass(frozen=True, eq=False)
 class Persistency(Value):
-    """Of which order the inputs excite.
+    """The order to which the inputs are persistently exciting.
 
     Attributes
     ----------
     order
         The largest L ≤ `asked` for which the windows (u_k, …, u_{k+L−1}) of all episodes span R^(nu L).
     asked
-        As given.
+        The largest order that was looked at.
     conditions
         (asked,) condition number of the windows of each order 1 … asked, on inputs of unit norm; infinite beyond
         `order`.
     windows
-        How many of the length asked there are.
+        Number of windows of `asked` steps.
     """
 
     order: int
@@ -49,7 +54,7 @@ def persistency(episodes: Episodes, order: int) -> Persistency:
     Parameters
     ----------
     episodes
-        With inputs.
+        Episodes with inputs.
     order
         The largest L to look at.
 
@@ -95,22 +100,35 @@ def persistency(episodes: Episodes, order: int) -> Persistency:
     return Persistency(int(np.isfinite(conditions).sum()), order, conditions, windows)
 
 
-def feedback_share(total: Moments) -> Float[np.ndarray, " nu"]:
+def feedback_share(
+    episodes: Episodes | Source,
+    lifting: Lifting | AnyPredictor,
+    *,
+    embedding: Delay | None = None,
+) -> Float[np.ndarray, " nu"]:
     """Return for each input the share R² of its energy that is a linear function of ψ(x), 0 … 1.
 
-    With 1 the input was a feedback u = K ψ(x), and A and B cannot be told apart. Where ψ holds a Constant, the
-    energy is that around the mean.
+    At 1 the input was a feedback u = K ψ(x), and A and B cannot be told apart. Where ψ holds a Constant, the energy
+    is that around the mean.
 
     Parameters
     ----------
-    total
-        ``moments(episodes, lifting)``, in the order of its inputs.
+    episodes
+        Episodes with inputs, or a source of them; measured disturbances count as inputs behind u.
+    lifting
+        ψ; or a predictor, for its lifting and embedding.
+    embedding
+        What a lifting of the state and its past acts on.
     """
+    return explained_inputs(moments_of(episodes, lifting, embedding=embedding))
+
+
+def explained_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
+    """Return what `feedback_share` returns, from the moments, in the order of their inputs."""
     P, _, cut = both_sides(total)
     nz, nu = total.nz, len(total.inputs)
-    names = total.lifting.names
     one = Constant().bind(total.lifting._states).names[0]
-    constant = [i for i, name in enumerate(names) if name == one]
+    constant = [i for i, name in enumerate(total.lifting.names) if name == one]
     U = P[:, nz : nz + nu]
     around = _outside(U, P[:, constant], cut)
     left = _outside(U, P[:, :nz], cut)

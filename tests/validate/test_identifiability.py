@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.validate.identifiability import explained_inputs
 
 
 def driven(*inputs: np.ndarray) -> km.Episodes:
@@ -50,8 +51,12 @@ def test_short_episodes_count_together_and_too_few_windows_do_not_suffice() -> N
         km.validate.persistency(km.Episodes([km.Episode(X=[[1.0], [2.0]])], 0.1), 1)
 
 
-@pytest.mark.parametrize("route", ["gram", "qr"])
-def test_feedback_is_the_share_of_u_that_the_observables_explain(route) -> None:
+def from_gram_sums(data: km.Episodes, lifting: km.Lifting) -> np.ndarray:
+    return explained_inputs(km.moments.second_moments(data, lifting, route="gram"))
+
+
+@pytest.mark.parametrize("share", [from_gram_sums, km.validate.feedback_share])
+def test_feedback_is_the_share_of_u_that_the_observables_explain(share) -> None:
     rng = np.random.default_rng(3)
     runs = []
     for _ in range(30):
@@ -60,18 +65,14 @@ def test_feedback_is_the_share_of_u_that_the_observables_explain(route) -> None:
         law = 3 + X[:-1] @ [[1.0], [-2.0]]
         runs.append(km.Episode(X=X, U=np.hstack([law, law + noise, noise, 3 + 0 * noise, X[:-1, :1] ** 3])))
     data = km.Episodes(runs, 0.1)
-    found = km.validate.feedback_share(km.moments.second_moments(data, km.State() + km.Constant(), route=route))
+    found = share(data, km.State() + km.Constant())
     var = (1 + 4) / 3
     assert found[0] == pytest.approx(1, abs=1e-6)
     assert found[1] == pytest.approx(var / (var + 1 / 3), abs=0.01)
     assert found[2] < 0.01
     assert found[3] == pytest.approx(1, abs=1e-6)  # a constant input is a function of the Constant
     assert found[4] == pytest.approx(21 / 25, abs=0.01)  # correlation² of x and x³ on [−1, 1]
-    cubed = km.validate.feedback_share(
-        km.moments.second_moments(data, km.State() + km.Constant() + km.Monomials(3), route=route)
-    )
+    cubed = share(data, km.State() + km.Constant() + km.Monomials(3))
     assert cubed[4] == pytest.approx(1, abs=1e-6)
-    raw = km.validate.feedback_share(
-        km.moments.second_moments(data, km.State(), route=route)
-    )  # without a Constant the mean is energy that x lacks
+    raw = share(data, km.State())  # without a Constant the mean is energy that x lacks
     assert raw[0] == pytest.approx(var / (var + 9), abs=0.01)
