@@ -10,6 +10,7 @@ from rich.table import Table
 
 WIDTH = 100  # columns of a report
 _LONG = 32  # characters of an observable's name in a sentence
+_HEADED = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)  # also Rerun's font has this line
 _SCALED = re.compile(r"~[0-9a-f]{8}")  # how names tell one standardization from another
 
 
@@ -25,7 +26,7 @@ def written(*parts: RenderableType) -> str:
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> Table:
     """Return a table whose first `left` columns hold words, and the others numbers; a heading may have two lines."""
-    made = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), pad_edge=False)
+    made = Table(box=_HEADED, show_edge=False, padding=(0, 1, 0, 0), pad_edge=False)
     for i, heading in enumerate(headings):
         made.add_column(heading, justify="left" if i < left else "right", no_wrap=True, vertical="bottom")
     for row in rows:
