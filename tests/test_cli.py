@@ -11,8 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.bench.controllers import CONTROLLERS
-from koopmpc.bench.sweep import FAULTS
 from koopmpc.cli.app import _program, app
 from tests.bench.tiny import write
 
@@ -105,9 +103,9 @@ def test_faults_add_a_table_and_a_log_each_and_exit_with_zero(call, tmp_path):
         result = call(command, f"{write(tmp_path)}:far", "-c", "lqr", "--faults")
         assert result.exit_code == 0, result.output
         assert "tiny:far under faults" in result.stdout
-        assert all(fault in result.stdout for fault in FAULTS)
+        assert all(fault in result.stdout for fault in km.bench.FAULTS)
     for folder in folders(tmp_path):
-        assert len(list(folder.glob("*.rrd"))) == 1 + len(FAULTS)
+        assert len(list(folder.glob("*.rrd"))) == 1 + len(km.bench.FAULTS)
         log = folder / "tiny-far-lqr-nan-sensor.rrd"
         assert "tiny far lqr nan-sensor" in call("inspect", log).stdout
 
@@ -116,7 +114,7 @@ def test_a_run_that_raises_exits_with_one_and_the_others_are_there(call, tmp_pat
     def broken(parts, limits):
         raise RuntimeError("out of [gain]")
 
-    monkeypatch.setitem(CONTROLLERS, "lqr", broken)
+    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", broken)
     result = call("run", f"{write(tmp_path)}:far", *TWO)
     assert result.exit_code == 1
     assert "tiny:far lqr: RuntimeError: out of [gain]" in result.stdout

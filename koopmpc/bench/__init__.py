@@ -1,10 +1,27 @@
-"""Problems, the sweep over controllers, the table."""
+"""Problems, the seven controllers that are compared on them, and the results."""
 
 from typing import TYPE_CHECKING
 
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.bench.controllers import CONTROLLERS as CONTROLLERS
+    from koopmpc.bench.controllers import Prepared as Prepared
     from koopmpc.bench.library import list_problems as list_problems
+    from koopmpc.bench.library import shipped as shipped
+    from koopmpc.bench.results import RunRow as RunRow
+    from koopmpc.bench.results import reached as reached
+    from koopmpc.bench.results import row_to_view as row_to_view
+    from koopmpc.bench.sweep import FAULTS as FAULTS
+    from koopmpc.bench.table import results_table as results_table
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"library": "list_problems"})
+    __getattr__, __dir__, __all__ = attach(
+        __name__,
+        {
+            "controllers": "CONTROLLERS Prepared",
+            "library": "list_problems shipped",
+            "results": "RunRow reached row_to_view",
+            "sweep": "FAULTS",
+            "table": "results_table",
+        },
+    )

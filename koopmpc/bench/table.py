@@ -82,7 +82,7 @@ LEGEND = (
 )
 
 
-def table(rows: Sequence[RunRow]) -> RenderableType:
+def results_table(rows: Sequence[RunRow]) -> RenderableType:
     """Return one table for each case, the failures in full, and what the columns mean; all fits 100 columns."""
     parts: list[RenderableType] = []
     for (problem, case), group in groupby(rows, key=lambda row: (row.problem, row.case)):

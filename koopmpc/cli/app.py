@@ -26,6 +26,7 @@ _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:c
 Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
 Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
 Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
+LogFiles = Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]
 Controllers = Annotated[
     list[str] | None, typer.Option("--controller", "-c", help="One of the seven; may be repeated. Default: all.")
 ]
@@ -51,7 +52,7 @@ def main(
 
 @app.command("list")
 def list_() -> None:
-    """Show the problems that there are, and their cases."""
+    """Show all problems and their cases."""
     from koopmpc.bench.library import list_problems, load_problem
 
     out = _console()
@@ -151,7 +152,7 @@ def fit(
 
 
 @app.command()
-def inspect(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
+def inspect(logs: LogFiles) -> None:
     """Recompute the metrics of runs from their logs alone."""
     from koopmpc.loop.metrics import metrics
     from koopmpc.recording.format.reader import load_run
@@ -166,7 +167,7 @@ def inspect(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc w
 
 
 @app.command()
-def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]) -> None:
+def view(logs: LogFiles) -> None:
     """Open logs in one Rerun viewer."""
     from koopmpc.recording.viewer import view as open_viewer
 
@@ -176,7 +177,7 @@ def view(logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrot
 
 @app.command()
 def reproduce(paper: Annotated[str, typer.Argument(help="The paper: snyder.")], logs: Logs = Path("logs")) -> None:
-    """Do a paper again: its figures, its numbers, and a verdict on each of its claims."""
+    """Reproduce a paper: its figures, its numbers, and a verdict on each of its claims."""
     from time import perf_counter
 
     from koopmpc.papers.registry import find_paper, verdict_table
@@ -197,18 +198,18 @@ def reproduce(paper: Annotated[str, typer.Argument(help="The paper: snyder.")], 
 def _sweep(
     problems: Sequence["Problem"], controllers: list[str] | None, faults: bool, live: bool, logs: Path, what: str
 ) -> None:
-    """Sweep behind a progress bar, print the table, and exit 1 if a run did not end as it should."""
+    """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
     from koopmpc.bench.results import row_to_view
     from koopmpc.bench.sweep import sweep
-    from koopmpc.bench.table import table
+    from koopmpc.bench.table import results_table
 
     controller_names(controllers)
     folder = _new_folder(logs, what)
     with _bar("") as progress:
         rows = sweep(problems, controllers, folder=folder, faults=faults, live=live, progress=progress)
     out = _console()
-    out.print(table(rows))
+    out.print(results_table(rows))
     out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
     shown = row_to_view(rows)
     if shown is not None:
@@ -218,12 +219,12 @@ def _sweep(
 
 
 def _split(names: str) -> list[str]:
-    """Return the names of ``"a, b"``; none of an empty text."""
+    """Return the names in ``"a, b"``; an empty text has none."""
     return [name.strip() for name in names.split(",") if name.strip()]
 
 
 def _program() -> list[str]:
-    """Return how this program is called from the current folder, where the shell may not find it by its name."""
+    """Return the command that calls this program from here: its name if that is on PATH, else its path."""
     beside = shutil.which("koopmpc", path=str(Path(sys.executable).parent))
     if beside is None:
         return [_near(sys.executable), "-m", "koopmpc"]
@@ -232,7 +233,7 @@ def _program() -> list[str]:
 
 
 def _near(path: str) -> str:
-    """Return the path from the current folder where that is shorter."""
+    """Return the path, relative to the current folder where that is shorter."""
     try:
         return min(os.path.relpath(path), path, key=len)
     except ValueError:  # on another drive
@@ -241,7 +242,7 @@ def _near(path: str) -> str:
 
 @contextmanager
 def _bar(first: str) -> Generator[Callable[[str, int, int | None], None]]:
-    """Show a progress bar on stderr, and hand out what moves it: (what, done, total)."""
+    """Show a progress bar on stderr and yield the function that moves it: (what, done, total)."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -257,7 +258,7 @@ def _console() -> Console:
 
 
 def _new_folder(logs: Path, what: str) -> Path:
-    """Make and return logs/<time>-<what>, with a number behind it where two calls share a second."""
+    """Make and return logs/<time>-<what>; a number follows where two calls share a second."""
     stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}-{what}"
     tries = 0
     while True:
@@ -276,7 +277,7 @@ def _new_folder(logs: Path, what: str) -> Path:
 
 @contextmanager
 def _friendly() -> Generator[None]:
-    """Show errors of koopmpc and warnings as one message each on stderr; exit code 2 for an error."""
+    """Show each warning and each error of koopmpc as one message on stderr; an error exits with 2."""
     err = Console(stderr=True)
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:

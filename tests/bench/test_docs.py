@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.results import reached
-from koopmpc.bench.sweep import FAULTS
 
 
 def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypatch, capsys):
@@ -19,7 +17,7 @@ def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypa
     run = found["run"]
     assert km.load_run("pendulum.rrd") == run
     assert capsys.readouterr().out == f"{km.metrics(run)}\n"
-    assert reached(run)
+    assert km.bench.reached(run)
     assert np.abs(run.U).max() <= 25
     assert {status.name for status in run.status} <= {"UNCONSTRAINED", "OPTIMAL"}
 
@@ -58,5 +56,5 @@ def test_the_examples_of_faults_run(capsys):
 
 def test_every_fault_is_in_the_documentation():
     text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
-    for fault in FAULTS.values():
+    for fault in km.bench.FAULTS.values():
         assert f"| `{type(fault).__name__}(" in text

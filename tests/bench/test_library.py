@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.library import list_problems, shipped
 from tests.bench.tiny import SOURCE, write
 
 
 def test_the_shipped_problems_are_two_plants_and_their_swing_ups():
     names = ["cart_pole", "cart_pole_swing", "pendulum", "pendulum_swing"]
-    assert [path.stem for path in shipped()] == names
+    assert [path.stem for path in km.bench.shipped()] == names
 
 
 @pytest.mark.parametrize("name", ["pendulum", "cart_pole"])
 def test_a_name_and_its_path_are_the_same_problem_from_any_folder(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     by_name = km.load_problem(name)
-    by_path = km.load_problem(next(path for path in shipped() if path.stem == name))
+    by_path = km.load_problem(next(path for path in km.bench.shipped() if path.stem == name))
     assert by_name.name == by_path.name == name
     assert by_name.title
     assert by_name.title == by_path.title
@@ -37,7 +36,7 @@ def test_a_file_is_found_before_a_name_and_a_local_problem_before_a_shipped_one(
     write(tmp_path / "problems", "pendulum")
     assert km.load_problem("pendulum").title.startswith("Tiny")
     assert km.load_problem("problems/pendulum.py").title.startswith("Tiny")
-    assert [entry.title[:4] for entry in list_problems() if entry.name == "pendulum"] == ["Tiny"]
+    assert [entry.title[:4] for entry in km.bench.list_problems() if entry.name == "pendulum"] == ["Tiny"]
 
 
 def test_listing_runs_no_file(tmp_path, monkeypatch):
@@ -47,7 +46,7 @@ def test_listing_runs_no_file(tmp_path, monkeypatch):
     (folder / "loud.py").write_text('"""Loud: raises when it runs."""\nraise RuntimeError("ran")\n')
     (folder / "garbled.py").write_text("def (:\n")
     (folder / "_helper.py").write_text("x = 1\n")
-    titles = {entry.name: entry.title for entry in list_problems()}
+    titles = {entry.name: entry.title for entry in km.bench.list_problems()}
     assert titles["loud"] == "Loud: raises when it runs."
     assert "no valid Python" in titles["garbled"]
     assert "_helper" not in titles

@@ -5,12 +5,11 @@ from dataclasses import replace
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.library import shipped
 
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    found = [replace(km.load_problem(path), scene=None) for path in shipped()]  # drawing is what takes long
+    found = [replace(km.load_problem(path), scene=None) for path in km.bench.shipped()]  # drawing is what takes long
     problems = [problem for problem in found if not problem.controllers]  # those for all controllers
     names = ["lqr", "koopman-mpc", "offset-free", "nonlinear-mpc"]
     swept = km.sweep(problems, names, folder=tmp_path_factory.mktemp("shipped"))
@@ -51,5 +50,5 @@ def test_only_the_estimator_leaves_no_offset_where_nobody_was_told_of_the_load(r
 
 @pytest.mark.slow
 def test_all_seven_controllers_end_as_they_should_on_all_cases(tmp_path):
-    swept = km.sweep([km.load_problem(path) for path in shipped()], folder=tmp_path)
+    swept = km.sweep([km.load_problem(path) for path in km.bench.shipped()], folder=tmp_path)
     assert [row.failure for row in swept if row.failure] == []

@@ -8,10 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
-from koopmpc.bench.results import RunRow, failures, reached, row_to_view
-from koopmpc.bench.sweep import FAULTS, possible_faults
-from koopmpc.control.move import Fallback
+from koopmpc.bench.results import failures
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
 
@@ -93,7 +90,7 @@ def test_the_qps_of_a_sweep_are_held_to_their_kkt_conditions(swept, tmp_path):
 
 
 def test_data_and_model_are_made_once(swept):
-    parts = Prepared(swept[0])
+    parts = km.bench.Prepared(swept[0])
     assert parts.model is parts.model
     assert parts.truth is parts.step_map
     assert parts.training_time > 0
@@ -102,18 +99,18 @@ def test_data_and_model_are_made_once(swept):
 def test_the_truth_may_be_another_plant(swept):
     problem, *_ = swept
     heavier = type(problem.dynamics)
-    parts = Prepared(replace(problem, plant=heavier()))
+    parts = km.bench.Prepared(replace(problem, plant=heavier()))
     assert parts.truth is not parts.step_map
     np.testing.assert_array_equal(parts.truth([0.3], [0.1]), parts.step_map([0.3], [0.1]))
-    given = Prepared(problem).step_map
-    assert Prepared(replace(problem, plant=given)).truth is given
+    given = km.bench.Prepared(problem).step_map
+    assert km.bench.Prepared(replace(problem, plant=given)).truth is given
 
 
 def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_path, monkeypatch):
     def broken(parts, limits):
         raise RuntimeError("no such gain")
 
-    monkeypatch.setitem(CONTROLLERS, "koopman-lqr", broken)
+    monkeypatch.setitem(km.bench.CONTROLLERS, "koopman-lqr", broken)
     rows = km.sweep([swept[0].select("far")], folder=tmp_path)
     assert [row.controller for row in rows if row.failure] == ["koopman-lqr"]
     (row,) = (row for row in rows if row.failure)
@@ -147,18 +144,18 @@ class Cheat:
         """Nothing to forget."""
 
     def __call__(self, y, reference, applied=None):
-        return km.Move(np.array([self.u]), km.Status.OPTIMAL, Fallback.NONE, 0.0, 0)
+        return km.Move(np.array([self.u]), km.Status.OPTIMAL, km.control.Fallback.NONE, 0.0, 0)
 
 
 def test_an_input_beyond_its_limit_is_a_failure(swept, tmp_path, monkeypatch):
-    monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, 1.5))
+    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, 1.5))
     (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure == "u = [1.5] at step 0 is 0.5 beyond a hard limit"
     assert row.metrics is not None
 
 
 def test_an_input_that_is_not_finite_is_a_failure(swept, tmp_path, monkeypatch):
-    monkeypatch.setitem(CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, np.nan))
+    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, np.nan))
     (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert "every input must be finite" in row.failure
 
@@ -199,13 +196,13 @@ def test_a_log_that_cannot_be_written_takes_no_figures_and_is_not_offered(swept,
     assert row.metrics is not None
     assert row.log is None
     assert not list(tmp_path.glob("*.rrd"))
-    assert row_to_view([row]) is None
+    assert km.bench.row_to_view([row]) is None
 
 
 def test_the_run_to_look_at_is_the_hardest_that_koopman_mpc_manages(swept):
     def ran(case, controller, cost, reached=True, fault=None):
         figures = replace(swept[1][0].metrics, cost=cost)
-        return RunRow("p", case, controller, figures, reached, log=Path(f"{case}.rrd"), fault=fault)
+        return km.bench.RunRow("p", case, controller, figures, reached, log=Path(f"{case}.rrd"), fault=fault)
 
     rows = [
         ran("easy", "lqr", 1.0),
@@ -217,11 +214,11 @@ def test_the_run_to_look_at_is_the_hardest_that_koopman_mpc_manages(swept):
         ran("lost", "nonlinear-mpc", 1.0),
         ran("easy", "koopman-mpc", 5.0, fault="nan-sensor"),
     ]
-    assert row_to_view(rows) is rows[3]
-    assert row_to_view(rows[:1]) is rows[0]
-    assert row_to_view([rows[1], rows[3]]) is rows[1]
-    assert row_to_view([rows[5]]) is rows[5]
-    assert row_to_view([]) is None
+    assert km.bench.row_to_view(rows) is rows[3]
+    assert km.bench.row_to_view(rows[:1]) is rows[0]
+    assert km.bench.row_to_view([rows[1], rows[3]]) is rows[1]
+    assert km.bench.row_to_view([rows[5]]) is rows[5]
+    assert km.bench.row_to_view([]) is None
 
 
 class Unseen(km.Recorder):
@@ -269,11 +266,11 @@ def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
     run = km.load_run(next(row.log for row in swept[1] if row.case == "near"))
     X = np.full_like(run.X, 1.0)
     X[1:] = 0.049
-    assert reached(replace(run, X=X))
+    assert km.bench.reached(replace(run, X=X))
     X[-2] = 0.051
-    assert not reached(replace(run, X=X))
+    assert not km.bench.reached(replace(run, X=X))
     X[-2], X[20] = 0.0, 3.0
-    assert reached(replace(run, X=X))
+    assert km.bench.reached(replace(run, X=X))
 
 
 def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
@@ -282,7 +279,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(controller_names(None)) == SEVEN
+    assert list(km.bench.CONTROLLERS) == SEVEN
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
@@ -303,7 +300,7 @@ def faulty(swept, tmp_path_factory):
 def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(faulty):
     rows, folder = faulty
     assert [(r.case, r.fault, r.controller) for r in rows] == [
-        (case, fault, name) for case in ("near", "far") for fault in (None, *FAULTS) for name in SEVEN
+        (case, fault, name) for case in ("near", "far") for fault in (None, *km.bench.FAULTS) for name in SEVEN
     ]
     assert [row.failure for row in rows] == [None] * len(rows)
     assert len({row.log for row in rows}) == len(rows)
@@ -318,7 +315,7 @@ def test_a_fault_is_named_in_its_log_and_in_no_other(faulty):
             assert not metadata.keys() & {"fault", "faults"}
         else:
             assert metadata["fault"] == row.fault
-            assert metadata["faults"] == (str(FAULTS[row.fault]),)
+            assert metadata["faults"] == (str(km.bench.FAULTS[row.fault]),)
             assert row.log.name == f"tiny-{row.case}-{row.controller}-{row.fault}.rrd"
 
 
@@ -345,23 +342,27 @@ def test_a_live_faulty_run_leaves_the_same_log(swept, faulty, tmp_path, monkeypa
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
     rows = km.sweep([swept[0].select("far")], ["koopman-mpc"], folder=tmp_path, live=True, faults=True)
-    assert [row.failure for row in rows] == [None] * (1 + len(FAULTS))
+    assert [row.failure for row in rows] == [None] * (1 + len(km.bench.FAULTS))
     for row in rows:
         same = (row.case, row.controller, row.fault)
         kept = next(r for r in faulty[0] if (r.case, r.controller, r.fault) == same)
         assert np.array_equal(km.load_run(row.log).U, km.load_run(kept.log).U)
 
 
-def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path):
-    free = replace(swept[0].select("near"), limits=km.Limits(x_max=5.0))
-    rows = km.sweep([free], ["lqr"], folder=tmp_path, faults=True)
-    assert [row.fault for row in rows] == [None, *(name for name in FAULTS if name != "actuator-loss")]
+@pytest.mark.parametrize(
+    ("limits", "loses"), [({"x_max": 5.0}, False), ({"u_min": -np.inf}, False), ({"u_max": 1.0}, True)]
+)
+def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path, limits, loses):
+    problem = replace(swept[0].select("near"), limits=km.Limits(**limits))
+    rows = km.sweep([problem], ["lqr"], folder=tmp_path, faults=True)
+    assert [row.fault for row in rows] == [
+        None,
+        *(name for name in km.bench.FAULTS if loses or name != "actuator-loss"),
+    ]
     assert not any(row.failure for row in rows)
-    assert possible_faults(km.Limits(u_max=[np.inf, 1.0])) == tuple(FAULTS)
-    assert "actuator-loss" not in possible_faults(km.Limits(u_min=-np.inf))
 
 
 def test_a_run_that_diverged_reaches_nothing_and_warns_of_nothing(swept):
     run = km.load_run(next(row.log for row in swept[1] if row.case == "far"))
     for value in (np.inf, np.nan, 1e200):
-        assert not reached(replace(run, X=np.full_like(run.X, value)))
+        assert not km.bench.reached(replace(run, X=np.full_like(run.X, value)))

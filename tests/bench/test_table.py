@@ -6,13 +6,9 @@ from dataclasses import replace
 import numpy as np
 from rich.console import Console
 
-from koopmpc.bench.controllers import CONTROLLERS
-from koopmpc.bench.results import RunRow
-from koopmpc.bench.sweep import FAULTS
-from koopmpc.bench.table import table
-from koopmpc.loop.metrics import Metrics
+import koopmpc as km
 
-GOOD = Metrics(
+GOOD = km.loop.Metrics(
     cost=120.5,
     tracking_rmse=np.array([0.1, 0.2]),
     final_error=np.array([0.001, -0.02]),
@@ -37,16 +33,18 @@ def printed(renderable, width=100):
 
 def rows():
     return [
-        RunRow("plant", "case", "lqr", replace(GOOD, cost=2.41e6, settling_time=np.inf), reached=False),
-        RunRow("plant", "case", "linear-mpc", replace(GOOD, settling_time=np.inf), reached=True),
-        RunRow("plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31),
-        RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True),
-        RunRow("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
+        km.bench.RunRow("plant", "case", "lqr", replace(GOOD, cost=2.41e6, settling_time=np.inf), reached=False),
+        km.bench.RunRow("plant", "case", "linear-mpc", replace(GOOD, settling_time=np.inf), reached=True),
+        km.bench.RunRow(
+            "plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31
+        ),
+        km.bench.RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True),
+        km.bench.RunRow("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
     ]
 
 
 def test_each_row_says_how_it_went():
-    lines = printed(table(rows())).split("\n")
+    lines = printed(km.bench.results_table(rows())).split("\n")
     line = {
         name: next(text for text in lines if text.strip().startswith(name))
         for name in ("koopman-mpc", "linear-mpc", "nonlinear-mpc", "lqr")
@@ -54,7 +52,7 @@ def test_each_row_says_how_it_went():
     assert "does not reach" in line["lqr"]
     assert "2e+04" in line["lqr"]  # the ratio to nonlinear-mpc
     assert "within 5 %" in line["linear-mpc"]
-    legend = " ".join(printed(table(rows())).split()).split(" cost: ")[1]
+    legend = " ".join(printed(km.bench.results_table(rows())).split()).split(" cost: ")[1]
     assert all(f"{word}, " in legend for word in ("within 5 %", "does not reach", "free", "clipped"))
     assert "a load that they do not know it is no oracle, and a ratio can be below 1" in legend
     assert "2.35 s" in line["koopman-mpc"]
@@ -64,7 +62,7 @@ def test_each_row_says_how_it_went():
 
 
 def test_one_table_a_case_with_training_time_and_failures_in_full():
-    text = printed(table(rows()))
+    text = printed(km.bench.results_table(rows()))
     assert text.index("plant:case") < text.index("plant:other")
     assert "learned from data in 310 ms" in text
     assert "plant:other lqr: RuntimeError: the [gain] is lost" in text
@@ -72,12 +70,12 @@ def test_one_table_a_case_with_training_time_and_failures_in_full():
 
 
 def test_no_column_of_violations_where_there_is_none():
-    assert "over " not in printed(table([rows()[3]])).split("cost:")[0]
-    assert "over " in printed(table(rows())).split("cost:")[0]
+    assert "over " not in printed(km.bench.results_table([rows()[3]])).split("cost:")[0]
+    assert "over " in printed(km.bench.results_table(rows())).split("cost:")[0]
 
 
 def test_a_hundred_columns_cut_nothing():
-    text = printed(table(rows()))
+    text = printed(km.bench.results_table(rows()))
     assert "…" not in text
     assert max(len(line) for line in text.split("\n")) <= 100
 
@@ -86,17 +84,17 @@ def faulty_rows():
     lost = replace(GOOD, cost=5e6, fallback={"NONE": 150, "HOLD": 50})
     return [
         *rows()[1:4],
-        RunRow("plant", "case", "linear-mpc", lost, fault="nan-sensor"),
-        RunRow("plant", "case", "koopman-mpc", replace(GOOD, cost=121.705), reached=True, fault="nan-sensor"),
-        RunRow("plant", "case", "nonlinear-mpc", fault="nan-sensor", failure="RuntimeError: no [luck]"),
-        RunRow("plant", "case", "linear-mpc", replace(GOOD, cost=60250.0), reached=True, fault="delay"),
-        RunRow("plant", "case", "koopman-mpc", GOOD, reached=True, fault="delay"),
-        RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True, fault="delay"),
+        km.bench.RunRow("plant", "case", "linear-mpc", lost, fault="nan-sensor"),
+        km.bench.RunRow("plant", "case", "koopman-mpc", replace(GOOD, cost=121.705), reached=True, fault="nan-sensor"),
+        km.bench.RunRow("plant", "case", "nonlinear-mpc", fault="nan-sensor", failure="RuntimeError: no [luck]"),
+        km.bench.RunRow("plant", "case", "linear-mpc", replace(GOOD, cost=60250.0), reached=True, fault="delay"),
+        km.bench.RunRow("plant", "case", "koopman-mpc", GOOD, reached=True, fault="delay"),
+        km.bench.RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True, fault="delay"),
     ]
 
 
 def test_faults_are_a_line_each_under_the_table_of_their_case():
-    text = printed(table(faulty_rows()))
+    text = printed(km.bench.results_table(faulty_rows()))
     assert text.index("plant:case ") < text.index("plant:case under faults")
     line = {name: next(t for t in text.split("\n") if t.strip().startswith(name)) for name in ("nan-", "delay")}
     assert line["nan-"].split() == ["nan-sensor", "lost", "(50)", "1.010", "(2)", "raised"]
@@ -109,23 +107,23 @@ def test_faults_are_a_line_each_under_the_table_of_their_case():
 
 def test_who_does_not_reach_without_a_fault_is_not_lost_to_it():
     own = [row for row in faulty_rows() if row.controller == "linear-mpc"]
-    text = printed(table([replace(own[0], reached=False), *own[1:]]))
+    text = printed(km.bench.results_table([replace(own[0], reached=False), *own[1:]]))
     assert "lost" not in text.split("cost:")[0]
     assert "– (50)" in text
 
 
 def test_no_faults_no_table_of_faults():
-    assert "faults" not in printed(table(rows()))
+    assert "faults" not in printed(km.bench.results_table(rows()))
 
 
 def test_the_seven_controllers_under_every_fault_fit_a_hundred_columns():
     worst = replace(GOOD, cost=1e9, fallback={"HOLD": 300})
     ran = [
-        RunRow("plant", "case", name, metrics, reached=True, fault=fault)
-        for fault, metrics in [(None, GOOD), *((fault, worst) for fault in FAULTS)]
-        for name in CONTROLLERS
+        km.bench.RunRow("plant", "case", name, metrics, reached=True, fault=fault)
+        for fault, metrics in [(None, GOOD), *((fault, worst) for fault in km.bench.FAULTS)]
+        for name in km.bench.CONTROLLERS
     ]
-    text = printed(table(ran))
+    text = printed(km.bench.results_table(ran))
     assert "…" not in text
     assert max(len(line) for line in text.split("\n")) <= 100
-    assert text.count("8e+06 (300)") == len(FAULTS) * len(CONTROLLERS)
+    assert text.count("8e+06 (300)") == len(km.bench.FAULTS) * len(km.bench.CONTROLLERS)

@@ -8,14 +8,18 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_continuous_are
 
 import koopmpc as km
-from koopmpc.plants.dynamics import right_side
 
 angle, speed = st.floats(-3.1, 3.1), st.floats(-4.0, 4.0)
 
 
-def rhs(name, x, u):
-    f = right_side(km.load_problem(name).dynamics)
-    return np.array(f(x, u)).ravel()
+def right_side(dynamics):
+    """Return the CasADi function ẋ = f(x, u)."""
+    x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    return ca.Function("f", [x, u], [dynamics.rhs(x, u)])
+
+
+def rate(dynamics, x, u):
+    return np.array(right_side(dynamics)(x, u)).ravel()
 
 
 def linearised(dynamics, x, u):
@@ -51,7 +55,7 @@ def test_the_torques_work_is_the_pendulums_energy(theta, omega, u):
     x = ca.SX.sym("x", 2)
     energy = 0.5 * p.m * (p.L * x[1]) ** 2 + p.m * p.g * p.L * ca.cos(x[0])
     slope = np.array(ca.Function("dE", [x], [ca.gradient(energy, x)])([theta, omega])).ravel()
-    dx = np.array(right_side(p)([theta, omega], [u])).ravel()
+    dx = rate(p, [theta, omega], [u])
     np.testing.assert_allclose(slope @ dx, u * omega, atol=1e-9)
 
 
@@ -63,21 +67,17 @@ def test_the_forces_work_is_the_cart_poles_energy(theta, omega, velocity, u):
     energy = 0.5 * p.M * x[1] ** 2 + 0.5 * p.m * ca.sumsqr(tip) - p.m * p.g * p.L * ca.cos(x[2])
     point = [0.3, velocity, theta, omega]
     slope = np.array(ca.Function("dE", [x], [ca.gradient(energy, x)])(point)).ravel()
-    dx = np.array(right_side(p)(point, [u])).ravel()
+    dx = rate(p, point, [u])
     np.testing.assert_allclose(slope @ dx, u * velocity, atol=1e-8)
 
 
 @pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
 def test_references_are_equilibria_and_cases_fit(problem):
     x, u = problem.equilibrium
-    np.testing.assert_allclose(np.array(right_side(problem.dynamics)(x, u)).ravel(), 0.0, atol=1e-12)
-    f = right_side(problem.dynamics)
-    for (
-        name,
-        case,
-    ) in problem.cases.items():  # both are affine in u: one input holds the reference, inside the limits
-        free = np.array(f(case.reference, [0.0])).ravel()
-        gain = np.array(f(case.reference, [1.0])).ravel() - free
+    np.testing.assert_allclose(rate(problem.dynamics, x, u), 0.0, atol=1e-12)
+    for name, case in problem.cases.items():  # f is affine in u: one input holds the reference, inside the limits
+        free = rate(problem.dynamics, case.reference, [0.0])
+        gain = rate(problem.dynamics, case.reference, [1.0]) - free
         held = -float(gain @ free) / float(gain @ gain)
         np.testing.assert_allclose(free + gain * held, 0.0, atol=1e-12)
         low, high = problem.limits_of(name).inputs(1)
@@ -108,4 +108,4 @@ def test_the_limits_are_the_ones_asked_for():
 def test_ten_newton_metres_cannot_hold_the_pendulum_level():
     p = PENDULUM.dynamics
     assert p.m * p.g * p.L > 10.0
-    assert rhs("pendulum", [np.pi / 2, 0.0], [-10.0])[1] > 0.0  # θ = 0 is upright: it still falls away
+    assert rate(p, [np.pi / 2, 0.0], [-10.0])[1] > 0.0  # θ = 0 is upright: it still falls away
