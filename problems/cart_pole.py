@@ -26,7 +26,7 @@ class CartPole(km.Dynamics):
     m: float = 1.0  # pole mass, at the tip [kg]
     L: float = 2.0  # pole length [m]
     g: float = 9.81  # gravity [m/s²]
-    wind: float = 0.0  # force on the cart that nobody measures [N]
+    wind: float = 0.0  # unmeasured force on the cart [N]
 
     def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
         """ẋ = [v, v̇, ω, ω̇]."""

@@ -49,7 +49,7 @@ names = ["omega sin(theta)", "omega cos(theta)", "omega sin(2 theta)", "omega co
 
 
 def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
-    """Draw the rod, the bob, the pivot, the place to be, and the torque as an arc."""
+    """Draw the rod, the bob, the pivot, the target, and the torque as an arc."""
     theta, L = float(x[0]), pendulum.L
     bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
     sweep = np.linspace(0.0, float(np.clip(u[0] / 25.0, -1.0, 1.0)) * np.pi, 24)
@@ -81,7 +81,7 @@ problem = km.Problem(
     cases={
         "upright": km.Case(x0=[np.pi / 4, 0.0], reference=[0.0, 0.0], steps=200),
         "hang": km.Case(x0=[np.pi, 0.0], reference=[0.0, 0.0], steps=300, limits=km.Limits(u_min=-10.0, u_max=10.0)),
-        # 17 N m hold the bob there, which weighs a fifth more than anybody was told
+        # The bob weighs a fifth more than the controllers know; it takes 17 N m to hold it there.
         "hold": km.Case(x0=[np.pi / 4, 0.0], reference=[0.8, 0.0], steps=200, plant=Pendulum(m=1.2)),
     },
     angles=(0,),

@@ -46,7 +46,7 @@ tracked = ("sin(theta)", "cos(theta)", "omega [rad/s]")
 
 
 def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
-    """Draw the rod, the bob, the pivot, the place to be, and the torque as an arc."""
+    """Draw the rod, the bob, the pivot, the target, and the torque as an arc."""
     theta, L = float(x[0]), pendulum.L
     bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
     sweep = np.linspace(0.0, float(np.clip(u[0] / 10.0, -1.0, 1.0)) * np.pi, 24)

@@ -57,7 +57,7 @@ def test_the_same_cost_and_limits_judge_every_controller(swept):
         assert run.plans is not None or row.controller.endswith("lqr")
 
 
-def test_the_oracle_is_not_beaten_by_much(swept):
+def test_no_controller_beats_the_oracle_by_much(swept):
     _, rows, _, _ = swept
     cost = {(row.case, row.controller): row.metrics.cost for row in rows}
     for (case, name), value in cost.items():

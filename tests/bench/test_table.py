@@ -61,7 +61,7 @@ def test_each_row_says_how_it_went():
     assert "4.2 ms" in line["nonlinear-mpc"]
 
 
-def test_one_table_a_case_with_training_time_and_failures_in_full():
+def test_each_case_has_a_table_with_training_time_and_failures_in_full():
     text = printed(km.bench.results_table(rows()))
     assert text.index("plant:case") < text.index("plant:other")
     assert "learned from data in 310 ms" in text
@@ -69,12 +69,12 @@ def test_one_table_a_case_with_training_time_and_failures_in_full():
     assert "raised" in text
 
 
-def test_no_column_of_violations_where_there_is_none():
+def test_a_column_of_violations_is_shown_only_where_there_are_some():
     assert "over " not in printed(km.bench.results_table([rows()[3]])).split("cost:")[0]
     assert "over " in printed(km.bench.results_table(rows())).split("cost:")[0]
 
 
-def test_a_hundred_columns_cut_nothing():
+def test_the_table_fits_a_hundred_columns():
     text = printed(km.bench.results_table(rows()))
     assert "…" not in text
     assert max(len(line) for line in text.split("\n")) <= 100
@@ -112,7 +112,7 @@ def test_who_does_not_reach_without_a_fault_is_not_lost_to_it():
     assert "– (50)" in text
 
 
-def test_no_faults_no_table_of_faults():
+def test_without_faults_there_is_no_table_of_faults():
     assert "faults" not in printed(km.bench.results_table(rows()))
 
 

@@ -65,7 +65,7 @@ def test_every_paper_is_found_by_its_name():
     assert [find_paper(name).name for name in registry.PAPERS] == list(registry.PAPERS)
 
 
-def test_an_unknown_paper_is_told():
+def test_an_unknown_paper_is_refused_and_the_nearest_is_suggested():
     with pytest.raises(km.errors.ProblemError, match=r"no paper 'snider', did you mean 'snyder'\?; there are snyder"):
         find_paper("snider")
     result = CliRunner().invoke(app, ["reproduce", "nobody"])
@@ -90,7 +90,7 @@ def test_the_command_prints_verdicts_and_paths(tmp_path, monkeypatch):
         assert word in result.output
 
 
-def test_verdicts_and_cells():
+def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits():
     assert judged("a", "b", holds=True, why="c").verdict is Verdict.HOLDS
     assert judged("a", "b", holds=False, in_part=True, why="c").verdict is Verdict.IN_PART
     assert judged("a", "b", holds=False, why="c").verdict is Verdict.FAILS

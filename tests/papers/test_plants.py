@@ -57,7 +57,7 @@ def test_the_printed_jacobian_still_stabilises_the_true_plant():
     assert np.linalg.eigvals(A - B @ K).real.max() < 0
 
 
-def test_recorded_inputs_lead_from_row_to_row():
+def test_recorded_inputs_are_those_of_the_feedback():
     K, start = [[0.0, 3.0]], [np.pi / 4, 0.0]
     held = trajectories(Pendulum(), start, dt=0.01, steps=50, K=K, held=True)
     data = inputs_of(held, Pendulum.inputs, K)

@@ -62,20 +62,20 @@ def fits(settings):
 
 
 @pytest.mark.parametrize("key", KNOWN)
-def test_errors_of_reconstruction(fits, key):
+def test_errors_of_reconstruction_are_those_computed_independently(fits, key):
     setting, method, full = key
     got, known = 100 * fits[setting][method, full].error, KNOWN[key]
     assert known / spread(known) < got < known * spread(known)
 
 
-def test_ranks_that_the_cut_leaves(fits):
+def test_full_rank_leaves_the_known_number_of_singular_values(fits):
     assert fits["cart-pole"]["EDMD monomials 2", True].rank == 15
     assert fits["cart-pole-lqr"]["EDMD monomials 2", True].rank == 14
     assert fits["cart-pole-lqr"]["EDMD Fourier 1", False].rank == 4
     assert ("pendulum", "DMD", False) not in {(s, *key) for s, each in fits.items() for key in each}
 
 
-def test_gains_to_the_digits():
+def test_gains_agree_to_the_digits():
     got = {name: K.ravel() for name, K in gains().items()}
     for name, known, digits in (
         ("pendulum", [0.0, 3.1623], 4),
@@ -96,7 +96,7 @@ def test_the_shift_stays_upright(settings):
 
 
 @pytest.mark.parametrize("amplitude", [1e-6, np.pi / 4, 1.5, 3.0])
-def test_frequency_by_the_elliptic_integral(amplitude):
+def test_the_frequency_is_that_of_the_elliptic_integral(amplitude):
     plant = Pendulum()
     exact = np.sqrt(plant.g / plant.L) * np.pi / (2 * ellipk(np.sin(amplitude / 2) ** 2))
     assert frequency(plant, amplitude) == pytest.approx(exact, rel=1e-12)
@@ -138,7 +138,7 @@ def test_a_held_input_changes_little(settings, fits):
 
 
 @pytest.mark.parametrize(("method", "rank"), [("DMD", 2), ("EDMD monomials 3", 10), ("EDMD Fourier 1", 4)])
-def test_each_equation_is_its_function(settings, method, rank):
+def test_each_equation_equals_its_function(settings, method, rank):
     lifting = OBSERVABLES[method]
     trajectory = settings["pendulum"].trajectory
     checked = theory.equations(trajectory, lifting, rank)
@@ -152,7 +152,7 @@ def test_eigenfunctions_are_left_eigenvectors(settings):
     assert left < 0.05 * right
 
 
-def test_verdicts_of_the_figures(fits):
+def test_each_figure_has_its_verdict(fits):
     found = {claim.where: claim.verdict for claim in of_figures(fits)}
     assert len(found) == sum(len(shown.settings) for shown in FIGURES)
     for where, verdict in {
@@ -235,7 +235,7 @@ def test_verdicts_of_the_text_follow_the_numbers(fits):
     assert verdict("EDMD finds the leading Koopman eigenfunctions") is Verdict.IN_PART
 
 
-def test_the_parts_of_the_report(settings, fits, tmp_path, monkeypatch):
+def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(pages, "save", lambda made, path: saved.append(path.stem))
     page = Page(tmp_path, beside="snyder")
