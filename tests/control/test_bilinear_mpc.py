@@ -223,21 +223,6 @@ def test_the_constant_of_an_affine_model_does_no_harm() -> None:
     assert km.BilinearMPC(model, km.Cost(1, 0.1), None, 5)([0.3, 0.1], [0, 0]).status is km.Status.UNCONSTRAINED
 
 
-def test_refusals() -> None:
-    model = pendulum()
-    with pytest.raises(km.errors.DataError, match="horizon is 0; it must be at least 1"):
-        km.BilinearMPC(model, CIRCLE, None, 0)
-    with pytest.raises(km.errors.DataError, match="sqp_iterations is 0; it must be at least 1"):
-        km.BilinearMPC(model, CIRCLE, None, 5, sqp_iterations=0)
-    with pytest.raises(km.errors.ShapeError, match="Q_N weighs x_N − r_N, but the reference is not of the state"):
-        km.BilinearMPC(model, km.Cost(Q=[2, 2, 0.2], R=0.1, Q_N=[1, 1], of=UPRIGHT), None, 5)
-    mpc = km.BilinearMPC(model, CIRCLE, None, 5)
-    with pytest.raises(km.errors.ShapeError, match=r"y has shape \(3,\), expected \(2,\), one value a state"):
-        mpc([0, 0, 0], [0, 1, 0])
-    with pytest.raises(km.errors.ShapeError, match=r"reference has shape \(2,\), expected \(3,\)"):
-        mpc([0, 0], [0, 1])
-
-
 def test_a_step_that_fails_without_a_plan_takes_the_clipped_optimum() -> None:
     """A hard limit that nothing meets: the loop goes on as a feedback law, and comes back inside."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")

@@ -7,10 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
+from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria, TerminalTargets
 from koopmpc.control.nonlinear.problem import learned_map
+from koopmpc.control.riccati import stationary
 from koopmpc.control.tracking import state_tracking
-from tests.control.test_bilinear_mpc import pendulum
+from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
+from tests.control.test_nonlinear_mpc import pendulum as hinge
 
 COST = km.Cost(Q=[1, 0.1], R=0.1)
 BOX = km.Limits(-0.3, 0.4, x_max=[0.7, 5.0])
@@ -81,3 +83,33 @@ def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(
         assert abs(x[0] - reference) < 1e-6
     elif reference > top:
         assert abs(x[0] - top) < 1e-4
+
+
+def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_target() -> None:
+    plant, cost = hinge(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
+    read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
+    target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
+
+    def end(x: np.ndarray) -> float:
+        e = target.M @ read.tracked(x).full().ravel() + target.L @ x - target.m
+        return float(e @ e)
+
+    assert np.allclose(np.sin(target.equilibrium.x[0]), 0, atol=1e-6)
+    assert np.cos(target.equilibrium.x[0]) > 0.99
+    far = np.array([1.0, 0.5])
+    assert end(far + np.array([2 * np.pi, 0])) == pytest.approx(end(far), rel=1e-9)
+    affine = plant.linearize(target.equilibrium.x, target.u)
+    P = stationary(affine.A, affine.B, np.diag([1.0, 0.1]), read.R, 300).P
+    for d in np.array([[1e-3, 0], [0, 1e-3], [1e-3, -2e-3]]):
+        assert end(target.equilibrium.x + d) == pytest.approx(d @ P @ d, rel=1e-2)
+    assert end(target.equilibrium.x + np.array([np.pi, 0])) > end(
+        target.equilibrium.x + np.array([0.5, 0])
+    )  # hanging is no target
+
+
+def test_the_terminal_target_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
+    """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
+    plant, cost = hinge(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
+    read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
+    target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
+    assert np.cos(target.equilibrium.x[0]) < -0.99

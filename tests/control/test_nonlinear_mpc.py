@@ -1,3 +1,9 @@
+"""NonlinearMPC: KoopmanMPC on a linear plant, three solvers and one answer, several starts against a local optimum."""
+
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -95,7 +101,7 @@ def test_every_end_has_a_status_and_a_safe_input():
     np.testing.assert_allclose(again.u, good.u, atol=1e-6)
 
 
-def pendulum():
+def swing():
     """θ̈ = (g/L) sin θ + u / (m L²): θ = 0 is upright, m = 1 kg, L = 2 m; level takes 19.6 N m."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     flow = ca.Function("f", [x, u], [ca.vertcat(x[1], 9.81 / 2 * ca.sin(x[0]) + u / 4)])
@@ -109,7 +115,7 @@ def pendulum():
 
 
 def test_it_swings_a_pendulum_up_with_half_the_torque_that_lifts_it():
-    plant = pendulum()
+    plant = swing()
     mpc = km.NonlinearMPC(plant, km.Cost(Q=[10, 1], R=0.05), km.Limits(-10, 10), 40)
     x = np.array([np.pi, 0.0])
     for _ in range(80):
@@ -120,44 +126,68 @@ def test_it_swings_a_pendulum_up_with_half_the_torque_that_lifts_it():
     np.testing.assert_allclose(x[1], 0, atol=1e-2)
 
 
-def test_messages():
-    plant, cost = step_map(A, B), km.Cost(1, 0.1)
-    for error, text, call in (
-        (
-            km.errors.DataError,
-            r"horizon is 0; it must be at least 1",
-            lambda: km.NonlinearMPC(plant, cost, horizon=0),
-        ),
-        (
-            km.errors.ShapeError,
-            r"Q has shape \(3,\), expected \(2, 2\) or its diagonal",
-            lambda: km.NonlinearMPC(plant, km.Cost([1, 1, 1], 1)),
-        ),
-        (
-            km.errors.ShapeError,
-            r"Q_N has shape \(3, 3\), expected \(2, 2\)",
-            lambda: km.NonlinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(3))),
-        ),
-        (
-            km.errors.ShapeError,
-            r"Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out",
-            lambda: km.NonlinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(2), of=km.Constant())),
-        ),
-        (
-            km.errors.ShapeError,
-            r"x_max has shape \(3,\), expected \(2,\) or a scalar",
-            lambda: km.NonlinearMPC(plant, cost, km.Limits(x_max=[1, 1, 1])),
-        ),
-        (
-            km.errors.ShapeError,
-            r"y has shape \(3,\), expected \(2,\)",
-            lambda: km.NonlinearMPC(plant, cost)([0] * 3, [0, 0]),
-        ),
-        (
-            km.errors.ShapeError,
-            r"reference has shape \(3,\), expected \(2,\), or rows of 2",
-            lambda: km.NonlinearMPC(plant, cost)([0, 0], [0, 0, 0]),
-        ),
-    ):
-        with pytest.raises(error, match=text):
-            call()
+SOLVERS = ["ipopt", "fatrop", "sqpmethod"]
+UPRIGHT = km.Expressions(lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ["s", "c", "omega"])
+
+
+def pendulum() -> km.StepMap:
+    """θ = 0 is upright."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    x_next = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.3 * ca.sin(x[0]) + 0.1 * u)
+    return km.StepMap(ca.Function("F", [x, u], [x_next]), 0.1, states=("theta", "omega"), inputs=("u",))
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        km.Limits(-1, 1),
+        km.Limits(-2, 2, x_max=[np.inf, 0.2]),
+        km.Limits(-2, 2, x_max=[0.5, np.inf], slack=None),
+        km.Limits(-2, 2, x_min=[-1, -0.4], slack=([np.inf, 30.0], [0.0, 3.0])),
+    ],
+)
+def test_all_solvers_find_the_same_plan(limits: km.Limits) -> None:
+    plant, cost = pendulum(), km.Cost(Q=[2, 0.2], R=0.1)
+    plans = []
+    for solver in SOLVERS:
+        mpc = km.NonlinearMPC(plant, cost, limits, 12, solver=solver)
+        x = np.array([0.45, 0.1])
+        for _ in range(4):
+            move = mpc(x, [0, 0])
+            assert move.status in (km.Status.OPTIMAL, km.Status.SOFTENED), solver
+            x = plant(x, move.u)
+        plans.append(mpc.plan().U)
+    assert np.allclose(plans[1], plans[0], atol=1e-3)
+    assert np.allclose(plans[2], plans[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_copies_go_on_as_their_original_also_in_threads(solver: str) -> None:
+    plant, limits = pendulum(), km.Limits(-1, 1, du_max=0.3, x_max=[np.inf, 0.2])
+    mpc = km.NonlinearMPC(plant, km.Cost(Q=[2, 0.2], R=0.1), limits, 12, solver=solver)
+    start = np.array([0.45, 0.1])
+    start = plant(start, mpc(start, [0, 0]).u)
+
+    def run(controller: km.NonlinearMPC) -> np.ndarray:
+        x, inputs = start, []
+        for k in range(25):
+            inputs.append(controller(x, [0.01 * (k % 5), 0]).u)
+            x = plant(x, inputs[-1])
+        return np.array(inputs)
+
+    controllers = [copy.deepcopy(mpc), copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))]
+    alone = run(mpc)
+    with ThreadPoolExecutor(3) as pool:
+        for inputs in pool.map(run, controllers):
+            assert np.array_equal(inputs, alone)
+
+
+def test_several_starts_leave_a_local_optimum() -> None:
+    """Hanging, at rest, no small input changes 1 − cos θ: one start stays, several do not."""
+    plant, cost = pendulum(), km.Cost(Q=[1, 1, 0.01], R=0.01, of=UPRIGHT)
+    hanging = [np.pi, 0.0]
+    one, several = (km.NonlinearMPC(plant, cost, km.Limits(-2, 2), 30, starts=n) for n in (1, 5))
+    one(hanging, [0, 1, 0])
+    several(hanging, [0, 1, 0])
+    highest = [np.cos(mpc.plan().X[:, 0]).max() for mpc in (one, several)]
+    assert highest[1] > highest[0] + 0.1

@@ -1,4 +1,4 @@
-"""Rates, weights of changes, blocks, disturbances, latency and deadlines of the controllers on x⁺ = F(x, u)."""
+"""Rates, blocks, disturbances, latency, deadlines and copies of the controllers on x⁺ = F(x, u): both do the same."""
 
 import copy
 import pickle
@@ -40,19 +40,22 @@ def linear(disturbed: bool = False, mass: float = 1.0) -> km.LinearPredictor:
     return km.LinearPredictor(A, B / mass, np.eye(3), km.State(), 0.1, *names, E=E if disturbed else None)
 
 
-def built(kind, model, cost, limits, moves, **options):
+KINDS = ["bilinear", "nonlinear"]
+
+
+def built(kind, model, cost, limits, horizon=N, **options):
     if kind == "bilinear":
-        return km.BilinearMPC(model, cost, limits, N, moves=moves, sqp_iterations=3, **options)
+        return km.BilinearMPC(model, cost, limits, horizon, sqp_iterations=3, **options)
     tight = {"ipopt.tol": 1e-10, "ipopt.bound_relax_factor": 0.0}
-    return km.NonlinearMPC(model.step_map(), cost, limits, N, moves=moves, settings=tight, **options)
+    return km.NonlinearMPC(model, cost, limits, horizon, settings=tight, **options)
 
 
-@pytest.mark.parametrize("kind", ["bilinear", "nonlinear"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("mix", range(len(MIXES)))
 def test_on_a_linear_plant_all_features_are_koopman_mpc(kind, mix):
     cost, limits, moves = MIXES[mix]
     model = linear()
-    ours = built(kind, model, cost, limits, moves)
+    ours = built(kind, model, cost, limits, moves=moves)
     theirs = km.KoopmanMPC(model, cost, limits, N, moves=moves, solver="daqp")
     x, u = np.array([0.5, -0.4, 0.3]), np.array([0.1, -0.1])
     for mpc in (ours, theirs):
@@ -91,17 +94,18 @@ def test_the_program_with_rates_is_that_of_cvxpy():
         objective += cp.quad_form(U[k] - last, np.diag([0.5, 0.1]))
         last = U[k]
     cp.Problem(cp.Minimize(objective), held).solve(cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11)
-    for kind in ("bilinear", "nonlinear"):
-        mpc = built(kind, linear(), cost, limits, None)
+    for kind in KINDS:
+        mpc = built(kind, linear(), cost, limits)
         mpc.reset(u_prev=u0)
         assert mpc(x0, [0, 0, 0]).status is km.Status.SOFTENED
         np.testing.assert_allclose(mpc.plan().U, U.value, atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("latency", [0, 2])
-def test_a_measured_disturbance_and_its_preview_are_koopman_mpcs(latency):
+def test_a_measured_disturbance_and_its_preview_are_koopman_mpcs(kind, latency):
     model, cost, limits = linear(disturbed=True), R_DELTA, km.Limits(**BOX, du_max=0.3)
-    ours = km.BilinearMPC(model, cost, limits, N, sqp_iterations=3, latency=latency)
+    ours = built(kind, model, cost, limits, latency=latency)
     theirs = km.KoopmanMPC(model, cost, limits, N, latency=latency, solver="daqp")
     assert ours.horizon == theirs.horizon == N + latency
     rng, x = np.random.default_rng(0), np.array([0.3, -0.2, 0.1])
@@ -111,6 +115,19 @@ def test_a_measured_disturbance_and_its_preview_are_koopman_mpcs(latency):
         a, b = ours(x, r, w=W), theirs(x, r, w=W)
         np.testing.assert_allclose(a.u, b.u, atol=1e-6)
         x = A @ x + B @ a.u + 0.01 * rng.normal(size=3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_simulate_tells_them_what_is_measured(kind):
+    model = linear(disturbed=True)
+    W = 0.3 * np.sin(np.arange(15))[:, None]
+    runs = []
+    for mpc in (built(kind, model, R_DELTA, km.Limits(**BOX)), km.KoopmanMPC(model, R_DELTA, km.Limits(**BOX), N)):
+        x0, push = [0.3, -0.2, 0.1], W @ E.T
+        runs.append(
+            km.simulate(model.step_map(), mpc, x0=x0, reference=[0, 0, 0], steps=15, measured=W, disturbance=push)
+        )
+    np.testing.assert_allclose(runs[0].X, runs[1].X, atol=1e-5)
 
 
 def pendulum(mass: float = 1.0, load: float = 0.0, gravity: float = 0.05) -> km.BilinearPredictor:
@@ -126,9 +143,10 @@ def pendulum(mass: float = 1.0, load: float = 0.0, gravity: float = 0.05) -> km.
 TRACKED = km.Cost(Q=[10, 1], R=0.1, R_delta=0.01)
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("mass", "load"), [(1.0, 0.0), (1.0, 0.02), (1.2, 0.0), (1.2, -0.02)])
-def test_no_offset_is_left(mass, load):
-    mpc = km.BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3, du_max=1), 20, estimator=km.LiftedDisturbance(gain=0.2))
+def test_an_estimator_leaves_no_offset(kind, mass, load):
+    mpc = built(kind, pendulum(), TRACKED, km.Limits(-3, 3, du_max=1), 20, estimator=km.LiftedDisturbance(gain=0.2))
     truth = pendulum(mass, load).step_map()
     run = km.simulate(truth, mpc, x0=[0, 0], reference=[0.4, 0], steps=120)
     assert abs(run.X[-1, 0] - 0.4) < 1e-6
@@ -152,14 +170,12 @@ def test_a_setpoint_beyond_the_input_limit_is_held_as_nearly_as_the_plant_can():
     assert abs(-0.05 * np.sin(theta) + 0.1 * 0.15 * np.cos(theta) + 0.005) < 2e-3
 
 
-@pytest.mark.parametrize("kind", ["bilinear", "nonlinear"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_on_a_true_model_the_plan_happens_late(kind):
     model = pendulum()
-    limits = km.Limits(-3, 3, du_max=1)
-    if kind == "bilinear":
-        mpc = km.BilinearMPC(model, TRACKED, limits, 15, latency=2, sqp_iterations=30)
-    else:
-        mpc = km.NonlinearMPC(model.step_map(), TRACKED, limits, 15, latency=2)
+    options = {"sqp_iterations": 30} if kind == "bilinear" else {}
+    maker = km.BilinearMPC if kind == "bilinear" else km.NonlinearMPC
+    mpc = maker(model, TRACKED, km.Limits(-3, 3, du_max=1), 15, latency=2, **options)
     run = km.simulate(
         model.step_map(),
         mpc,
@@ -174,10 +190,11 @@ def test_on_a_true_model_the_plan_happens_late(kind):
     np.testing.assert_allclose(run.X[-1], 0, atol=1e-3)
 
 
-def test_an_update_is_a_new_controller():
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_update_is_a_new_controller(kind):
     old, new = pendulum(), pendulum(1.2, 0.01)
     limits = km.Limits(-3, 3, du_max=1)
-    updated, fresh = (km.BilinearMPC(model, TRACKED, limits, 15, sqp_iterations=20) for model in (old, new))
+    updated, fresh = (built(kind, model, TRACKED, limits, 15) for model in (old, new))
     updated([0.3, 0.1], [0.2, 0])
     updated.update(new)
     updated.reset()
@@ -190,8 +207,9 @@ def test_an_update_is_a_new_controller():
         x = new.step_map()(x, a.u)
 
 
-def test_an_update_keeps_the_plan():
-    mpc = km.BilinearMPC(pendulum(), TRACKED, km.Limits(-3, 3), 15)
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_update_keeps_the_plan_and_refuses_what_is_no_other_set_of_matrices(kind):
+    mpc = built(kind, pendulum(), TRACKED, km.Limits(-3, 3), 15)
     for _ in range(3):
         mpc([0.3, 0.1], [0.2, 0])
     before = mpc.plan()
@@ -211,22 +229,16 @@ def test_an_update_keeps_the_plan():
     )
     with pytest.raises(km.errors.DataError, match="another lifting than the controller's; make a new controller"):
         mpc.update(other)
+    fixed = built(kind, pendulum().step_map(), TRACKED, km.Limits(-3, 3), 15)
+    with pytest.raises(km.errors.DataError, match="a StepMap has no matrices that could be exchanged"):
+        fixed.update(pendulum().step_map())
 
 
-def whole():
-    return km.BilinearMPC(
-        linear(disturbed=True),
-        R_DELTA,
-        km.Limits(**BOX, du_max=0.3, du_slack=(5.0, 1.0), x_max=[0.45, np.inf, 0.3]),
-        N,
-        moves=6,
-        latency=1,
-        estimator=km.LiftedDisturbance(0.3),
-    )
-
-
-def test_a_copy_runs_as_its_original():
-    original = whole()
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_copy_runs_as_its_original(kind):
+    limits = km.Limits(**BOX, du_max=0.3, du_slack=(5.0, 1.0), x_max=[0.45, np.inf, 0.3])
+    options = {"moves": 6, "latency": 1, "estimator": km.LiftedDisturbance(0.3)}
+    original = built(kind, linear(disturbed=True), R_DELTA, limits, **options)
     inputs = []
     for mpc in (original, copy.deepcopy(original), pickle.loads(pickle.dumps(original))):
         mpc.reset()
@@ -325,49 +337,46 @@ def test_several_starts_with_rates_find_the_better_side():
     assert price(several.plan()) <= price(one.plan()) + 1e-3
 
 
-def test_what_cannot_be_is_refused_by_name():
-    said = shown(
-        """
-x = km.load_problem("pendulum")
-plant = km.discretize(x.dynamics, 0.05)
+CALLS = """
+plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
 flat = km.LinearPredictor.local(plant, [0, 0], [0])
-cost, limits = km.Cost(1, 0.1), km.Limits(-1, 1)
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
-from koopmpc.estimate.kalman import LiftedKalman
 still = km.LinearPredictor(np.eye(2), np.zeros((2, 0)), np.eye(2), km.State(), 0.1, ("a", "b"), ())
-mpc = km.KoopmanMPC(flat, cost, limits, 5)
-show(lambda: km.KoopmanMPC(plant, cost, limits, 5))
-show(lambda: km.KoopmanMPC(flat, limits, cost, 5))
-show(lambda: km.KoopmanMPC(flat, cost, cost, 5))
-show(lambda: mpc("fast", [0, 0]))
-show(lambda: mpc(None, [0, 0]))
-show(lambda: mpc([0, 0], "up"))
-show(lambda: km.NonlinearMPC(plant, cost, limits, 5, settings={"tol": 1}))
-show(lambda: km.NonlinearMPC("flat", cost, limits, 5))
-show(lambda: BilinearMPC(still, cost, limits, 5))
-show(lambda: BilinearMPC(plant, limits, cost, 5))
-show(lambda: BilinearMPC("model", cost, limits, 5))
-show(lambda: BilinearMPC(flat, cost, limits, 5, estimator=LiftedKalman("theta")))
-show(lambda: BilinearMPC(flat, cost, limits, 5)([0, 0], [0, 0], w=[1.0]))
-show(lambda: BilinearMPC(flat, cost, limits, 5)("now", [0, 0]))
+cost, limits = km.Cost(1, 0.1), km.Limits(-1, 1)
 """
-    )
-    wanted = [
-        "DataError predictor is a StepMap, expected a LinearPredictor; fit one with edmd, or use LinearMPC",
-        "DataError cost is a Limits; pass a Cost, and the Limits after it",
-        "DataError limits is a Cost; pass Limits, or None",
-        "DataError y is not an array of numbers: got str",
-        "DataError y is not an array of numbers: got NoneType",
-        "DataError reference is not an array of numbers: got str",
-        "DataError ipopt was not built with settings {'tol': 1}",
-        "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
-        "DataError the model has no inputs",
-        "DataError cost is a Limits",
-        "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a StepMap",
-        "DataError LiftedKalman filters the lifted state of a linear predictor, and this controller plans in the state",
-        "DataError w was passed, but the predictor has no E",
-        "DataError y is not an array of numbers: got str",
-    ]
-    assert len(said) == len(wanted)
-    for line, start in zip(said, wanted, strict=True):
+REFUSALS = {
+    "KoopmanMPC(plant, cost)": "DataError predictor is a StepMap, expected a LinearPredictor; fit one with edmd, or use",
+    "KoopmanMPC(flat, limits, cost)": "DataError cost is a Limits; pass a Cost, and the Limits after it",
+    "KoopmanMPC(flat, cost, cost)": "DataError limits is a Cost; pass Limits, or None",
+    "KoopmanMPC(flat, cost)(None, [0, 0])": "DataError y is not an array of numbers: got NoneType",
+    'KoopmanMPC(flat, cost)("fast", [0, 0])': "DataError y is not an array of numbers: got str",
+    'KoopmanMPC(flat, cost)([0, 0], "up")': "DataError reference is not an array of numbers: got str",
+    'BilinearMPC("model", cost)': "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a",
+    'NonlinearMPC("flat", cost)': "DataError model is a str, expected a BilinearPredictor or a LinearPredictor or a",
+    "BilinearMPC(still, cost)": "DataError the model has no inputs",
+    "BilinearMPC(plant, limits, cost)": "DataError cost is a Limits; pass a Cost, and the Limits after it",
+    "BilinearMPC(flat, cost, cost)": "DataError limits is a Cost; pass Limits, or None",
+    "BilinearMPC(plant, cost, horizon=0)": "DataError horizon is 0; it must be at least 1",
+    "NonlinearMPC(plant, cost, horizon=0)": "DataError horizon is 0; it must be at least 1",
+    "BilinearMPC(plant, cost, sqp_iterations=0)": "DataError sqp_iterations is 0; it must be at least 1",
+    "NonlinearMPC(plant, cost, starts=0)": "DataError starts is 0; it must be at least 1",
+    'NonlinearMPC(plant, cost, solver="acados")': 'DataError solver is \'acados\'; pass "ipopt", "fatrop" or',
+    'NonlinearMPC(plant, cost, settings={"tol": 1})': "DataError ipopt was not built with settings {'tol': 1}",
+    "NonlinearMPC(plant, km.Cost([1, 1, 1], 1))": "ShapeError Q has shape (3,), expected (2, 2) or its diagonal",
+    "NonlinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(3)))": "ShapeError Q_N has shape (3, 3), expected (2, 2)",
+    "BilinearMPC(plant, km.Cost(1, 1, Q_N=np.eye(2), of=km.Constant()))": "ShapeError Q_N weighs x_N − r_N, but the",
+    "BilinearMPC(plant, cost, km.Limits(x_max=[1, 1, 1]))": "ShapeError x_max has shape (3,), expected (2,) or a",
+    'BilinearMPC(flat, cost, estimator=km.LiftedKalman("theta"))': "DataError LiftedKalman filters the lifted state of a linear predictor,",
+    'NonlinearMPC(flat, cost, estimator=km.LiftedKalman("theta"))': "DataError LiftedKalman filters the lifted state of a linear predictor,",
+    "BilinearMPC(flat, cost)([0, 0], [0, 0], w=[1.0])": "DataError w was passed, but the predictor has no E",
+    "NonlinearMPC(plant, cost)([0, 0], [0, 0], w=[1.0])": "DataError w was passed, but the predictor has no E",
+    'BilinearMPC(flat, cost)("now", [0, 0])': "DataError y is not an array of numbers: got str",
+    "BilinearMPC(plant, cost)([0] * 3, [0, 0])": "ShapeError y has shape (3,), expected (2,), one value a state",
+    "NonlinearMPC(plant, cost)([0, 0], [0, 0, 0])": "ShapeError reference has shape (3,), expected (2,), or rows of 2",
+}
+
+
+def test_messages():
+    said = shown(CALLS + "".join(f"show(lambda: km.{call})\n" for call in REFUSALS))
+    assert len(said) == len(REFUSALS)
+    for line, start in zip(said, REFUSALS.values(), strict=True):
         assert line.startswith(start), line
