@@ -160,9 +160,8 @@ class Equilibria:
     ) -> Equilibrium:
         """Return the equilibrium that holds a reference row, by ipopt: from `near`, or from several guesses."""
         model, inputs, box = self.model, self._outputs.inputs, self._outputs.outputs
-        nx, e = model.nx, np.zeros(model.nx) if e is None else e
-        u = np.clip(np.zeros(model.nu), *inputs)
-        x = np.zeros(nx)
+        nx, u = model.nx, np.clip(np.zeros(model.nu), *inputs)
+        x, e = np.zeros(nx), np.zeros(nx) if e is None else e
         if self.of_state:
             x = row if model.embedding is None else model.embedding.held(row, u)
         guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
@@ -175,17 +174,14 @@ class Equilibria:
         for limits in (box, Interval(-unlimited, unlimited)):
             found, least = None, np.inf
             for guess in guesses:
-                solved = cast(
-                    "dict[str, Any]",
-                    self._solver(
-                        p=np.concatenate([row, model.theta, e]),
-                        x0=guess,
-                        lbx=np.concatenate([np.full(nx, -np.inf), inputs.low]),
-                        ubx=np.concatenate([np.full(nx, np.inf), inputs.high]),
-                        lbg=np.concatenate([np.zeros(nx), limits.low]),
-                        ubg=np.concatenate([np.zeros(nx), limits.high]),
-                    ),
-                )
+                bounds = {
+                    "lbx": np.concatenate([np.full(nx, -np.inf), inputs.low]),
+                    "ubx": np.concatenate([np.full(nx, np.inf), inputs.high]),
+                    "lbg": np.concatenate([np.zeros(nx), limits.low]),
+                    "ubg": np.concatenate([np.zeros(nx), limits.high]),
+                }
+                p = np.concatenate([row, model.theta, e])
+                solved = cast("dict[str, Any]", self._solver(p=p, x0=guess, **bounds))
                 if self._solver.stats()["success"] and float(solved["f"]) < least:
                     found, least = solved["x"].full().ravel(), float(solved["f"])
                 if least <= good:
@@ -229,6 +225,7 @@ class TerminalTargets:
 
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking, most: int) -> None:
         self._cost, self._outputs, self._most = cost, outputs, most
+        self._hold = cost.u_target == "equilibrium"
         self.equilibria = Equilibria(model, cost, outputs)
         if cost.Q_N is not None:
             checks.weight(cost.Q_N, "Q_N", model.ny)
@@ -265,19 +262,15 @@ class TerminalTargets:
         target = self(row)
         begin = (target if last is None else last).equilibrium
         found = self.equilibria.near(begin, row, e, CLOSE) or self.equilibria.find(row, e, begin)
-        u, m = self._input(found), target.m
+        u, m = found.u * self._hold, target.m
         if self._cost.Q_N is None:
             m = target.M @ self.equilibria.linearise(found.x, found.u).of + target.L @ found.x + target.V @ u
         return target._replace(equilibrium=found, u=u, m=m)
 
-    def _input(self, found: Equilibrium) -> Float[np.ndarray, " nu"]:
-        """Return the reference input."""
-        return found.u if self._cost.u_target == "equilibrium" else np.zeros_like(found.u)
-
     def _target(self, row: Float[np.ndarray, " nr"], found: Equilibrium) -> TerminalTarget:
         o, nx, nr, Q = self._outputs, len(found.x), len(row), self._outputs.Q
-        at, u = self.equilibria.linearise(found.x, found.u), self._input(found)
-        slope = self.equilibria.slope(at) * (self._cost.u_target == "equilibrium")
+        at, u = self.equilibria.linearise(found.x, found.u), found.u * self._hold
+        slope = self.equilibria.slope(at) * self._hold
         if self._cost.Q_N is not None:
             M, L, V = (np.zeros((nx + nr, columns)) for columns in (nr, nx, len(u)))
             M[:nr] = root(checks.weight(self._cost.Q_N, "Q_N", nr))
