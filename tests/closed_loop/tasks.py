@@ -18,12 +18,9 @@ class Task:
 
     Attributes
     ----------
-    name
-        Of the row in the table.
-    truth
-        The plant that is driven, and whose optimum is the measure.
-    model
-        What the training data and the equations are of; None where it is the truth.
+    truth, model
+        The plant that is driven, whose optimum is the measure; the one that the training data and the equations are
+        of, None where it is the same.
     around
         (x, u) at which LQR and LinearMPC linearise the model.
     training
@@ -32,10 +29,8 @@ class Task:
         Weights of the tracked states and of the inputs.
     tracked
         Names of the tracked states, in the order of Q and of the reference; None for all.
-    reference
-        (nr,) or (steps+1, nr).
-    starts
-        Initial states; each is one run.
+    reference, starts
+        (nr,) or (steps+1, nr); initial states, each of which is one run.
     u_target
         Which inputs cost nothing: those that hold the reference, or zero.
     noise
