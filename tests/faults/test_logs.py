@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.loop.run import Plans
 from tests.recording.runs import about, make_run, steps_of
 
 
-def test_a_log_that_is_no_log(tmp_path: Path) -> None:
+def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
     text, empty, folder = tmp_path / "notes.rrd", tmp_path / "empty.rrd", tmp_path / "folder.rrd"
     text.write_text("these are notes")
     empty.touch()
@@ -29,7 +28,7 @@ def test_a_log_that_is_no_log(tmp_path: Path) -> None:
         km.load_run(tmp_path / "nowhere.rrd")
 
 
-def test_a_recording_of_something_else(tmp_path: Path) -> None:
+def test_a_recording_of_something_else_is_refused(tmp_path: Path) -> None:
     import rerun as rr
 
     other = rr.RecordingStream("something_else")
@@ -43,7 +42,7 @@ def test_a_recording_of_something_else(tmp_path: Path) -> None:
         km.load_run(tmp_path / "other.rrd")
 
 
-def test_a_log_without_a_step(tmp_path: Path) -> None:
+def test_a_log_without_a_whole_step_is_refused(tmp_path: Path) -> None:
     run = make_run()
     with km.Recorder(tmp_path / "none.rrd", **about(run)):
         pass
@@ -102,7 +101,7 @@ def head(run: km.Run, steps: int) -> km.Run:
         run,
         **{name: getattr(run, name)[: steps + 1] for name in ends},
         **{name: getattr(run, name)[:steps] for name in moves},
-        plans=Plans(run.plans.X[:steps], run.plans.U[:steps]),
+        plans=km.loop.Plans(run.plans.X[:steps], run.plans.U[:steps]),
     )
 
 

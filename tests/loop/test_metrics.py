@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.loop.metrics import duration
+from tests.control.models import linear, step_map
 
 STATES = ("theta [rad]", "omega [rad/s]")
 
@@ -44,7 +45,7 @@ def wrapped(angle):
 
 
 @given(seed=st.integers(0, 2**32 - 1), angles=st.sampled_from([(), (0,), (0, 1)]))
-def test_against_loops(seed, angles):
+def test_each_figure_is_what_its_equation_says_summed_step_by_step(seed, angles):
     rng = np.random.default_rng(seed)
     Q, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[0.7]])
     of = km.Fourier(1, states=["theta"])
@@ -115,13 +116,13 @@ def test_tracked_observables_wrap_only_where_they_are_the_angle():
         ([np.nan, 0, 0, 0, 0], np.inf),
     ],
 )
-def test_settling_time(errors, settled):
+def test_a_run_settles_after_the_last_step_outside_two_percent(errors, settled):
     run = random_run(np.random.default_rng(2), T=4, cost=km.Cost(1, 0))
     X = np.column_stack([errors, np.zeros(5)])
     assert km.metrics(replace(run, X=X, reference=np.zeros((5, 2)))).settling_time == pytest.approx(settled)
 
 
-def test_without_a_cost_and_with_a_hidden_state():
+def test_without_a_cost_there_is_none_and_measurements_stand_in_for_a_hidden_state():
     rng = np.random.default_rng(3)
     run = random_run(rng)
     found = km.metrics(run)
@@ -134,13 +135,7 @@ def test_without_a_cost_and_with_a_hidden_state():
     assert np.isnan(km.metrics(blind).cost)
 
 
-def test_a_reference_that_does_not_fit_the_cost():
-    run = random_run(np.random.default_rng(4), nr=1)
-    with pytest.raises(km.errors.ShapeError, match=r"the reference has shape \(13, 1\), what it is for \(13, 2\)"):
-        km.metrics(run)
-
-
-def test_rest_where_the_reference_is_held_costs_nothing():
+def test_rest_on_the_reference_costs_nothing():
     """x⁺ = 0.5 x + u stays at 1 under u = 0.5: cost zero with that u_reference, its charge without."""
     rng = np.random.default_rng(5)
     run = random_run(rng, cost=km.Cost(1, 2.0))
@@ -151,7 +146,7 @@ def test_rest_where_the_reference_is_held_costs_nothing():
     assert km.metrics(free).effort == km.metrics(rest).effort
 
 
-def test_they_print_as_lines_to_read():
+def test_metrics_print_a_figure_a_line():
     """A line a figure: every number that the fields hold can be found in it."""
     run = random_run(np.random.default_rng(6), cost=km.Cost(1, 1))
     found = replace(km.metrics(run), settling_time=2.35, solve_time_p50=13e-6, solve_time_p99=4.2e-3)
@@ -174,7 +169,7 @@ def test_a_duration_is_right_to_its_digits(seconds):
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, 1e200])
-def test_a_measurement_that_is_no_number_beside_a_hidden_state(value):
+def test_an_infinite_measurement_beside_a_hidden_state_costs_no_number(value):
     """Warnings are errors here. What is beyond no limit is not beyond: only the upper one stands."""
     run = random_run(np.random.default_rng(7), cost=km.Cost(1, 1), limits=km.Limits(x_max=[np.inf, 100.0]))
     Y = run.Y.copy()
@@ -193,3 +188,23 @@ def test_figures_of_named_outputs_stand_each_in_a_line():
         np.testing.assert_allclose([float(line) for line in lines], values, rtol=1e-3)
         plain.pop(what)
     assert named == plain
+
+
+A, B = np.array([[1.05, 0.1], [0.08, 1.0]]), np.array([[0.005], [0.1]])
+
+
+def test_the_change_of_the_inputs_is_charged_and_its_limits_count_as_limits():
+    cost, limits = km.Cost(1, 0.1), km.Limits(-1, 1)
+    mpc = km.KoopmanMPC(linear(A, B), cost, limits, 10)
+    go = lambda cost, limits: km.metrics(  # noqa: E731
+        km.simulate(step_map(A, B), mpc, x0=[0.6, 0.0], reference=[0.0, 0.0], steps=20, cost=cost, limits=limits)
+    )
+    plain = go(cost, limits)
+    result = km.simulate(step_map(A, B), mpc, x0=[0.6, 0.0], reference=[0.0, 0.0], steps=20)
+    changes = np.diff(result.U[:, 0])
+    dearer = go(km.Cost(1, 0.1, R_delta=2.0), limits)
+    assert dearer.cost == pytest.approx(plain.cost + 2.0 * changes @ changes)
+    rated = go(cost, km.Limits(-1, 1, du_max=0.05))
+    assert plain.violation == 0.0
+    assert rated.violation == pytest.approx(np.abs(changes).max() - 0.05)
+    assert rated.input_violation == 0.0

@@ -1,4 +1,3 @@
-import casadi as ca
 import numpy as np
 import pytest
 
@@ -29,7 +28,7 @@ def mpc(**kwargs):
     return km.KoopmanMPC(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, **kwargs)
 
 
-def test_it_is_the_loop_one_would_write():
+def test_simulate_is_the_loop_that_one_would_write():
     plant, controller, other = step_map(A, B), mpc(), mpc()
     steps = 20
     t = np.arange(steps + 1)
@@ -72,7 +71,7 @@ def test_it_is_the_loop_one_would_write():
 
 
 @pytest.mark.parametrize("preview", [True, False])
-def test_what_the_controller_gets(preview):
+def test_the_controller_gets_the_references_ahead_and_what_was_applied(preview):
     controller = Recorded()
     reference = np.arange(12.0).reshape(6, 2)
     run = km.simulate(step_map(A, B), controller, x0=[1, 2], reference=reference, steps=5, preview=preview)
@@ -88,7 +87,7 @@ def test_what_the_controller_gets(preview):
             assert applied is None
 
 
-def test_a_reference_that_is_held():
+def test_one_reference_is_held_throughout():
     one = km.simulate(step_map(A, B), mpc(), x0=[0.5, 0], reference=[0.2, 0], steps=8)
     many = km.simulate(step_map(A, B), mpc(), x0=[0.5, 0], reference=[[0.2, 0]] * 9, steps=8)
     np.testing.assert_array_equal(one.U, many.U)
@@ -203,90 +202,65 @@ def test_a_sensor_that_fails_does_not_stop_the_loop():
     np.testing.assert_array_equal(run.U[3:6], run.plans.U[2, 1:4])
 
 
-class Says(Recorded):
-    def __init__(self, u):
-        super().__init__()
-        self.u = np.array(u)
-
-    def __call__(self, y, reference, applied=None):
-        move = super().__call__(y, reference, applied)
-        move.u = self.u
-        return move
+P, Q, E = np.array([[1.05, 0.1], [0.08, 1.0]]), np.array([[0.005], [0.1]]), np.array([[0.02], [0.1]])
 
 
-def test_messages():
-    plant, ones = step_map(A, B), np.ones((5, 2))
-    x = ca.SX.sym("x", 2)
-    slow = km.StepMap(ca.Function("F", [x, ca.SX.sym("u", 1)], [x]), 0.2)
-    two = step_map(A, np.eye(2))
+class Told:
+    """A controller that keeps what w it was told."""
 
-    def run(plant=plant, controller=None, steps=5, reference=(0, 0), x0=(0, 0), **kwargs):
-        controller = Recorded() if controller is None else controller
-        km.simulate(plant, controller, x0=x0, reference=reference, steps=steps, **kwargs)
+    dt, nu = 0.1, 1
 
-    for error, text, call in (
-        (
-            km.errors.DataError,
-            r"the controller has dt = 0.1 s, the plant 0.2 s; use one dt for both",
-            lambda: run(slow),
-        ),
-        (km.errors.ShapeError, r"the controller returns 1 inputs, the plant takes 2", lambda: run(two)),
-        (km.errors.DataError, r"steps is 0; it must be at least 1", lambda: run(steps=0)),
-        (km.errors.ShapeError, r"x0 has shape \(3,\), expected \(2,\)", lambda: run(x0=[0, 0, 0])),
-        (
-            km.errors.ShapeError,
-            r"reference has shape \(5, 2\), expected \(nr,\) or \(steps\+1, nr\) = \(6, nr\)",
-            lambda: run(reference=ones),
-        ),
-        (km.errors.DataError, r"reference holds 1 NaN or inf", lambda: run(reference=[0, np.nan])),
-        (
-            km.errors.ShapeError,
-            r"reference has 2 columns, the cost tracks 3 outputs; pass one a column",
-            lambda: run(cost=km.Cost(1, 1, of=km.State() + km.Constant())),
-        ),
-        (km.errors.DataError, r"angles holds 2; pass indices of states, 0 to 1", lambda: run(angles=[2])),
-        (
-            km.errors.ShapeError,
-            r"disturbance has shape \(3,\), expected \(2,\) or a scalar",
-            lambda: run(disturbance=[1, 1, 1]),
-        ),
-        (
-            km.errors.ShapeError,
-            r"disturbance has shape \(6, 2\), expected \(5, 2\)",
-            lambda: run(disturbance=np.ones((6, 2))),
-        ),
-        (
-            km.errors.ShapeError,
-            r"disturbance has shape \(3,\), expected \(2,\)",
-            lambda: run(disturbance=lambda k, r: ones[:3, 0]),
-        ),
-        (
-            km.errors.ShapeError,
-            r"u_reference has shape \(6, 1\), expected \(5, 1\)",
-            lambda: run(u_reference=np.ones((6, 1))),
-        ),
-        (
-            km.errors.ShapeError,
-            r"u_reference has shape \(2,\), expected \(1,\)",
-            lambda: run(u_reference=[1.0, 2.0]),
-        ),
-        (km.errors.ShapeError, r"noise has shape \(3,\), expected \(2,\) or a scalar", lambda: run(noise=[1, 1, 1])),
-        (km.errors.ShapeError, r"noise has shape \(5, 2\), expected \(6, 2\)", lambda: run(noise=ones)),
-        (
-            km.errors.DataError,
-            r"a disturbance is added to the next state: pass a StepMap or a SimulatedPlant",
-            lambda: run(Outside(), disturbance=0.1),
-        ),
-        (
-            km.errors.DataError,
-            r"the controller returned u = \[nan\] at step 0; every input must be finite",
-            lambda: run(controller=Says([np.nan])),
-        ),
-        (
-            km.errors.ShapeError,
-            r"the controller returned u of shape \(2,\) at step 0, expected \(1,\)",
-            lambda: run(controller=Says([1.0, 2.0])),
-        ),
-    ):
-        with pytest.raises(error, match=text):
-            call()
+    def __init__(self, horizon):
+        self.horizon, self.told = horizon, []
+
+    def reset(self, x0=None, u_prev=None):
+        pass
+
+    def __call__(self, y, reference, applied=None, w=None):
+        self.told.append(None if w is None else np.array(w))
+        return km.Move(np.zeros(1), km.Status.OPTIMAL, km.control.Fallback.NONE, 0.0, 0)
+
+
+def told_run(controller, **more):
+    return km.simulate(step_map(P, Q), controller, x0=[0.0, 0.0], reference=[0.0, 0.0], steps=6, **more)
+
+
+def test_a_controller_is_told_the_measured_disturbances_ahead():
+    W = np.arange(12.0).reshape(6, 2)
+    whole = np.vstack([W, np.tile(W[-1], (3, 1))])
+    controller = Told(3)
+    result = told_run(controller, measured=W)
+    for k, told in enumerate(controller.told):
+        np.testing.assert_array_equal(told, whole[k : k + 3])
+    assert result.metadata["measured"] == W.tolist()
+    controller = Told(3)
+    told_run(controller, measured=W, preview=False)
+    np.testing.assert_array_equal(controller.told, W)
+    controller = Told(0)
+    told_run(controller, measured=[4.0])
+    assert all(told.tolist() == [[4.0]] for told in controller.told)
+    controller = Told(3)
+    assert "measured" not in told_run(controller).metadata
+    assert controller.told == [None] * 6
+
+
+def test_a_disturbance_that_is_told_ahead_costs_less():
+    """A pulse that is measured costs less than one that is not, and least with its preview."""
+    base = linear(P, Q)
+    model = km.LinearPredictor(P, Q, np.eye(2), base.lifting, 0.1, base.states, base.inputs, E=E)
+    cost, steps = km.Cost([2, 1], 0.01), 60
+    W = np.where((np.arange(steps) >= 25) & (np.arange(steps) < 40), 0.5, 0.0)[:, None]
+    costs = []
+    for more in ({}, {"measured": W, "preview": False}, {"measured": W}):
+        result = km.simulate(
+            step_map(P, Q),
+            km.KoopmanMPC(model, cost, km.Limits(-3, 3), 15),
+            x0=[0.0, 0.0],
+            reference=[0.0, 0.0],
+            steps=steps,
+            cost=cost,
+            disturbance=W @ E.T,
+            **more,
+        )
+        costs.append(km.metrics(result).cost)
+    assert costs[2] < costs[1] < costs[0]

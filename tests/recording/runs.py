@@ -4,8 +4,6 @@ import numpy as np
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.move import Fallback, Plan
-from koopmpc.loop.run import Plans, Step
 
 metadata = st.dictionaries(
     st.text(max_size=8),
@@ -69,7 +67,7 @@ def make_run(
         U=numbers(T, nu),
         reference=numbers(T + 1, nx if cost else 3),
         status=tuple(rng.choice(list(km.Status), T)),
-        fallback=tuple(rng.choice(list(Fallback), T, p=[0.7, 0.1, 0.1, 0.1])),
+        fallback=tuple(rng.choice(list(km.control.Fallback), T, p=[0.7, 0.1, 0.1, 0.1])),
         solve_time=rng.random(T) * 1e-3,
         iterations=rng.integers(0, 4000, T),
         cost=km.Cost(Q=rng.random(nx), R=np.eye(nu) / 3) if cost else None,
@@ -80,7 +78,7 @@ def make_run(
         states=states,
         inputs=tuple(f"input {i}" for i in range(nu)),
         outputs=states if ny == nx else tuple(f"output {i}" for i in range(ny)),
-        plans=None if N is None else Plans(numbers(T, N + 1, nx), numbers(T, N, nu)),
+        plans=None if N is None else km.loop.Plans(numbers(T, N + 1, nx), numbers(T, N, nu)),
         angles=(nx - 1,),
         metadata={} if metadata is None else metadata,
         slack=np.where(rng.random(T) < 0.5 * held, rng.random(T), 0.0),
@@ -88,10 +86,10 @@ def make_run(
     )
 
 
-def steps_of(run: km.Run) -> list[Step]:
+def steps_of(run: km.Run) -> list[km.loop.Step]:
     """Return what an observer of `run` sees."""
     return [
-        Step(
+        km.loop.Step(
             k=k,
             y=run.Y[k],
             u=run.U[k],
@@ -105,7 +103,7 @@ def steps_of(run: km.Run) -> list[Step]:
                 float(run.slack[k]),
             ),
             x=run.X[k],
-            plan=None if run.plans is None else Plan(run.plans.X[k], run.plans.U[k]),
+            plan=None if run.plans is None else km.control.Plan(run.plans.X[k], run.plans.U[k]),
             x_next=run.X[k + 1],
             y_next=run.Y[k + 1],
             reference_next=run.reference[k + 1],

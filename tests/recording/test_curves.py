@@ -1,9 +1,7 @@
 """record_curves: what is written can be read, and what would end the viewer is not written."""
 
 import numpy as np
-import pytest
 
-import koopmpc as km
 from koopmpc.recording.views.curves import Curves, record_curves
 
 
@@ -33,16 +31,3 @@ def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
     assert flat["/one_two/v_m_s/0_truth"] == truth[:, 1].tolist()
     assert "/one_two/v_m_s/1_model_a" not in flat
     assert flat["/page"] == ["# U^T"]
-
-
-def test_refusals(tmp_path):
-    tab = Curves("one", 0.1, ("x",), {"truth": np.zeros((3, 1))})
-    with pytest.raises(km.errors.DataError, match="there is no curve to record"):
-        record_curves([], tmp_path / "c.rrd", application="koopmpc-test", page="")
-    with pytest.raises(km.errors.DataError, match="two tabs are called 'one'"):
-        record_curves([tab, tab], tmp_path / "c.rrd", application="koopmpc-test", page="")
-    wide = Curves("one", 0.1, ("x", "y"), {"truth": np.zeros((3, 1))})
-    with pytest.raises(km.errors.ShapeError, match=r"truth has shape \(3, 1\), expected \(any, 2\)"):
-        record_curves([wide], tmp_path / "c.rrd", application="koopmpc-test", page="")
-    with pytest.raises(km.errors.LogError, match="is a folder"):
-        record_curves([tab], tmp_path, application="koopmpc-test", page="")

@@ -1,5 +1,7 @@
 """The law of a log: load_run(record(run)) is run, to the bit."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.loop.run import About, Run, StepRows
-from koopmpc.recording.description import from_json, to_json, to_markdown
+from koopmpc.loop.run import StepRows
 from koopmpc.recording.format.rows import block_of_run, blocks
 from tests.recording.runs import make_run, options
 
@@ -67,14 +68,14 @@ def test_a_scene_whose_shapes_change_is_refused(ahead: bool, tmp_path: Path) -> 
 
 @settings(max_examples=30)
 @given(T=st.integers(1, 12), least=st.integers(1, 4), most=st.integers(1, 6), k=st.integers(0, 5))
-def test_blocks_are_the_rows(T: int, least: int, most: int, k: int) -> None:
+def test_blocks_joined_are_the_run_again(T: int, least: int, most: int, k: int) -> None:
     run = make_run(T=T, N=2)
     rows = replace(block_of_run(run), k=k, planned=np.arange(k, k + T))
     parts = blocks(rows, least, most)
     assert len(parts) <= most
     assert all(len(part.U) >= min(least, T) for part in parts)
     assert [part.k for part in parts] == [k + sum(len(p.U) for p in parts[:i]) for i in range(len(parts))]
-    assert Run(**StepRows.joined(parts).columns(), **run.about()) == replace(run, plans=None)
+    assert km.Run(**StepRows.joined(parts).columns(), **run.about()) == replace(run, plans=None)
     assert all(np.array_equal(p.planned, p.k + np.arange(len(p.U))) for p in parts)
     assert np.array_equal(np.concatenate([p.plan_X for p in parts]), run.plans.X)
     assert np.array_equal(np.concatenate([p.plan_U for p in parts]), run.plans.U)
@@ -105,32 +106,20 @@ def test_logs_of_one_problem_share_the_application_but_no_recording(tmp_path: Pa
     assert len({entry.recording_id for entry in entries}) == 2
 
 
-def test_the_description_says_what_ran_and_with_what() -> None:
-    told = {
-        "problem": "pendulum",
-        "case": "upright",
-        "controller": "lqr",
-        "seed": 7,
-        "versions": {"casadi": "9.9"},
-    }
-    page = to_markdown(About(**make_run(metadata=told).about()))
-    assert page.startswith("# pendulum · upright · lqr")
-    for part in (
-        "| seed | 7 |",
-        "casadi 9.9",
-        "| u_max | [",
-        "state 0 [m]",
-        "written with",
-        "rerun-sdk 0.41",
-    ):
-        assert part in page
+def test_a_log_opens_as_the_episode_of_its_run(tmp_path: Path) -> None:
+    run = make_run(T=12)
+    km.record(run, tmp_path / "run.rrd")
+    read = km.load_episodes(tmp_path / "run.rrd")
+    assert (read.dt, read.states, read.inputs) == (run.dt, run.states, run.inputs)
+    assert np.array_equal(read[0].X, run.X)
+    assert np.array_equal(read[0].U, run.U)
 
 
-def test_the_description_is_exact_data() -> None:
-    run = make_run(metadata={"a": [1, 2.5, None], "b": {"c": float("nan")}, "d": np.arange(3.0)})
-    about, steps = from_json(to_json(About(**run.about()), 20))
-    assert about == About(**run.about())
-    assert steps == 20
+def test_a_log_is_read_by_a_process_that_has_recorded_nothing(tmp_path: Path) -> None:
+    km.record(make_run(T=12), tmp_path / "run.rrd")
+    code = f"import koopmpc as km; print(len(km.load_episodes({str(tmp_path / 'run.rrd')!r})[0].U))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "12\n"
 
 
 def test_metadata_that_is_no_data_is_refused_before_a_file_is_made(tmp_path: Path) -> None:

@@ -14,6 +14,10 @@ from koopmpc.validate.bands import forecast
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 
 DATA = episodes(24, noise=0.05)
+BILINEAR = km.BilinearPredictor(
+    turning().A, turning().B, np.zeros((1, 2, 2)), np.eye(2), km.State(), DT, STATES, INPUTS
+)
+DEFECTIVE = km.LinearPredictor([[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
 
 
 @pytest.fixture(scope="module")
@@ -104,31 +108,13 @@ def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None
 
 def test_what_has_no_eigenfunctions_says_so(tmp_path: Path) -> None:
     data = episodes(2)
-    bilinear = km.BilinearPredictor(
-        turning().A, turning().B, np.zeros((1, 2, 2)), np.eye(2), km.State(), DT, STATES, INPUTS
-    )
-    defective = km.LinearPredictor([[0.9, 1.0], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
-    for model, words in ((bilinear, "has no eigenfunctions"), (defective, "A is defective")):
+    for model, words in ((BILINEAR, "has no eigenfunctions"), (DEFECTIVE, "A is defective")):
         km.recording.record_model(model, data, tmp_path / "a.rrd", horizon=5)
         assert words in _read(tmp_path / "a.rrd", "/report").static("/report", "text")
     one = km.LinearPredictor([[0.9]], [[1.0]], [[1.0]], km.State(), DT, STATES[:1], INPUTS)
     small = km.Episodes([type(e)(X=e.X[:, :1], U=e.U) for e in data], DT, STATES[:1], INPUTS)
     km.recording.record_model(one, small, tmp_path / "b.rrd", horizon=5)
     assert "has one state" in _read(tmp_path / "b.rrd", "/report").static("/report", "text")
-    with pytest.raises(km.errors.DataError, match="a bilinear predictor has no eigenfunctions; leave `which` out"):
-        km.recording.record_model(bilinear, data, tmp_path / "a.rrd", which=[0])
-    with pytest.raises(km.errors.DataError, match="A is defective"):
-        km.recording.record_model(defective, data, tmp_path / "a.rrd", which=[0])
-
-
-def test_messages(tmp_path: Path) -> None:
-    with pytest.raises(km.errors.DataError, match="episode 0 has 30 steps, the horizon is 31"):
-        km.recording.record_model(turning(), DATA, tmp_path / "a.rrd", horizon=31)
-    with pytest.raises(km.errors.DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
-        km.recording.record_model(turning(), DATA, tmp_path / "a.rrd", which=[2])
-    (tmp_path / "file").write_text("")
-    with pytest.raises(km.errors.LogError, match="cannot be written"):
-        km.recording.record_model(turning(), DATA, tmp_path / "file" / "a.rrd")
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.loop.run import Step
 from koopmpc.recording import viewer as connect
 from koopmpc.recording.viewer import free_port, start_viewer
 from tests.recording.runs import about, make_run, steps_of
@@ -42,13 +41,13 @@ def test_steps_without_a_plan_leave_a_gap_in_the_plans(tmp_path: Path) -> None:
     assert km.load_run(tmp_path / "run.rrd") == run
 
 
-def test_a_loop_of_ones_own_needs_only_y_u_and_the_reference(tmp_path: Path) -> None:
+def test_a_loop_of_your_own_needs_only_y_u_and_the_reference(tmp_path: Path) -> None:
     run = make_run()
     y, u = np.zeros(2), np.zeros(1)
     with km.Recorder(tmp_path / "run.rrd", dt=0.1, states=run.states, inputs=run.inputs) as recorder:
         for k in range(run.steps):
             y[:], u[:] = run.Y[k], run.U[k]  # the same arrays again: the Recorder keeps copies
-            recorder(Step(k, y, u, run.reference[k], y_next=run.Y[-1] if k == run.steps - 1 else None))
+            recorder(km.loop.Step(k, y, u, run.reference[k], y_next=run.Y[-1] if k == run.steps - 1 else None))
     read = km.load_run(tmp_path / "run.rrd")
     assert np.array_equal(read.Y, run.Y)
     assert np.array_equal(read.U, run.U)
@@ -98,20 +97,6 @@ def test_a_viewer_that_fails_to_start_is_told(tmp_path: Path, monkeypatch: pytes
     assert km.load_run(tmp_path / "run.rrd") == run
 
 
-def test_a_path_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
-    run = make_run()
-    (tmp_path / "file").touch()
-    with pytest.raises(km.errors.LogError, match=rf"{tmp_path} is a folder; pass the path of a file in it"):
-        km.record(run, tmp_path)
-    with pytest.raises(km.errors.LogError, match=r"file/run\.rrd cannot be written: .+; pass another path"):
-        km.record(run, tmp_path / "file" / "run.rrd")
-    with (
-        pytest.raises(km.errors.LogError, match=rf"{tmp_path} is a folder"),
-        km.Recorder(tmp_path, **about(run)) as recorder,
-    ):
-        feed(recorder, run)
-
-
 def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
     run, port = make_run(), free_port()
     viewer = start_viewer("--save", str(tmp_path / "seen.rrd"), port=port)
@@ -130,12 +115,12 @@ import sys, time, warnings
 sys.path.insert(0, {root!r})
 from tests.recording.runs import about, make_run, steps_of
 from koopmpc.recording.viewer import start_viewer
-from koopmpc.recording.recorder import Recorder
+import koopmpc as km
 run = make_run(T=40)
 viewer = start_viewer("--serve-grpc", port={port})
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
-    with Recorder({path!r}, live=True, port={port}, **about(run)) as recorder:
+    with km.Recorder({path!r}, live=True, port={port}, **about(run)) as recorder:
         for step in steps_of(run):
             recorder(step)
             time.sleep(0.02)
@@ -187,9 +172,9 @@ _KILLED = """
 import sys, time
 sys.path.insert(0, {root!r})
 from tests.recording.runs import about, make_run, steps_of
-from koopmpc.recording.recorder import Recorder
+import koopmpc as km
 run = make_run(T=200)
-with Recorder({path!r}, **about(run)) as recorder:
+with km.Recorder({path!r}, **about(run)) as recorder:
     for step in steps_of(run)[:100]:
         recorder(step)
     time.sleep(1.0)
@@ -218,15 +203,3 @@ def test_a_killed_writer_keeps_what_was_flushed(tmp_path: Path) -> None:
     assert np.array_equal(read.X, run.X[: read.steps + 1])
     assert np.array_equal(read.plans.X, run.plans.X[: read.steps])
     assert read.status == run.status[: read.steps]
-
-
-def test_a_recorder_needs_a_place_and_a_with_block(tmp_path: Path) -> None:
-    run = make_run()
-    with pytest.raises(
-        km.errors.DataError, match="a Recorder needs somewhere to write: pass a path, live=True, or both"
-    ):
-        km.Recorder(**about(run))
-    with pytest.raises(km.errors.DataError, match=r"dt is 0 s; it must be above zero"):
-        km.Recorder(tmp_path / "run.rrd", **about(run) | {"dt": 0.0})
-    with pytest.raises(km.errors.DataError, match=r"the Recorder is not open; call it inside `with Recorder"):
-        km.Recorder(tmp_path / "run.rrd", **about(run))(steps_of(run)[0])

@@ -1,5 +1,7 @@
-"""view and screenshot: what the viewer is told, and that it can draw what it is told to."""
+"""The viewer is found or opened, never waited for in vain, and it draws what a log tells it to."""
 
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.recording import viewer
-from koopmpc.recording.viewer import free_port, screenshot, start_viewer
+from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, screenshot, start_viewer
 from tests.recording.runs import make_run
 
 
@@ -29,7 +31,7 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / "run.rrd"
 
 
-def test_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = []
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: opened.append(logs) or True)
@@ -38,31 +40,21 @@ def test_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert opened == [[str(log), str(log)], [str(log)]]
 
 
-def test_messages(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_the_command_for_another_machine_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "has_display", lambda: False)
-    with pytest.raises(
-        km.errors.LogError,
-        match=r"there is no display to open .*run\.rrd on; copy it to a machine with .* run `koopmpc view run\.rrd`",
-    ):
+    told = r"there is no display to open .*run\.rrd on; copy it to a machine with .* run `koopmpc view run\.rrd`"
+    with pytest.raises(km.errors.LogError, match=told):
         km.view(log)
-    with pytest.raises(km.errors.LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):
-        km.view([log, "nowhere.rrd"])
-    notes = log.with_name("notes.rrd")
-    notes.write_text("these are notes")
-    with pytest.raises(km.errors.LogError, match=r"notes\.rrd is no log of koopmpc: it does not start as"):
-        km.view([log, notes])
-    with pytest.raises(km.errors.LogError, match=r"is a folder; pass the \.rrd of a run"):
-        screenshot(log.parent, "picture.png", time=0.0)
-    with pytest.raises(km.errors.LogError, match=r"no log to open; pass the \.rrd of a run"):
-        km.view([])
+
+
+def test_a_viewer_that_does_not_start_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: False)
     with pytest.raises(km.errors.LogError, match=r"the viewer did not start; run `/.*rerun.* .*run\.rrd` to see"):
         km.view(log)
     monkeypatch.setattr(viewer, "start_viewer", lambda *arguments, port: None)
-    with pytest.raises(
-        km.errors.LogError, match=r"no picture of .*: the viewer did not start; is a Vulkan driver installed\?"
-    ):
+    told = r"no picture of .*: the viewer did not start; is a Vulkan driver installed\?"
+    with pytest.raises(km.errors.LogError, match=told):
         screenshot(log, "picture.png", time=0.0)
 
 
@@ -91,3 +83,52 @@ def test_the_viewer_draws_every_view_of_the_blueprint(log: Path, tmp_path: Path)
     screenshot(log, tmp_path / "run.png", time=0.5)
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "run.png").stat().st_size > 20_000
+
+
+def test_a_viewer_is_found_once_it_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port()
+    assert not is_up(port)
+    process = start_viewer("--serve-grpc", port=port)
+    assert process is not None
+    try:
+        assert is_up(port)
+        assert find_viewer(port) == f"rerun+http://127.0.0.1:{port}/proxy"
+    finally:
+        process.kill()
+        process.wait()
+    monkeypatch.setattr(viewer, "has_display", lambda: False)
+    assert find_viewer(port) is None
+
+
+def test_a_viewer_is_opened_where_there_is_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    port, opened = free_port(), []
+    monkeypatch.setattr(viewer, "has_display", lambda: True)
+    monkeypatch.setattr(viewer, "start_viewer", lambda *logs, port: opened.append(port))
+    assert find_viewer(port) is None  # it was tried, and did not come up
+    assert opened == [port]
+
+
+def test_a_viewer_that_ends_at_once_is_not_waited_for() -> None:
+    start = time.monotonic()
+    assert start_viewer("--no-such-option", port=free_port()) is None
+    assert time.monotonic() - start < 10
+
+
+@pytest.mark.parametrize(
+    ("platform", "variables", "expected"),
+    [
+        ("linux", {}, False),
+        ("linux", {"DISPLAY": ":0"}, True),
+        ("linux", {"WAYLAND_DISPLAY": "wayland-0"}, True),
+        ("darwin", {}, True),
+    ],
+)
+def test_a_display_is_known_by_the_platform_and_its_variables(
+    monkeypatch: pytest.MonkeyPatch, platform: str, variables: dict[str, str], expected: bool
+) -> None:
+    monkeypatch.setattr(sys, "platform", platform)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert has_display() is expected
