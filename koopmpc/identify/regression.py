@@ -3,7 +3,8 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar, Unpack
+from inspect import currentframe
+from typing import NamedTuple, Unpack
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -13,11 +14,11 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import How, second_moments
-from koopmpc.identify.solve import Rows, scaled_rank, solve
+from koopmpc.identify.moments.read import ReadOptions, second_moments
+from koopmpc.identify.solve import RegressionRows, scaled_rank
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import FitReport
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.predictors import LinearPredictor
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class Regression:
 
     method: str
     route: str
-    rows: Rows
+    rows: RegressionRows
     x_next: Int[np.ndarray, " nx"]
     lifting: Lifting
     states: tuple[str, ...]
@@ -78,26 +79,30 @@ def read(
     method: str,
     *,
     noisy: bool = False,
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> Regression:
-    """Return the regression on [ψ(x) u w] that these episodes hold, read as `moments` says."""
+    """Return the regression on [ψ(x) u w] that these episodes hold, read as `second_moments` says."""
     source = source_of(episodes)
     sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
-    total = second_moments(source.driven(), lifting, embedding=sized, **how)
-    return regression(total, method, noisy=noisy, disturbances=source.disturbances)
+    total = second_moments(source.driven(), lifting, embedding=sized, **options)
+    return regression_of(total, method, noisy=noisy, disturbances=source.disturbances)
 
 
-def regression(total: Moments, method: str, *, noisy: bool = False, disturbances: tuple[str, ...] = ()) -> Regression:
-    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included; `noisy` keeps all of T."""
-    states = total.states
-    place = {name: i for i, name in enumerate(total.full.names)}
+def regression_of(
+    total: Moments, method: str, *, noisy: bool = False, disturbances: tuple[str, ...] = ()
+) -> Regression:
+    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included.
+
+    `noisy` says that x and x⁺ hold noise alike: the rows then hold all of ψ(x⁺), not only what ψ(x) and u reach.
+    """
+    columns, states = total.columns, total.states
+    place = {name: i for i, name in enumerate(columns.full.names)}
     where = np.array([place[name] for name in states])
-    C, residual = _decoder(total, where)
-    regressors = total.regressors
+    C, residual = total.decoder(where)
     return Regression(
         method=method,
         route=total.route,
-        rows=(total.complete if noisy else total.rows)(regressors, total.targets),
+        rows=(total.complete if noisy else total.rows)(columns.regressors, columns.targets),
         x_next=where,
         lifting=total.lifting,
         states=states,
@@ -110,33 +115,15 @@ def regression(total: Moments, method: str, *, noisy: bool = False, disturbances
     )
 
 
-def _decoder(total: Moments, where: np.ndarray) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
-    """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked."""
-    nz = total.nz
-    C = np.zeros((len(where), nz))
-    residual = np.zeros(len(where))
-    held = where < nz
-    C[held, where[held]] = 1.0
-    if not held.all():
-        rows = total.rows(np.arange(nz), where[~held])
-        K = solve(rows).K
-        C[~held] = K.T
-        residual[~held] = rows.residual(np.arange(len(rows.rest)), K)
-    return C, residual
-
-
-Model = TypeVar("Model", LinearPredictor, BilinearPredictor)
-
-
-class Found(NamedTuple):
-    """What a method found: z⁺ = A z + B u, B with the columns of w, and what it says of it.
+class FitResult(NamedTuple):
+    """What a method found: z⁺ = A z + B u, B with the columns of w, and what the report says of it.
 
     Attributes
     ----------
     rule
         What solved it, in words.
     doubts, changes
-        Sentences of the report: its warnings, and what a prior or a limit changed.
+        Sentences of the report: its warnings, and what a prior, a limit or a penalty changed.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -154,26 +141,31 @@ class Found(NamedTuple):
     modes: Complex[np.ndarray, "nl nz"] | None = None
 
 
-def whole(
-    task: Regression,
+def unreduced(
+    regression: Regression,
     K: Float[np.ndarray, "n nz"],
     *,
-    rank: int,
-    condition: float,
     rule: str,
+    rank: int | None = None,
+    condition: float = np.inf,
     ridge: float = 0.0,
     doubts: Sequence[str] = (),
     changes: Sequence[str] = (),
-) -> Found:
-    """Return what K = [A B]ᵀ is, in the lifting of the task."""
-    nz = task.lifting.nz
-    return Found(
+) -> FitResult:
+    """Return the result that K = [A B E]ᵀ is, in the lifting of the regression.
+
+    Rank and condition number are those of the regressors, computed here where they are not given.
+    """
+    nz = regression.lifting.nz
+    if rank is None:
+        rank, condition = scaled_rank(regression.rows, regression.rows.P)
+    return FitResult(
         A=K[:nz].T,
         B=K[nz:].T,
-        C=np.eye(nz) if task.C is None else task.C,
-        lifting=task.lifting,
-        residual=task.rows.residual(task.x_next, task.decoded(K)),
-        state_residual=task.state_residual,
+        C=np.eye(nz) if regression.C is None else regression.C,
+        lifting=regression.lifting,
+        residual=regression.rows.residual(regression.x_next, regression.decoded(K)),
+        state_residual=regression.state_residual,
         rank=rank,
         condition=condition,
         rule=rule,
@@ -183,71 +175,59 @@ def whole(
     )
 
 
-def report(task: Regression, found: Found) -> FitReport:
-    """Return the report of what was found."""
+def fit_report(regression: Regression, result: FitResult, *, warn: bool = True) -> FitReport:
+    """Return the report; each of its doubts is a FitWarning at the line outside of the library that asked for it."""
+    for sentence in result.doubts if warn else ():
+        warnings.warn(sentence, FitWarning, stacklevel=_level_outside())
     return FitReport(
-        method=task.method,
-        route=f"{task.route}, {found.rule}",
-        samples=task.rows.samples,
-        condition=found.condition,
-        rank=found.rank,
-        columns=task.columns,
-        ridge=found.ridge,
-        residual=found.residual,
-        state_residual=found.state_residual,
-        warnings=tuple(found.doubts),
-        changes=tuple(found.changes),
+        method=regression.method,
+        route=f"{regression.route}, {result.rule}",
+        samples=regression.rows.samples,
+        condition=result.condition,
+        rank=result.rank,
+        columns=regression.columns,
+        ridge=result.ridge,
+        residual=result.residual,
+        state_residual=result.state_residual,
+        warnings=tuple(result.doubts),
+        changes=tuple(result.changes),
     )
 
 
-def linear_predictor(task: Regression, found: Found) -> LinearPredictor:
-    """Return z⁺ = A z + B u + E w with its report."""
-    nu = len(task.inputs) - len(task.disturbances)
+def _level_outside() -> int:
+    """Return the stacklevel with which the caller's warning points at the first line outside of koopmpc."""
+    frame, level = currentframe(), 0
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("koopmpc."):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def linear_predictor(regression: Regression, result: FitResult, *, warn: bool = True) -> LinearPredictor:
+    """Return z⁺ = A z + B u + E w with its report, whose doubts are warnings."""
+    nu = len(regression.inputs) - len(regression.disturbances)
     return LinearPredictor(
-        found.A,
-        found.B[:, :nu],
-        found.C,
-        found.lifting,
-        task.dt,
-        task.states,
-        task.inputs[:nu],
-        report(task, found),
-        found.modes,
-        E=found.B[:, nu:],
-        disturbances=task.disturbances,
-        embedding=task.embedding,
+        result.A,
+        result.B[:, :nu],
+        result.C,
+        result.lifting,
+        regression.dt,
+        regression.states,
+        regression.inputs[:nu],
+        fit_report(regression, result, warn=warn),
+        result.modes,
+        E=result.B[:, nu:],
+        disturbances=regression.disturbances,
+        embedding=regression.embedding,
     )
 
 
-def assembled(
-    task: Regression,
-    K: Float[np.ndarray, "n nz"],
-    *,
-    rule: str,
-    ridge: float = 0.0,
-    doubts: Sequence[str] = (),
-    changes: Sequence[str] = (),
-) -> LinearPredictor:
-    """Return z⁺ = A z + B u + E w with [A B E] = Kᵀ, found under priors, limits or penalties."""
-    rank, condition = scaled_rank(task.rows, task.rows.P)
-    found = whole(task, K, rank=rank, condition=condition, rule=rule, ridge=ridge, doubts=doubts, changes=changes)
-    return linear_predictor(task, found)
-
-
-def warned(model: Model) -> Model:
-    """Return the model; each doubt of its report is a FitWarning at the line that called the caller."""
-    for sentence in model.report.warnings if model.report else ():
-        warnings.warn(sentence, FitWarning, stacklevel=3)
-    return model
-
-
-def growth(rows: Rows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
+def growth(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
     """Return in words how much of the observables, each relative to its size, K and the plain fit miss."""
     before, after = relative_misfit(rows, plain), relative_misfit(rows, K)
     return f"relative one-step misfit of the observables {after:.3g}, of the plain fit {before:.3g}"
 
 
-def relative_misfit(rows: Rows, K: Float[np.ndarray, "n nz"]) -> float:
+def relative_misfit(rows: RegressionRows, K: Float[np.ndarray, "n nz"]) -> float:
     """Return the root-mean-square over observables i of ‖tᵢ − P kᵢ‖ / ‖tᵢ‖."""
     which = np.arange(len(K.T))
     energy = (np.sum(rows.T[:, which] ** 2, axis=0) + rows.rest[which]) / rows.samples

@@ -6,17 +6,17 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import qr, solve_triangular
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.identify.ridge import cross_validated
 
 Ridge = float | Literal["gcv"]
 
-_ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
-_NOTHING = 1e-14
-_LARGEST = 1e3  # times σ₁²: beyond it next to nothing is left of K
-_POINTS = 300  # of the first grid, about ten a decade
-_ZOOMS = 5  # each ten times finer than the one before
+_CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
+_ILL_CONDITIONED = 1e10
+_NAMED = 3  # dependent columns that a message names
 
 
 def ridge_of(given: object) -> Ridge:
@@ -31,66 +31,8 @@ def ridge_of(given: object) -> Ridge:
     return ridge
 
 
-def cross_validated(
-    s: Float[np.ndarray, " k"],
-    shares: Float[np.ndarray, "k nt"],
-    outside: Float[np.ndarray, " nt"],
-    samples: int,
-    cut: float,
-) -> float:
-    """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
-
-    Each target counts relative to its own size, so that units mean nothing. Where P holds all of them to
-    rounding there is no noise, and λ is 0.
-
-    Parameters
-    ----------
-    s
-        Singular values of P on unit-norm columns.
-    shares
-        Uᵀ T.
-    outside
-        Energy of each target that P cannot reach.
-    samples
-        M.
-    cut
-        Singular values below cut · σ₁ are rounding.
-
-    References
-    ----------
-    Golub, Heath & Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",
-    Technometrics 21, 1979.
-    """
-    live = s > cut * s.max(initial=0.0)
-    energy = np.sum(shares**2, axis=0) + outside
-    lost = outside + np.sum(shares[~live] ** 2, axis=0)
-    exact = samples > live.sum() and not (lost > _ROUNDING * energy).any()
-    if exact or not live.any():
-        return 0.0
-    size = np.where(energy > 0, energy, 1.0)
-    power = np.sum(shares**2 / size, axis=1)
-    rest = float(np.sum(outside / size))
-    squares = s**2
-
-    def score(ridge: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        left = ridge[:, None] / (squares + ridge[:, None])  # I − H along each singular direction
-        free = samples - len(s) + np.sum(left, axis=1)
-        return samples * (left**2 @ power + rest) / free**2
-
-    smallest = float(s[live].min())  # a ridge far below its square changes nothing
-    low, high, points = np.log(_NOTHING * smallest**2), np.log(_LARGEST * float(s[0]) ** 2), _POINTS
-    for _ in range(_ZOOMS):
-        grid = np.linspace(low, high, points)
-        best = int(np.argmin(score(np.exp(grid))))
-        low, high, points = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, points - 1)]), 21
-    return float(np.exp(0.5 * (low + high)))
-
-
-_CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
-
-
 @dataclass(frozen=True, eq=False)
-class Rows:
+class RegressionRows:
     """Rows [P T] with the second moments of M snapshots.
 
     Attributes
@@ -116,9 +58,9 @@ class Rows:
         np.subtract(self.T[:, columns], error, out=error)
         return np.sqrt((np.einsum("ij,ij->j", error, error) + self.rest[columns]) / self.samples)
 
-    def leading(self, targets: int) -> "Rows":
+    def leading(self, targets: int) -> "RegressionRows":
         """Return these rows with the first targets only."""
-        return Rows(self.P, self.T[:, :targets], self.rest[:targets], self.samples)
+        return RegressionRows(self.P, self.T[:, :targets], self.rest[:targets], self.samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +83,12 @@ def unit(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     return P / np.where(size > 0, size, 1.0)
 
 
-def cutoff(rows: Rows) -> float:
+def cutoff(rows: RegressionRows) -> float:
     """Return eps · max(M, n): below it, relative to the largest, a singular value is rounding."""
     return float(np.finfo(float).eps * max(rows.samples, rows.P.shape[1]))
 
 
-def solve(rows: Rows, *, ridge: Ridge = 0.0, scaled: bool = True) -> Solution:
+def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True) -> Solution:
     """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag of the columns' norms.
 
     With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
@@ -156,7 +98,7 @@ def solve(rows: Rows, *, ridge: Ridge = 0.0, scaled: bool = True) -> Solution:
     return path(rows, (ridge,), scaled=scaled)[0]
 
 
-def path(rows: Rows, ridges: Sequence[Ridge], *, scaled: bool = True) -> list[Solution]:
+def path(rows: RegressionRows, ridges: Sequence[Ridge], *, scaled: bool = True) -> list[Solution]:
     """Return the solution for each ridge, of one decomposition."""
     size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
     size[size == 0] = 1.0
@@ -176,7 +118,7 @@ def path(rows: Rows, ridges: Sequence[Ridge], *, scaled: bool = True) -> list[So
     return found
 
 
-def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
+def scaled_rank(rows: RegressionRows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
     """Return rank and condition number of the columns P of `rows`, scaled to unit norm; inf if dependent."""
     if P.shape[1] == 0:
         return 0, 1.0
@@ -189,8 +131,104 @@ def scaled_rank(rows: Rows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
     return rank, float(s[0] / s[-1]) if rank == P.shape[1] else np.inf
 
 
+def orthonormal(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:
+    """Return an orthonormal basis of the span of these columns, those of norm 0 left out."""
+    U, s, _ = np.linalg.svd(unit(columns[:, norms(columns) > 0]), full_matrices=False)
+    return U[:, s > cut * s.max(initial=0.0)]
+
+
 def onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
     """Return the columns projected on the span of the basis."""
-    U, s, _ = np.linalg.svd(unit(basis), full_matrices=False)
-    U = U[:, s > np.finfo(float).eps * max(basis.shape) * s.max(initial=0.0)]
+    U = orthonormal(basis, float(np.finfo(float).eps * max(basis.shape)))
     return U @ (U.T @ columns)
+
+
+def rule(rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True) -> str:
+    """Return what a solve without a rank cut or added, in words."""
+    columns = "unit-norm" if scaled else "unscaled"
+    how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
+    if ridge > 0:
+        return f"ridge {ridge:.6g} on {columns} columns{how}"
+    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns" + (
+        ", ridge 0" + how if how else ""
+    )
+
+
+def doubts(
+    rows: RegressionRows, observables: Sequence[str], inputs: Sequence[str], *, regular: bool
+) -> tuple[list[str], float]:
+    """Return one sentence for each reason to doubt a regression on [ψ(x) u], P of `rows`, and its condition number.
+
+    The condition number is that of columns scaled to unit norm; inf where they are dependent.
+
+    Parameters
+    ----------
+    rows
+        Their P holds the observables, then the inputs.
+    observables, inputs
+        Names of the columns of P.
+    regular
+        The user asked for a ridge or a rank: dependent or ill-conditioned observables are no surprise then.
+    """
+    nz, nu = len(observables), len(inputs)
+    names = [*observables, *inputs]
+    size = norms(rows.P)
+    zero = np.flatnonzero(size == 0)
+    zero = zero[zero >= nz] if regular else zero
+    sentences: list[str] = []
+    if zero.size:
+        sentences.append(
+            f"{_listed([names[j] for j in zero])} was 0 in all snapshots, so its coefficients are set to 0; "
+            "excite it or drop it"
+        )
+    if rows.samples < nz + nu:
+        if not regular:
+            sentences.append(
+                f"rank-deficient: {rows.samples} snapshot pairs cannot determine {nz + nu} coefficients "
+                "a row; the minimum-norm solution is taken; collect more, or lift to fewer observables"
+            )
+        return sentences, np.inf
+    live = np.flatnonzero(size > 0)
+    Z, U = rows.P[:, live[live < nz]], rows.P[:, live[live >= nz]]
+    rank, condition = scaled_rank(rows, rows.P[:, live])
+    if rank == len(live):
+        if condition > _ILL_CONDITIONED and not regular:
+            sentences.append(
+                f"ill-conditioned: the observables have condition number {condition:.1e} on unit-norm "
+                "columns; pass a ridge, or drop observables that are almost functions of others"
+            )
+        return sentences, condition if rank == nz + nu else np.inf
+    rank_z, rank_u = scaled_rank(rows, Z)[0], scaled_rank(rows, U)[0]
+    for P, own, part, what in (
+        (Z, rank_z, live[live < nz], "observables"),
+        (U, rank_u, live[live >= nz], "inputs"),
+    ):
+        if own < P.shape[1] and not (regular and what == "observables"):
+            sentences.append(
+                f"rank-deficient: {P.shape[1] - own} of {P.shape[1]} {what} are linear functions of others "
+                f"on these data ({_dependent(P, own, [names[int(j)] for j in part])}); the minimum-norm solution "
+                "is taken; drop them, or collect richer data"
+            )
+    if rank < rank_z + rank_u:
+        sentences.append(
+            "feedback made A and B inseparable: on these data inputs are linear functions of ψ(x) "
+            f"(rank [Z U] = {rank}, rank Z + rank U = {rank_z + rank_u}); the minimum-norm split is taken; "
+            "add noise to the input, or pass a known B to dmdc"
+        )
+    return sentences, condition
+
+
+def _dependent(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:
+    """Return for the columns beyond `rank` which others they depend on."""
+    R, pivots = qr(unit(P), mode="r", pivoting=True)
+    sorted_names = [names[int(j)] for j in pivots]
+    weights = np.abs(solve_triangular(R[:rank, :rank], R[:rank, rank:]))
+    said: list[str] = []
+    for name, column in zip(sorted_names[rank : rank + _NAMED], weights.T, strict=False):
+        sources = [sorted_names[int(i)] for i in np.argsort(-column, kind="stable") if column[i] > 1e-6]
+        said.append(f"{name!r} of {_listed(sources)}")
+    return ", ".join(said) + (", …" if P.shape[1] - rank > _NAMED else "")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(repr(name) for name in names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

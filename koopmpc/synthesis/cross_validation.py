@@ -12,8 +12,8 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.regression import regression
-from koopmpc.identify.solve import Rows, path
+from koopmpc.identify.regression import regression_of
+from koopmpc.identify.solve import RegressionRows, path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
@@ -121,10 +121,10 @@ def tried(trial: Trial) -> Tried:
 
 def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
-    task, nz, nu = regression(total, "select"), total.nz, like.nu
+    task, nz, nu = regression_of(total, "select"), total.nz, like.nu
     P, T, which = task.rows.P, task.rows.T[:, :nz], total.products
     start = np.eye(P.shape[1], nz) * candidate.bilinear  # a bilinear model is drawn to z⁺ = z, as its refit is
-    rows = Rows(P, T - P @ start, task.rows.rest[:nz], task.rows.samples)
+    rows = RegressionRows(P, T - P @ start, task.rows.rest[:nz], task.rows.samples)
     C = task.C
     assert C is not None, "an extended regression has its C"
     models: list[AnyPredictor] = []

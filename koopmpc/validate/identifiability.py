@@ -10,8 +10,8 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.moments.moments import Moments, both_sides, orthonormal
-from koopmpc.identify.solve import norms, unit
+from koopmpc.identify.moments.moments import Moments, both_sides
+from koopmpc.identify.solve import norms, orthonormal, unit
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import Constant
 from koopmpc.validate.residuals import moments_of

@@ -14,9 +14,9 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.moments.moments import Moments, both_sides, orthonormal
+from koopmpc.identify.moments.moments import Moments, both_sides
 from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.solve import norms
+from koopmpc.identify.solve import norms, orthonormal
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.moments.rows import chunks, lifted
+from koopmpc.identify.moments.rows import ROWS, chunks, lifted_chunks, row_columns
 from koopmpc.identify.solve import solve
 from tests.identify.plants import brute_force, random_episodes
 
@@ -43,10 +43,32 @@ def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed
     data = random_episodes(seed, lengths, 2, 1)
     pieces = chunks(data, rows)
     assert all(sum(p.last - p.first for p in chunk) == rows for chunk in pieces[:-1])
+    pairs = [(p.episode, k) for chunk in pieces for p in chunk for k in range(p.first, p.last)]
+    assert pairs == [(i, k) for i, length in enumerate(lengths) for k in range(length)]
+
+
+def test_lifted_chunks_hold_the_rows_of_all_pairs() -> None:
+    data = random_episodes(0, [500, 1, 2000, 30], 2, 1)
     lifting = km.State().bind(data.states)
-    assert np.array_equal(
-        np.vstack([lifted(data, lifting, chunk).pairs() for chunk in pieces]), brute_force(data, lifting)
-    )
+    every = lifted_chunks(data, row_columns(lifting, data.inputs, bilinear=False))
+    assert np.array_equal(np.vstack([chunk.pairs() for chunk in every]), brute_force(data, lifting))
+
+
+def test_each_chunk_is_lifted_once_where_gram_sums_serve(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = random_episodes(0, [3000] * 4, 2, 1)
+    lifted: list[int] = []
+    count = km.State._lift
+    monkeypatch.setattr(km.State, "_lift", lambda self, X, Z: (lifted.append(len(X)), count(self, X, Z))[1])
+    km.edmd(data, km.State())
+    assert sum(lifted) <= 12_000 * (1 + 2 / ROWS) + 4
+
+
+def test_pairs_of_no_weight_in_the_pilot_do_not_hide_the_others() -> None:
+    data = random_episodes(0, [1023] * 12, 2, 1)
+    only = [float(i == 2) for i in range(12)]  # the pilot reads other chunks
+    m = km.moments.second_moments(data, LIFTING, weights=only)
+    assert m.samples == 1023
+    assert close(gram(m), gram(km.moments.second_moments(data[2:3], LIFTING, route="gram")))
 
 
 @given(LENGTHS, st.integers(0, 999), st.sampled_from(["gram", "qr"]), st.randoms(use_true_random=False))
@@ -81,7 +103,7 @@ def test_a_huge_last_state_takes_no_digits_from_the_others() -> None:
     data = km.Episodes([km.Episode(X=e.X * huge, U=e.U) for e in given], given.dt)
     m = km.moments.second_moments(data, km.State(), route="gram")
     now = np.vstack([np.hstack([e.X[:-1], e.U]) for e in data])
-    assert close(m.sums[np.ix_(m.regressors, m.regressors)], now.T @ now)
+    assert close(m.sums[np.ix_(m.columns.regressors, m.columns.regressors)], now.T @ now)
 
 
 def test_weights_of_one_are_no_weights() -> None:
@@ -101,20 +123,20 @@ def test_a_state_that_the_lifting_lacks_is_appended_to_the_rows() -> None:
     data = random_episodes(0, [20], 2, 1)
     m = km.moments.second_moments(data, km.Fourier(1), route="gram")
     assert m.nz == 4
-    assert m.full.names == (*m.lifting.names, *data.states)
-    D = brute_force(data, m.full)
+    assert m.columns.full.names == (*m.lifting.names, *data.states)
+    D = brute_force(data, m.columns.full)
     assert close(m.sums, D.T @ D)
-    assert D[:, m.regressors].shape[1] == 5
-    assert np.allclose(D[:, m.targets[4:]], data[0].X[1:])
+    assert D[:, m.columns.regressors].shape[1] == 5
+    assert np.allclose(D[:, m.columns.targets[4:]], data[0].X[1:])
 
 
 @pytest.mark.parametrize("route", ["gram", "qr"])
 def test_rows_have_the_second_moments_of_the_columns_asked_for(route: str) -> None:
     data = random_episodes(3, [60, 40], 2, 1)
     m = km.moments.second_moments(data, LIFTING, route=route)
-    D = brute_force(data, m.full)
-    rows = m.rows(m.regressors, m.targets)
-    P, T = D[:, m.regressors], D[:, m.targets]
+    D = brute_force(data, m.columns.full)
+    rows = m.rows(m.columns.regressors, m.columns.targets)
+    P, T = D[:, m.columns.regressors], D[:, m.columns.targets]
     assert np.allclose(rows.P.T @ rows.P, P.T @ P, rtol=0, atol=1e-10)
     assert np.allclose(rows.P.T @ rows.T, P.T @ T, rtol=0, atol=1e-10)
     assert np.allclose(np.sum(rows.T**2, axis=0) + rows.rest, np.sum(T**2, axis=0))
@@ -138,7 +160,7 @@ def test_gram_loses_at_condition_1e10_and_qr_does_not() -> None:
     error = {}
     for route in ("gram", "qr"):
         m = km.moments.second_moments(data, km.State(), route=route)
-        K = solve(m.rows(m.regressors, m.targets)).K
+        K = solve(m.rows(m.columns.regressors, m.columns.targets)).K
         error[route] = np.abs(K.T - A).max()
     assert error["qr"] < 1e-4
     assert error["gram"] > 1e-1

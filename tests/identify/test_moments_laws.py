@@ -16,7 +16,7 @@ ROUTES = pytest.mark.parametrize("route", ["gram", "qr"])
 
 def coefficients(episodes: km.Episodes | km.Stream, lifting: km.Lifting, route: str) -> np.ndarray:
     m = km.moments.second_moments(episodes, lifting, route=route)
-    return solve(m.rows(m.regressors, m.targets)).K[:, : m.nz]
+    return solve(m.rows(m.columns.regressors, m.columns.targets)).K[:, : m.nz]
 
 
 def rows_of(episodes: km.Episodes, lifting: km.Lifting) -> np.ndarray:

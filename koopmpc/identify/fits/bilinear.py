@@ -11,12 +11,11 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ObservableError
-from koopmpc.identify.fits.edmd import rule
-from koopmpc.identify.moments.moments import Moments, product_names
-from koopmpc.identify.moments.read import How, second_moments
-from koopmpc.identify.rank import Rank, doubts, leading, lost
-from koopmpc.identify.regression import Found, regression, report, warned
-from koopmpc.identify.solve import Ridge, Rows, ridge_of, solve
+from koopmpc.identify.moments.moments import Moments
+from koopmpc.identify.moments.read import ReadOptions, second_moments
+from koopmpc.identify.rank import Rank, leading, lost
+from koopmpc.identify.regression import FitResult, fit_report, regression_of
+from koopmpc.identify.solve import RegressionRows, Ridge, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.predict.predictors import BilinearPredictor
@@ -31,7 +30,7 @@ def bilinear_edmd(
     rank: Rank = None,
     products: Sequence[str] | None = None,
     difference: bool = False,
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> BilinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
 
@@ -57,8 +56,8 @@ def bilinear_edmd(
         Regress ψ(x⁺) − ψ(x), and A = I + what is found. Without a ridge and on independent columns it is the same
         model; a ridge, or a cut, then draws z⁺ towards z ("nothing changes") instead of towards zero, which is
         nearer the truth for a short dt.
-    **how
-        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
+    **options
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
 
     Raises
     ------
@@ -86,36 +85,36 @@ def bilinear_edmd(
     ridge = ridge_of(ridge)
     if rank is not None and products is not None:
         raise DataError("a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two")
-    total = second_moments(source, lifting, bilinear=True, embedding=embedding, **how)
-    task = regression(total, "bilinear_edmd")
-    assert task.C is not None, "an extended regression has its C"
-    bound, nz, nu = task.lifting, total.nz, source.nu
+    total = second_moments(source, lifting, bilinear=True, embedding=embedding, **options)
+    regression = regression_of(total, "bilinear_edmd")
+    assert regression.C is not None, "an extended regression has its C"
+    bound, nz, nu = regression.lifting, total.nz, source.nu
     which = total.products if products is None else _named(total, products)
-    given = _with_products(task.rows, total, which)
-    names = product_names(bound, total.inputs, which)
+    given = _with_products(regression.rows, total, which)
+    names = tuple(f"{u} * {bound.names[int(i)]}" for u in total.inputs for i in which)
     regular = ridge != 0 or rank is not None
     sentences, condition = doubts(given, bound.names, (*total.inputs, *names), regular=regular)
-    P, C, basis, state_residual, words = given.P, task.C, np.eye(nz), task.state_residual, ""
+    P, C, basis, state_residual, words = given.P, regression.C, np.eye(nz), regression.state_residual, ""
     if rank is not None:
         basis, words = leading(given, nz, rank, sentences)
         P, C, bound = _projected(P, basis, nu, which), C @ basis, Projected(bound, basis)
-        state_residual = np.hypot(state_residual, lost(given.P[:, :nz], basis, task.C, given.samples))
+        state_residual = np.hypot(state_residual, lost(given.P[:, :nz], basis, regression.C, given.samples))
         which = np.arange(len(basis.T))
     r = len(basis.T)
     start = np.eye(P.shape[1], r) @ basis.T * difference  # what stands in K before anything is learned
-    change = Rows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples)
+    change = RegressionRows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples)
     solution = solve(change, ridge=ridge)
     K = (solution.K + start) @ basis
     N = np.zeros((nu, r, r))
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
-    task = replace(task, rows=Rows(P, given.T, given.rest, given.samples))
-    solved = rule(task.rows, ridge, solution.ridge)
-    found = Found(
+    regression = replace(regression, rows=RegressionRows(P, given.T, given.rest, given.samples))
+    solved = rule(regression.rows, ridge, solution.ridge)
+    result = FitResult(
         A=K[:r].T,
         B=K[r : r + nu].T,
         C=C,
         lifting=bound,
-        residual=task.rows.residual(task.x_next, K @ C.T),
+        residual=regression.rows.residual(regression.x_next, K @ C.T),
         state_residual=state_residual,
         rank=solution.rank,
         condition=condition,
@@ -123,19 +122,18 @@ def bilinear_edmd(
         ridge=solution.ridge,
         doubts=sentences,
     )
-    model = BilinearPredictor(
-        found.A,
-        found.B,
+    return BilinearPredictor(
+        result.A,
+        result.B,
         N,
         C,
         bound,
-        task.dt,
-        task.states,
-        task.inputs,
-        report(task, found),
-        task.embedding,
+        regression.dt,
+        regression.states,
+        regression.inputs,
+        fit_report(regression, result),
+        regression.embedding,
     )
-    return warned(model)
 
 
 def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
@@ -149,12 +147,12 @@ def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
     return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
 
 
-def _with_products(rows: Rows, total: Moments, which: Int[np.ndarray, " np"]) -> Rows:
+def _with_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
     """Return the rows with u⊗ψ(x) of these observables only."""
     first = total.nz + len(total.inputs)
     block = np.flatnonzero(np.isin(total.products, which))
     columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
-    return Rows(rows.P[:, np.concatenate([np.arange(first), *columns])], rows.T, rows.rest, rows.samples)
+    return RegressionRows(rows.P[:, np.concatenate([np.arange(first), *columns])], rows.T, rows.rest, rows.samples)
 
 
 def _projected(

@@ -11,18 +11,16 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.edmd import rule
 from koopmpc.identify.fits.prior import Combination, Entries, Prior, Storage, entries_of
-from koopmpc.identify.moments.read import How
-from koopmpc.identify.rank import doubts
-from koopmpc.identify.regression import assembled, growth, read, warned
-from koopmpc.identify.solve import Ridge, Rows, norms, ridge_of, solve
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
+from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
 
 def optimum(
-    rows: Rows, entries: Entries, which: Int[np.ndarray, " r"], ridge: float, prior: Prior | None
+    rows: RegressionRows, entries: Entries, which: Int[np.ndarray, " r"], ridge: float, prior: Prior | None
 ) -> tuple[Float[np.ndarray, "n r"], str]:
     """Return K = argmin Σᵢ ‖tᵢ − P kᵢ‖² / ‖tᵢ‖² (+ ridge) over the targets `which`, and the solver's status.
 
@@ -159,7 +157,7 @@ def constrained_edmd(
     embedding: Delay | None = None,
     prior: Prior,
     ridge: Ridge = 0.0,
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares among the A, B, E that agree with what is known of them.
 
@@ -180,8 +178,8 @@ def constrained_edmd(
         What is known; its shapes and names are those of the lifting's observables and of the inputs.
     ridge
         Tikhonov weight on unit-norm columns of what is free; "gcv" chooses it for the fit without the prior.
-    **how
-        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
+    **options
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
 
     Raises
     ------
@@ -194,11 +192,11 @@ def constrained_edmd(
         The free columns are dependent or ill-conditioned, or the solver met its tolerance only roughly.
     """
     asked = ridge_of(ridge)
-    task = read(episodes, lifting, embedding, "constrained_edmd", **how)
-    nz, names = task.lifting.nz, task.lifting.names
-    entries = entries_of(prior, names, task.inputs)
-    rows = task.rows.leading(nz)
-    sentences = _doubts(rows, entries, names, task.inputs, regular=asked != 0)
+    regression = read(episodes, lifting, embedding, "constrained_edmd", **options)
+    nz, names = regression.lifting.nz, regression.lifting.names
+    entries = entries_of(prior, names, regression.inputs)
+    rows = regression.rows.leading(nz)
+    sentences = _doubts(rows, entries, names, regression.inputs, regular=asked != 0)
     without = solve(rows, ridge=asked)
     K, statuses = _bounded(rows, entries, linear(rows, entries, without.ridge), without.ridge, prior)
     sentences += [
@@ -212,7 +210,9 @@ def constrained_edmd(
     changes += [word for word, held in _COUPLINGS.items() if getattr(prior, held)]
     changes.append(growth(rows, K, without.K))
     said = f"{'Clarabel' if statuses else 'linear algebra'} under priors, {rule(rows, asked, without.ridge)}"
-    return warned(assembled(task, K, rule=said, ridge=without.ridge, doubts=sentences, changes=changes))
+    return linear_predictor(
+        regression, unreduced(regression, K, rule=said, ridge=without.ridge, doubts=sentences, changes=changes)
+    )
 
 
 _COUPLINGS = {
@@ -223,18 +223,18 @@ _COUPLINGS = {
 
 
 def _doubts(
-    rows: Rows, entries: Entries, names: tuple[str, ...], inputs: tuple[str, ...], *, regular: bool
+    rows: RegressionRows, entries: Entries, names: tuple[str, ...], inputs: tuple[str, ...], *, regular: bool
 ) -> list[str]:
     """Return doubts about the columns that are free in some row."""
     free, nz = np.isnan(entries.known).any(axis=0), len(names)
     which = np.flatnonzero(free)
-    part = Rows(rows.P[:, which], rows.T, rows.rest, rows.samples)
+    part = RegressionRows(rows.P[:, which], rows.T, rows.rest, rows.samples)
     observables = [names[int(j)] for j in which if j < nz]
     forces = [inputs[int(j) - nz] for j in which if j >= nz]
     return doubts(part, observables, forces, regular=regular)[0] if which.size else []
 
 
-def linear(rows: Rows, entries: Entries, ridge: float) -> Float[np.ndarray, "n nz"]:
+def linear(rows: RegressionRows, entries: Entries, ridge: float) -> Float[np.ndarray, "n nz"]:
     """Return the least squares over the free entries; rows of [A B] with the same ones are solved together."""
     known = entries.known
     K = np.where(np.isnan(known), 0.0, known).T
@@ -245,13 +245,13 @@ def linear(rows: Rows, entries: Entries, ridge: float) -> Float[np.ndarray, "n n
         free = np.isnan(known[targets[0]])
         if free.any():
             rest = rows.T[:, targets] - rows.P @ K[:, targets]
-            task = Rows(rows.P[:, free], rest, rows.rest[targets], rows.samples)
-            K[np.ix_(free, targets)] = solve(task, ridge=ridge).K
+            regression = RegressionRows(rows.P[:, free], rest, rows.rest[targets], rows.samples)
+            K[np.ix_(free, targets)] = solve(regression, ridge=ridge).K
     return K
 
 
 def _bounded(
-    rows: Rows, entries: Entries, plain: Float[np.ndarray, "n nz"], ridge: float, prior: Prior
+    rows: RegressionRows, entries: Entries, plain: Float[np.ndarray, "n nz"], ridge: float, prior: Prior
 ) -> tuple[Float[np.ndarray, "n nz"], set[str]]:
     """Return K within bounds and couplings, and the statuses of the programs that were solved."""
     nz = len(plain.T)

@@ -12,16 +12,16 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.edmd import Method, fit
-from koopmpc.identify.moments.read import How, second_moments
+from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.rank import Rank
-from koopmpc.identify.regression import Regression, warned
-from koopmpc.identify.solve import Rows
+from koopmpc.identify.regression import Regression, linear_predictor
+from koopmpc.identify.solve import RegressionRows
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
 
 def dmd(
-    episodes: Episodes | Source, *, rank: Rank = None, method: Method = "ls", **how: Unpack[How]
+    episodes: Episodes | Source, *, rank: Rank = None, method: Method = "ls", **options: Unpack[ReadOptions]
 ) -> LinearPredictor:
     """Fit x⁺ = A x, A = X′X⁺ by truncated SVD of the unscaled snapshots; inputs in the data are left out.
 
@@ -40,8 +40,8 @@ def dmd(
         "ls", least squares: noise in x shrinks A, so that modes seem to decay faster. "tls", total least
         squares, takes x and x⁺ as noisy alike; "fb" fits forward and backward, A = (A_f A_b⁻¹)^½, which needs
         no noise of one size, but a motion that can be run backward.
-    **how
-        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
+    **options
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
 
     Raises
     ------
@@ -59,8 +59,8 @@ def dmd(
     Hemati, Williams & Rowley, "Characterizing and correcting for the effect of sensor noise in the dynamic mode
     decomposition", Exp. Fluids 57, 2016.
     """
-    task = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", how=how)
-    return warned(fit(task, rank=rank, method=method))
+    regression = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", options=options)
+    return linear_predictor(regression, fit(regression, rank=rank, method=method))
 
 
 def dmdc(
@@ -69,7 +69,7 @@ def dmdc(
     rank: Rank = None,
     B: ArrayLike | None = None,
     method: Method = "ls",
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
     """Fit x⁺ = A x + B u by truncated SVD of the unscaled snapshots [X; U], or of X alone where B is known.
 
@@ -83,7 +83,7 @@ def dmdc(
         (nx, nu), known; identified by default.
     method
         As in `dmd`; inputs are exact in "tls" and "fb".
-    **how
+    **options
         As in `dmd`.
 
     Raises
@@ -106,8 +106,8 @@ def dmdc(
     if source.nw:
         raise DataError("the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()")
     known = None if B is None else checks.array(B, "B", (source.nx, source.nu))
-    task = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", how=how)
-    return warned(fit(task, rank=rank, method=method))
+    regression = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", options=options)
+    return linear_predictor(regression, fit(regression, rank=rank, method=method))
 
 
 def _regression(
@@ -117,21 +117,21 @@ def _regression(
     inputs: tuple[str, ...],
     B: Float[np.ndarray, "nx nu"] | None = None,
     noisy: bool,
-    how: How,
+    options: ReadOptions,
 ) -> Regression:
     """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
     lifting = State().bind(source.states)
     nx, nu = source.nx, len(inputs)
-    episodes = source.episodes if isinstance(source, Held) and how.get("weights") is None else ()
+    episodes = source.episodes if isinstance(source, Held) and options.get("weights") is None else ()
     pairs = sum(len(e) for e in episodes)
     if 0 < pairs <= 2 * nx + nu:  # the snapshots themselves are no more rows than their moments
         X, X_next = _stacked([e.X[:-1] for e in episodes]), _stacked([e.X[1:] for e in episodes])
         P = np.hstack([X, _stacked([e.U for e in episodes])]) if nu else X
-        rows = Rows(P, X_next, np.zeros(nx), pairs)
+        rows = RegressionRows(P, X_next, np.zeros(nx), pairs)
     else:
-        total = second_moments(source, lifting, route="qr", **how)
-        columns = total.regressors[: nx + nu]
-        rows = (total.complete if noisy else total.rows)(columns, total.targets)
+        total = second_moments(source, lifting, route="qr", **options)
+        columns = total.columns.regressors[: nx + nu]
+        rows = (total.complete if noisy else total.rows)(columns, total.columns.targets)
     return Regression(
         method=method,
         route="svd",

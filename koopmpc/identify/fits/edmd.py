@@ -9,10 +9,10 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.noise import denoised, forward_backward
-from koopmpc.identify.moments.read import How
-from koopmpc.identify.rank import Rank, doubts, leading, lost
-from koopmpc.identify.regression import Found, Regression, linear_predictor, read, warned, whole
-from koopmpc.identify.solve import Ridge, Rows, cutoff, ridge_of, solve
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.rank import Rank, leading, lost
+from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
+from koopmpc.identify.solve import RegressionRows, Ridge, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.lifting.state import Constant
@@ -23,12 +23,12 @@ Method = Literal["ls", "tls", "fb"]
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
-def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> LinearPredictor:
-    """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖² and report.
+def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> FitResult:
+    """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
 
     Parameters
     ----------
-    task
+    regression
         The regression.
     ridge
         Weight of ‖[A B] S‖², S the diagonal of column norms; 0 takes the minimum-norm solution, "gcv" chooses.
@@ -42,66 +42,72 @@ def fit(task: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Meth
         raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
     if method != "ls" and ridge != 0:
         raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
-    rows, nz = task.rows, task.lifting.nz
-    if task.B is not None:  # what is known of x⁺ goes to the left side
-        known = rows.P[:, nz:] @ task.B.T
-        rows = Rows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
-    free = task.inputs if task.B is None else ()
-    sentences, condition = doubts(rows, task.lifting.names, free, regular=ridge != 0 or rank is not None)
-    if rank is None:
-        found = _whole(task, rows, ridge, method, condition)
-    else:
-        found = _reduced(task, rows, ridge, rank, method, condition, sentences)
-    return linear_predictor(task, found._replace(rule=_WORDS[method] + found.rule, doubts=sentences))
-
-
-def _whole(task: Regression, rows: Rows, ridge: Ridge, method: Method, condition: float) -> Found:
-    nz = task.lifting.nz
-    given = rows.leading(nz)
+    rows, nz = regression.rows, regression.lifting.nz
+    if regression.B is not None:  # what is known of x⁺ goes to the left side
+        known = rows.P[:, nz:] @ regression.B.T
+        rows = RegressionRows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
+    free = regression.inputs if regression.B is None else ()
+    sentences, condition = doubts(rows, regression.lifting.names, free, regular=ridge != 0 or rank is not None)
+    if rank is not None:
+        result = _reduced(regression, rows, ridge, rank, method, condition, sentences)
+        return result._replace(rule=_WORDS[method] + result.rule, doubts=sentences)
+    given, C = rows.leading(nz), regression.C
     if method == "tls":
-        given = _denoised(task, given, nz)
-    solution = forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=task.scaled)
-    K = solution.K if task.B is None else np.vstack([solution.K, task.B.T])
-    said = rule(rows, ridge, solution.ridge, scaled=task.scaled)
-    return whole(task, K, rank=solution.rank, condition=condition, rule=said, ridge=solution.ridge)
+        given = _denoised(regression, given, nz)
+    scaled = regression.scaled
+    solution = forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled)
+    K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
+    return FitResult(
+        A=K[:nz].T,
+        B=K[nz:].T,
+        C=np.eye(nz) if C is None else C,
+        lifting=regression.lifting,
+        residual=regression.rows.residual(regression.x_next, K if C is None else K @ C.T),
+        state_residual=regression.state_residual,
+        rank=solution.rank,
+        condition=condition,
+        rule=_WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled),
+        ridge=solution.ridge,
+        doubts=sentences,
+    )
 
 
 def _reduced(
-    task: Regression,
-    rows: Rows,
+    regression: Regression,
+    rows: RegressionRows,
     ridge: Ridge,
     rank: Rank,
     method: Method,
     condition: float,
     sentences: list[str],
-) -> Found:
+) -> FitResult:
     """Regress on [U_rᵀψ(x) u]; Ã = U_rᵀ X′ V_r Σ_r⁻¹ without input (Tu et al. 2014)."""
-    nz = task.lifting.nz
+    nz = regression.lifting.nz
     basis, words = leading(rows, nz, rank, sentences)
     r = len(basis.T)
     given = rows.leading(nz)
     if method == "tls":
-        given = _denoised(task, given, r)
+        given = _denoised(regression, given, r)
         basis = leading(given, nz, r, [])[0]
     P = np.hstack([given.P[:, :nz] @ basis, given.P[:, nz:]])
     if method == "fb":
-        solution = forward_backward(Rows(P, given.T @ basis, np.zeros(r), rows.samples), r)
+        solution = forward_backward(RegressionRows(P, given.T @ basis, np.zeros(r), rows.samples), r)
         forward, drive = basis @ solution.K[:r].T, basis @ solution.K[r:].T
     else:
-        solution = solve(Rows(P, given.T, given.rest, rows.samples), ridge=ridge)
+        solution = solve(RegressionRows(P, given.T, given.rest, rows.samples), ridge=ridge)
         forward, drive = solution.K[:r].T, solution.K[r:].T  # forward = X′ V_r Σ_r⁻¹, (nz, r)
     A = basis.T @ forward
-    B = basis.T @ (drive if task.B is None else task.B)
-    C = basis if task.C is None else task.C @ basis
+    B = basis.T @ (drive if regression.B is None else regression.B)
+    C = basis if regression.C is None else regression.C @ basis
     Z = rows.P[:, :nz]
-    seen = Rows(np.hstack([Z @ basis, task.rows.P[:, nz:]]), task.rows.T, rows.rest, rows.samples)
-    return Found(
+    seen = RegressionRows(np.hstack([Z @ basis, regression.rows.P[:, nz:]]), regression.rows.T, rows.rest, rows.samples)
+    return FitResult(
         A=A,
         B=B,
         C=C,
-        lifting=Projected(task.lifting, basis),
-        residual=seen.residual(task.x_next, np.vstack([A.T, B.T]) @ C.T),
-        state_residual=np.hypot(task.state_residual, lost(Z, basis, task.C, rows.samples)),
+        lifting=Projected(regression.lifting, basis),
+        residual=seen.residual(regression.x_next, np.vstack([A.T, B.T]) @ C.T),
+        state_residual=np.hypot(regression.state_residual, lost(Z, basis, regression.C, rows.samples)),
         rank=r,
         condition=condition,
         rule=words if ridge == 0 else f"{words}, {rule(seen, ridge, solution.ridge)}",
@@ -110,23 +116,12 @@ def _reduced(
     )
 
 
-def _denoised(task: Regression, rows: Rows, directions: int) -> Rows:
+def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
     """Return the rows without the noise of ψ; a Constant and inputs have none."""
-    nz, one = task.lifting.nz, Constant().bind(task.states).names[0]
-    exact = [*(i for i, name in enumerate(task.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
+    nz, one = regression.lifting.nz, Constant().bind(regression.states).names[0]
+    exact = [*(i for i, name in enumerate(regression.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
     constants = sum(i < nz for i in exact)
-    return denoised(rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=task.scaled)
-
-
-def rule(rows: Rows, asked: Ridge, ridge: float, *, scaled: bool = True) -> str:
-    """Return what a solve without a rank cut or added, in words."""
-    columns = "unit-norm" if scaled else "unscaled"
-    how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
-    if ridge > 0:
-        return f"ridge {ridge:.6g} on {columns} columns{how}"
-    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns" + (
-        ", ridge 0" + how if how else ""
-    )
+    return denoised(rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=regression.scaled)
 
 
 def edmd(
@@ -137,7 +132,7 @@ def edmd(
     ridge: Ridge = 0.0,
     rank: Rank = None,
     method: Method = "ls",
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
 
@@ -165,8 +160,8 @@ def edmd(
         "ls", least squares: noise in ψ(x) shrinks A. "tls", total least squares, takes ψ(x) and ψ(x⁺) as noisy
         alike, relative to each observable's size; inputs and a Constant as exact. "fb", forward and backward,
         supposes no sizes, but that the motion can be run backward. Both suppose that noise in x adds to ψ(x).
-    **how
-        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`: w of each pair, and who reads.
+    **options
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
 
     Raises
     ------
@@ -184,5 +179,5 @@ def edmd(
     Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
     25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
     """
-    task = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **how)
-    return warned(fit(task, ridge=ridge, rank=rank, method=method))
+    regression = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **options)
+    return linear_predictor(regression, fit(regression, ridge=ridge, rank=rank, method=method))

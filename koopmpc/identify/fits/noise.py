@@ -5,11 +5,13 @@ from jaxtyping import Complex, Float, Int
 from scipy.linalg import sqrtm
 
 from koopmpc.errors import DataError
-from koopmpc.identify.solve import Rows, Solution, solve
+from koopmpc.identify.solve import RegressionRows, Solution, solve
 from koopmpc.predict.base import eigen
 
 
-def denoised(rows: Rows, exact: Int[np.ndarray, " e"], nz: int, directions: int, *, scaled: bool) -> Rows:
+def denoised(
+    rows: RegressionRows, exact: Int[np.ndarray, " e"], nz: int, directions: int, *, scaled: bool
+) -> RegressionRows:
     """Return the rows projected on the leading directions that [ψ(x) ψ(x⁺)] span together.
 
     Least squares on the result is the total least squares solution: with D = [ψ(x) ψ(x⁺)] freed of the exact
@@ -48,7 +50,7 @@ def denoised(rows: Rows, exact: Int[np.ndarray, " e"], nz: int, directions: int,
         D = D / np.tile(np.where(size > 0, size, 1.0), 2)
     L = np.linalg.svd(D - E @ (E.T @ D), full_matrices=False)[0][:, :directions]
     onto = np.hstack([E, L]).T
-    return Rows(onto @ rows.P, onto @ rows.T, rows.rest, rows.samples)
+    return RegressionRows(onto @ rows.P, onto @ rows.T, rows.rest, rows.samples)
 
 
 def _basis(P: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m r"]:
@@ -61,7 +63,7 @@ _DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal roo
 _REAL = 1e-6  # share of the size of A below which an imaginary part is rounding
 
 
-def forward_backward(rows: Rows, nz: int) -> Solution:
+def forward_backward(rows: RegressionRows, nz: int) -> Solution:
     """Return K = [Aᵀ; Bᵀ] of z⁺ = A z + B u with the A whose bias by noise cancels to first order.
 
     A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]: noise shrinks both, and A_b is A⁻¹. Of the square
@@ -86,9 +88,9 @@ def forward_backward(rows: Rows, nz: int) -> Solution:
     """
     now, U, ahead = rows.P[:, :nz], rows.P[:, nz:], rows.T
     forward = solve(rows)
-    backward = solve(Rows(np.hstack([ahead, U]), now, rows.rest, rows.samples))
+    backward = solve(RegressionRows(np.hstack([ahead, U]), now, rows.rest, rows.samples))
     A = _root_next_to(forward.K[:nz].T, backward.K[:nz].T)
-    B = solve(Rows(U, ahead - now @ A.T, rows.rest, rows.samples)).K
+    B = solve(RegressionRows(U, ahead - now @ A.T, rows.rest, rows.samples)).K
     return Solution(np.vstack([A.T, B]), forward.rank, 0.0)
 
 

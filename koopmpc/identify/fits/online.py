@@ -9,12 +9,11 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.fits.edmd import rule
-from koopmpc.identify.moments.moments import Moments, with_states
-from koopmpc.identify.moments.sums import Forgetting, Window
-from koopmpc.identify.rank import doubts
-from koopmpc.identify.regression import assembled, regression
-from koopmpc.identify.solve import Ridge, ridge_of, solve
+from koopmpc.identify.moments.moments import Moments
+from koopmpc.identify.moments.rows import row_columns
+from koopmpc.identify.moments.sliding import Forgetting, Window
+from koopmpc.identify.regression import linear_predictor, regression_of, unreduced
+from koopmpc.identify.solve import Ridge, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.buffered import buffered
 from koopmpc.predict.predictors import LinearPredictor
@@ -75,7 +74,7 @@ class OnlineEDMD:
         keep: float = 1e-6,
     ) -> None:
         self._lifting = lifting_of(lifting).bind(tuple(states))
-        self._full = with_states(self._lifting)
+        self._full = row_columns(self._lifting, (), bilinear=False).full
         self._psi, self._pair = buffered(self._full), np.empty((2, self._full.nz))  # for single pairs
         self._inputs, self._disturbances = tuple(inputs), tuple(disturbances)
         self._dt = checks.positive(dt, "dt", "s")
@@ -183,18 +182,14 @@ class OnlineEDMD:
         if self.pairs == 0:
             raise DataError("nothing was learned yet; call update first")
         R, weight = self._memory.factor(self._rows[: self._waiting])
-        task = regression(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
-        rows = task.rows.leading(self._lifting.nz)
-        sentences = doubts(rows, task.lifting.names, task.inputs, regular=self._ridge != 0)[0]
+        regression = regression_of(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
+        rows = regression.rows.leading(self._lifting.nz)
+        sentences = doubts(rows, regression.lifting.names, regression.inputs, regular=self._ridge != 0)[0]
         solution = solve(rows, ridge=self._ridge)
-        return assembled(
-            task,
-            solution.K,
-            rule=f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
-            + rule(rows, self._ridge, solution.ridge),
-            ridge=solution.ridge,
-            doubts=sentences,
-        )
+        said = f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
+        said += rule(rows, self._ridge, solution.ridge)
+        result = unreduced(regression, solution.K, rule=said, ridge=solution.ridge, doubts=sentences)
+        return linear_predictor(regression, result, warn=False)
 
     def _lifted(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
         """Return ψ of both at a microsecond each, in memory of our own; NaN beyond 1e30."""

@@ -181,7 +181,7 @@ class Entries:
 
     @property
     def bounded(self) -> Bool[np.ndarray, " nz"]:
-        """Rows with a bound on a free entry."""
+        """RegressionRows with a bound on a free entry."""
         limited = np.isfinite(self.low) | np.isfinite(self.high)
         return np.asarray((limited & np.isnan(self.known)).any(axis=1))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.identify.solve import Rows, solve
+from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.monomials import Monomials
@@ -141,4 +141,4 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
 
     @staticmethod
     def _solved(P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:
-        return solve(Rows(P, T, np.zeros(T.shape[1]), len(P)), ridge=alpha).K.T
+        return solve(RegressionRows(P, T, np.zeros(T.shape[1]), len(P)), ridge=alpha).K.T

@@ -13,10 +13,9 @@ from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.constrained import linear
 from koopmpc.identify.fits.prior import Entries
-from koopmpc.identify.moments.read import How
-from koopmpc.identify.rank import doubts
-from koopmpc.identify.regression import assembled, growth, read, warned
-from koopmpc.identify.solve import Rows, norms, onto, solve
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
+from koopmpc.identify.solve import RegressionRows, doubts, norms, onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Picked
 from koopmpc.lifting.state import Constant
@@ -95,7 +94,7 @@ def sparse_edmd(
     penalty: float = 1e-3,
     over: Literal["observables", "entries"] = "observables",
     adaptive: bool = True,
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
     """Fit z⁺ = A z + B u + E w on those observables z of ψ that predict the states, and each other.
 
@@ -121,8 +120,8 @@ def sparse_edmd(
     adaptive
         Weights 1 / |coefficient of a ridge fit| (by generalised cross-validation), which spare large ones and find
         the true set from enough data; else 1.
-    **how
-        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
+    **options
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
 
     Raises
     ------
@@ -142,20 +141,20 @@ def sparse_edmd(
     penalty = checks.positive(penalty, "penalty")
     if over not in ("observables", "entries"):
         raise DataError(f'over is {over!r}; pass "observables" or "entries"')
-    task = read(episodes, lifting, embedding, "sparse_edmd", **how)
-    names, nz = task.lifting.names, task.lifting.nz
-    missing = [state for state in task.states if state not in names]
+    regression = read(episodes, lifting, embedding, "sparse_edmd", **options)
+    names, nz = regression.lifting.names, regression.lifting.nz
+    missing = [state for state in regression.states if state not in names]
     if missing:
         raise DataError(f"the lifting lacks the state {missing[0]!r}; add State() to it")
-    rows = task.rows.leading(nz)
-    one = Constant().bind(task.states).names[0]
-    kept = np.array([name in task.states or name == one for name in names])
+    rows = regression.rows.leading(nz)
+    one = Constant().bind(regression.states).names[0]
+    kept = np.array([name in regression.states or name == one for name in names])
     used, missed = _closed(rows, kept, penalty, over == "entries", adaptive)
     stay = np.flatnonzero(kept)
     columns = np.concatenate([stay, np.arange(nz, len(used))])
-    few = Rows(rows.P[:, columns], rows.T[:, stay], rows.rest[stay], rows.samples)
-    picked = Picked(task.lifting, tuple(map(int, stay))).bind(task.lifting._states)
-    sentences = doubts(few, picked.names, task.inputs, regular=False)[0]
+    few = RegressionRows(rows.P[:, columns], rows.T[:, stay], rows.rest[stay], rows.samples)
+    picked = Picked(regression.lifting, tuple(map(int, stay))).bind(regression.lifting._states)
+    sentences = doubts(few, picked.names, regression.inputs, regular=False)[0]
     if missed > 1e-6:
         sentences.append(
             f"the LASSO met its optimality conditions only to {missed:.1e}; raise the penalty, or drop observables "
@@ -168,18 +167,18 @@ def sparse_edmd(
     changes = [
         f"{len(dropped)} of {nz} observables dropped" + (f": {', '.join(dropped)}" if dropped else ""),
         f"{int(np.isnan(known).sum())} of {known.size} entries of [A B] are not zero",
-        growth(Rows(rows.P, few.T, few.rest, rows.samples), _spread(K, columns, len(used)), plain),
+        growth(RegressionRows(rows.P, few.T, few.rest, rows.samples), _spread(K, columns, len(used)), plain),
     ]
-    assert task.C is not None, "an extended regression has its C"
+    assert regression.C is not None, "an extended regression has its C"
     place = {name: i for i, name in enumerate(picked.names)}
-    where = np.array([place[state] for state in task.states])
-    part = replace(task, rows=few, lifting=picked, C=task.C[:, stay], x_next=where)
+    where = np.array([place[state] for state in regression.states])
+    part = replace(regression, rows=few, lifting=picked, C=regression.C[:, stay], x_next=where)
     rule = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
-    return warned(assembled(part, K, rule=rule, doubts=sentences, changes=changes))
+    return linear_predictor(part, unreduced(part, K, rule=rule, doubts=sentences, changes=changes))
 
 
 def _closed(
-    rows: Rows, kept: Bool[np.ndarray, " nz"], penalty: float, entries: bool, adaptive: bool
+    rows: RegressionRows, kept: Bool[np.ndarray, " nz"], penalty: float, entries: bool, adaptive: bool
 ) -> tuple[Bool[np.ndarray, "n nz"], float]:
     """Grow `kept`, in place, until it predicts itself; return which coefficients are not zero, and the worst miss."""
     nz, worst = len(kept), 0.0
@@ -194,8 +193,8 @@ def _closed(
             rated[targets] = False
         if not rated.any():
             return np.ones((P.shape[1], nz), dtype=bool), worst
-        task = Rows(P, T[:, targets], rest[targets], rows.samples)
-        plain = np.abs(solve(task, ridge="gcv").K[rated])
+        regression = RegressionRows(P, T[:, targets], rest[targets], rows.samples)
+        plain = np.abs(solve(regression, ridge="gcv").K[rated])
         if not entries:
             plain = np.sqrt(np.sum(plain**2, axis=1, keepdims=True)) * np.ones_like(plain)
         weights = penalty / np.maximum(plain, 1e-12) if adaptive else np.full_like(plain, penalty)

@@ -12,11 +12,9 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.identify.fits.contraction import Misfit, clipped, inside, nearest, radius_of
-from koopmpc.identify.fits.edmd import rule
-from koopmpc.identify.moments.read import How
-from koopmpc.identify.rank import doubts
-from koopmpc.identify.regression import Regression, assembled, growth, read, relative_misfit, warned
-from koopmpc.identify.solve import Ridge, Rows, norms, onto, ridge_of, solve
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.regression import Regression, growth, linear_predictor, read, relative_misfit, unreduced
+from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, onto, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import Constant
 from koopmpc.predict.predictors import LinearPredictor
@@ -74,7 +72,7 @@ def stable_edmd(
     embedding: Delay | None = None,
     radius: float = 1.0,
     ridge: Ridge = 0.0,
-    **how: Unpack[How],
+    **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares with every eigenvalue |λ(A)| ≤ radius.
 
@@ -99,8 +97,8 @@ def stable_edmd(
         ρ > 0; below 1 it asks for a rate of decay.
     ridge
         Tikhonov weight on unit-norm columns; "gcv" chooses it for the plain fit.
-    **how
-        ``weights``, ``workers``, ``scheduler`` and ``progress`` of `moments`.
+    **options
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
 
     Raises
     ------
@@ -115,13 +113,13 @@ def stable_edmd(
         relative to its own size.
     """
     rho, asked = checks.positive(radius, "radius"), ridge_of(ridge)
-    task = read(episodes, lifting, embedding, "stable_edmd", **how)
-    nz, names = task.lifting.nz, task.lifting.names
-    rows = task.rows.leading(nz)
-    sentences = doubts(rows, names, task.inputs, regular=asked != 0)[0]
+    regression = read(episodes, lifting, embedding, "stable_edmd", **options)
+    nz, names = regression.lifting.nz, regression.lifting.names
+    rows = regression.rows.leading(nz)
+    sentences = doubts(rows, names, regression.inputs, regular=asked != 0)[0]
     plain = solve(rows, ridge=asked)
     K, weight = plain.K, plain.ridge
-    one = Constant().bind(task.states).names[0]
+    one = Constant().bind(regression.states).names[0]
     moving = np.array([i for i, name in enumerate(names) if name != one], dtype=np.intp)
     if one in names:
         K[:, names.index(one)] = np.eye(len(K))[names.index(one)]
@@ -133,10 +131,12 @@ def stable_edmd(
         after = radius_of(stable[np.ix_(moving, moving)].T)
         said = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, {said}"
         changes = [f"spectral radius {before:.6g} before, {after:.6g} after", growth(rows, stable, K)]
-        changes += _losses(task, K, stable)
+        changes += _losses(regression, K, stable)
         sentences += _doubt(relative_misfit(rows, K), relative_misfit(rows, stable))
         K = stable
-    return warned(assembled(task, K, rule=said, ridge=weight, doubts=sentences, changes=changes))
+    return linear_predictor(
+        regression, unreduced(regression, K, rule=said, ridge=weight, doubts=sentences, changes=changes)
+    )
 
 
 def _doubt(before: float, after: float) -> list[str]:
@@ -149,17 +149,19 @@ def _doubt(before: float, after: float) -> list[str]:
     ]
 
 
-def _losses(task: Regression, plain: Float[np.ndarray, "n nz"], stable: Float[np.ndarray, "n nz"]) -> list[str]:
+def _losses(regression: Regression, plain: Float[np.ndarray, "n nz"], stable: Float[np.ndarray, "n nz"]) -> list[str]:
     """Return for each state what stability costs its one-step residual, in words."""
-    pairs = zip(*(task.rows.residual(task.x_next, task.decoded(K)) for K in (plain, stable)), strict=True)
+    pairs = zip(
+        *(regression.rows.residual(regression.x_next, regression.decoded(K)) for K in (plain, stable)), strict=True
+    )
     return [
         f"one-step residual of {name!r}: {before:.3g} before, {after:.3g} after"
-        for name, (before, after) in zip(task.states, pairs, strict=True)
+        for name, (before, after) in zip(regression.states, pairs, strict=True)
     ]
 
 
 def _stabilised(
-    rows: Rows, K: Float[np.ndarray, "n nz"], moving: Int[np.ndarray, " m"], rho: float, ridge: float
+    rows: RegressionRows, K: Float[np.ndarray, "n nz"], moving: Int[np.ndarray, " m"], rho: float, ridge: float
 ) -> Float[np.ndarray, "n nz"]:
     """Return K with a stable block of the `moving` observables; what multiplies the other columns is refitted."""
     n = len(K)
@@ -191,7 +193,7 @@ def _nearest(misfit: Misfit, rho: float) -> Float[np.ndarray, "m m"]:
 
 
 def _refitted(
-    rows: Rows,
+    rows: RegressionRows,
     K: Float[np.ndarray, "n nz"],
     moving: Int[np.ndarray, " m"],
     A: Float[np.ndarray, "m m"],
@@ -204,6 +206,6 @@ def _refitted(
     found[np.ix_(moving, moving)] = inside(A, rho).T
     if len(others):
         known = rows.P[:, moving] @ found[np.ix_(moving, moving)]
-        rest = Rows(rows.P[:, others], rows.T[:, moving] - known, rows.rest[moving], rows.samples)
+        rest = RegressionRows(rows.P[:, others], rows.T[:, moving] - known, rows.rest[moving], rows.samples)
         found[np.ix_(others, moving)] = solve(rest, ridge=ridge).K
     return found

@@ -1,4 +1,4 @@
-"""Second moments of the rows [ψ(x) u ψ(x⁺)], or [ψ(x) u u⊗ψ(x) ψ(x⁺)]: all that the regressions need."""
+"""Second moments of the rows [ψ(x) u u⊗ψ(x) ψ(x⁺)], all that the regressions need, and what sums them up."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -7,14 +7,113 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg.lapack import dtpqrt
 
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.moments.sums import absorb
-from koopmpc.identify.solve import Rows, norms, unit
+from koopmpc.identify.moments.rows import LiftedChunk, RowColumns, row_columns
+from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.state import Constant, State
 from koopmpc.values import Value
+
+_PANEL = 4, 16  # columns that dtpqrt eliminates at once: fastest for few rows, for many
+_MANY = 256
+
+Triangle = Float[np.ndarray, "nd nd"]
+Table = Float[np.ndarray, "m nd"]
+
+
+def absorb(R: Triangle, rows: Table) -> None:
+    """Turn R into the triangular factor of [R; rows], in place; R is in Fortran's order."""
+    if len(rows):
+        panel = min(_PANEL[len(rows) >= _MANY], len(R))
+        info = dtpqrt(0, panel, R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
+        assert info == 0, f"dtpqrt refused argument {-info}"
+
+
+def empty(nd: int) -> Triangle:
+    """Return the factor of no rows."""
+    return np.zeros((nd, nd), order="F")
+
+
+class Gram:
+    """Sums of products over chunks, each state multiplied once.
+
+    Inside a piece of consecutive states Σ ψ⁺ψ⁺ᵀ is Σ ψψᵀ but for the first and the last state. So the rows between
+    are multiplied once, and what the ends have of their own is added; nothing is subtracted, so no digits are lost.
+
+    Parameters
+    ----------
+    n
+        Columns of p = [ψ(x) u u⊗ψ(x)].
+    nz
+        Those of ψ.
+    """
+
+    def __init__(self, n: int, nz: int) -> None:
+        self._n, self._nz = n, nz
+        self._now, self._cross, self._next = np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nz, nz))
+        self._both, self._beside = np.empty((n, n)), np.empty((n, nz))
+
+    def add(self, chunk: LiftedChunk) -> None:
+        """Add Σ w dᵀd of one chunk; its rows are used up."""
+        if chunk.weights is not None:
+            self._add_weighted(chunk.pairs())
+            return
+        P, first, last, nz, _ = chunk
+        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs of a first or a last state
+        now, after = P[at_ends], P[at_ends + 1, :nz]
+        starts, stops = P[first], P[last, :nz]
+        P[first] = P[last] = 0.0
+        np.matmul(P.T, P, out=self._both)
+        np.matmul(P[:-1].T, P[1:, :nz], out=self._beside)
+        self._now += self._both
+        self._now += starts.T @ starts
+        self._next += self._both[:nz, :nz]
+        self._next += stops.T @ stops
+        self._cross += self._beside
+        self._cross += now.T @ after
+
+    def _add_weighted(self, D: Float[np.ndarray, "M nd"]) -> None:
+        n, products = self._n, D.T @ D
+        self._now += products[:n, :n]
+        self._cross += products[:n, n:]
+        self._next += products[n:, n:]
+
+    @property
+    def size(self) -> Float[np.ndarray, " nd"]:
+        """A number for each column that is finite only if the column is: Σ w d²."""
+        return np.concatenate([self._now.diagonal(), self._next.diagonal()])
+
+    @property
+    def sums(self) -> Float[np.ndarray, "nd nd"]:
+        """Σ dᵀd."""
+        return np.block([[self._now, self._cross], [self._cross.T, self._next]])
+
+
+class Factor:
+    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd: twice the digits of the sums.
+
+    Parameters
+    ----------
+    n, nz
+        As for `Gram`.
+    """
+
+    def __init__(self, n: int, nz: int) -> None:
+        self._R = empty(n + nz)
+        self.size = np.zeros(n + nz)
+
+    def add(self, chunk: LiftedChunk) -> None:
+        """Take in the rows of one chunk."""
+        D = chunk.pairs()
+        self.size = np.abs(D).max(axis=0)
+        absorb(self._R, D)
+
+    @property
+    def sums(self) -> Float[np.ndarray, "nd nd"]:
+        """R."""
+        return np.ascontiguousarray(self._R)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +156,9 @@ class Moments(Value):
     embedding: Delay | None = None
 
     @cached_property
-    def full(self) -> Lifting:
-        """The lifting, then the states that it lacks."""
-        return with_states(self.lifting)
+    def columns(self) -> RowColumns:
+        """What the columns of the rows are."""
+        return row_columns(self.lifting, self.inputs, self.bilinear)
 
     @property
     def nz(self) -> int:
@@ -74,30 +173,20 @@ class Moments(Value):
     @property
     def products(self) -> Int[np.ndarray, " np"]:
         """Observables in u⊗ψ(x): all but a Constant, or none."""
-        return multiplied(self.lifting, self.bilinear)
-
-    @property
-    def regressors(self) -> Int[np.ndarray, " n"]:
-        """Columns of ψ(x), u and u⊗ψ(x)."""
-        return np.concatenate([np.arange(self.nz), np.arange(self.full.nz, self._first)])
-
-    @property
-    def targets(self) -> Int[np.ndarray, " n"]:
-        """Columns of ψ(x⁺), the appended states last."""
-        return np.arange(self._first, self._first + self.full.nz)
-
-    @property
-    def _first(self) -> int:
-        return self.full.nz + len(self.inputs) * (1 + len(self.products))
+        return self.columns.products
 
     @property
     def condition(self) -> float:
         """Condition number of the regressors on unit-norm columns, those that are 0 throughout left out."""
-        columns = self.rows(self.regressors, self.targets[:0]).P
-        size = norms(columns)
-        s = np.linalg.svd(columns[:, size > 0] / size[size > 0], compute_uv=False)
-        if self.samples < len(s):
+        P = self.rows(self.columns.regressors, self.columns.targets[:0]).P
+        size = np.sqrt(np.einsum("ij,ij->j", P, P))
+        unit = P[:, size > 0] / size[size > 0]
+        if self.samples < unit.shape[1]:
             return np.inf
+        if self.route == "gram":  # the rows are orthogonal
+            s = np.sort(np.sqrt(np.einsum("ij,ij->i", unit, unit)))[::-1][: unit.shape[1]]
+        else:
+            s = np.linalg.svd(unit, compute_uv=False)
         return float(s[0] / s[-1]) if s.size and s[-1] > 0 else (np.inf if s.size else 1.0)
 
     def __add__(self, other: "Moments") -> "Moments":
@@ -122,7 +211,7 @@ class Moments(Value):
             )
         return replace(both, route="gram", sums=self._gram() + other._gram())
 
-    def rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> Rows:
+    def rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> RegressionRows:
         """Return a few rows [P T] with the same second moments as these columns of all M rows.
 
         Weights are taken with mean 1, so that a root of the mean over M rows is one over the weighted rows.
@@ -130,7 +219,7 @@ class Moments(Value):
         n, scale = len(regressors), self.samples / self.weight
         if self.route == "qr":
             R = _triangle(np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])])
-            return Rows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
+            return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
         G = scale * self.sums
         size = np.sqrt(G.diagonal()[regressors])
         size[size == 0] = 1.0
@@ -142,40 +231,39 @@ class Moments(Value):
         inverse = np.where(held, 1.0, 0.0) / np.where(held, root, 1.0)
         T = inverse[:, None] * (vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None]))
         rest = np.maximum(G.diagonal()[targets] - np.sum(T**2, axis=0), 0.0)
-        return Rows(P, T, rest, self.samples)
+        return RegressionRows(P, T, rest, self.samples)
 
-    def complete(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> Rows:
+    def complete(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> RegressionRows:
         """Return rows [P T] as `rows` does, with all of T inside: TᵀT is that of all M rows, too.
 
         From Gram sums they are a root of the whole matrix, and have half the digits.
         """
         n = len(regressors)
         every = self.rows(np.concatenate([regressors, targets]), targets[:0]).P
-        return Rows(every[:, :n], every[:, n:], np.zeros(len(targets)), self.samples)
+        return RegressionRows(every[:, :n], every[:, n:], np.zeros(len(targets)), self.samples)
+
+    def decoder(self, where: Int[np.ndarray, " nx"]) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
+        """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked.
+
+        `where` says which of the observables, with the appended states, is each state.
+        """
+        nz = self.nz
+        C, residual = np.zeros((len(where), nz)), np.zeros(len(where))
+        held = where < nz
+        C[held, where[held]] = 1.0
+        if not held.all():
+            rows = self.rows(np.arange(nz), where[~held])
+            K = solve(rows).K
+            C[~held] = K.T
+            residual[~held] = rows.residual(np.arange(len(rows.rest)), K)
+        return C, residual
 
     def _gram(self) -> Float[np.ndarray, "nd nd"]:
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
 
 
-def multiplied(lifting: Lifting, bilinear: bool) -> Int[np.ndarray, " np"]:
-    """Return which observables u is multiplied with: all but a Constant, or none where the model is not bilinear."""
-    one = Constant().bind(lifting._states).names[0]
-    return np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
-
-
-def product_names(lifting: Lifting, inputs: tuple[str, ...], products: Int[np.ndarray, " np"]) -> tuple[str, ...]:
-    """Return ``"force [N] * theta [rad]"``, …, in the order of u⊗ψ(x)."""
-    return tuple(f"{u} * {lifting.names[int(i)]}" for u in inputs for i in products)
-
-
 def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
     return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
-
-
-def with_states(lifting: Lifting) -> Lifting:
-    """Return the lifting, then the states that it lacks."""
-    states = State().bind(lifting._states)
-    return lifting if set(states.names) <= set(lifting.names) else lifting + states
 
 
 class BothSides(NamedTuple):
@@ -198,13 +286,6 @@ class BothSides(NamedTuple):
 
 def both_sides(total: Moments) -> BothSides:
     """Return these rows, and where rounding begins: with Gram sums at half the digits."""
-    rows = total.complete(total.regressors, total.targets[: total.nz])
-    rounding = float(np.finfo(float).eps * max(total.samples, len(total.regressors) + total.nz))
+    rows = total.complete(total.columns.regressors, total.columns.targets[: total.nz])
+    rounding = float(np.finfo(float).eps * max(total.samples, len(total.columns.regressors) + total.nz))
     return BothSides(rows.P, rows.T, rounding if total.route == "qr" else float(np.sqrt(rounding)))
-
-
-def orthonormal(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:
-    """Return an orthonormal basis of the span of these columns, those of norm 0 left out."""
-    live = unit(columns[:, norms(columns) > 0])
-    U, s, _ = np.linalg.svd(live, full_matrices=False)
-    return U[:, s > cut * s.max(initial=0.0)]

@@ -1,126 +1,36 @@
 """The moments of all that a source holds: by which route, from which parts, read by whom."""
 
-from collections.abc import Iterable, Sized
-from dataclasses import dataclass
-from functools import cached_property, reduce
+from collections.abc import Callable, Iterable, Sequence, Sized
+from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import islice
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal, NamedTuple, TypedDict, cast
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
-from koopmpc.data.source import Part, Source, source_of
-from koopmpc.errors import DataError
-from koopmpc.identify.moments.moments import Moments, multiplied, product_names, with_states
-from koopmpc.identify.moments.rows import ROWS, Weights, changed, chunks, lifted, weights_of
-from koopmpc.identify.moments.sums import Factor, Gram
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Changed, Held, Part, Source, source_of
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.moments.moments import Factor, Gram, Moments
+from koopmpc.identify.moments.rows import ROWS, chunks, lifted_chunks, row_columns
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.parallel import Progress, map_tasks
 from koopmpc.values import Arrays, from_data, to_data
 
 Route = Literal["gram", "qr"]
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What is to be summed: the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)] of a part.
-
-    Attributes
-    ----------
-    part
-        Where the episodes are from.
-    lifting
-        ψ with all states; it crosses processes as data, so that a lifting of the user's own does too.
-    names
-        Of the columns.
-    products
-        The observables that u is multiplied with.
-    route
-        "gram" for Σ dᵀd, "qr" for its triangular factor.
-    weights
-        Of the steps; none weighs them all 1.
-    limit
-        Read at most so many chunks, evenly spread.
-    """
-
-    part: Part
-    lifting: Lifting
-    names: tuple[str, ...]
-    products: Int[np.ndarray, " np"]
-    route: Route
-    weights: Weights | None = None
-    limit: int | None = None
-
-    def __str__(self) -> str:
-        return str(self.part)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        arrays: Arrays = {}
-        rest = (self.part, self.names, self.products, self.route, self.weights, self.limit)
-        return _unpacked, (to_data(self.lifting, arrays), arrays, *rest)
-
-
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """Σ w dᵀd, or R with RᵀR equal to it; pairs of weight above 0, Σ w, and whether every chunk was read."""
-
-    sums: Float[np.ndarray, "nd nd"]
-    samples: int
-    weight: float
-    whole: bool
-
-
-def read(task: Reading) -> Sums:
-    """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten."""
-    episodes = task.part.load()
-    pieces = chunks(episodes)
-    which = range(len(pieces)) if task.limit is None else spread(len(pieces), task.limit)
-    steps = None if task.weights is None else weights_of(task.weights, episodes)
-    nz = task.lifting.nz
-    n = len(task.names) - nz
-    total = Gram(n, nz) if task.route == "gram" else Factor(n, nz)
-    samples, weight = 0, 0.0
-    space = np.empty((2 * ROWS, n))
-    for i in which:
-        chunk = lifted(episodes, task.lifting, pieces[i], task.products, space)
-        count = len(chunk.P) - len(chunk.last)
-        w = None if steps is None else np.concatenate([steps[e][first:last] for e, first, last in pieces[i]])
-        samples += count if w is None else int(np.count_nonzero(w))
-        weight += count if w is None else float(w.sum())
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
-            total.add(chunk, w)
-        _require_finite(total.size, task)
-    return Sums(total.sums, samples, weight, len(which) == len(pieces))
-
-
-def spread(total: int, wanted: int) -> list[int]:
-    """Return at most `wanted` of the indices 0 … total − 1, evenly spread."""
-    if wanted == 1:
-        return [0]
-    return sorted({round(i * (total - 1) / (wanted - 1)) for i in range(wanted)})
-
-
-def _require_finite(size: Float[np.ndarray, " nd"], task: Reading) -> None:
-    bad = np.flatnonzero(~np.isfinite(size))
-    if bad.size:
-        raise DataError(
-            f"the observable {task.names[int(bad[0])]!r} is NaN, infinite or above 1e154 in {task.part}; "
-            "drop it, or the episodes where it is"
-        )
-
-
-def _unpacked(lifting: Any, arrays: Arrays, part: Part, *rest: Any) -> Reading:
-    return Reading(part, from_data(lifting, arrays), *rest)
-
+Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
+Steps = list[Float[np.ndarray, " T"]]  # of each episode, one a step
 
 _WELL_CONDITIONED = 1e6  # scaled cond(Z) up to which normal equations lose nothing
 _PILOT = 4  # parts, and least number of chunks, that choose the route
 
 
-class How(TypedDict, total=False):
-    """How the moments are read; the fits take these keywords, too, and `moments` says what they mean."""
+class ReadOptions(TypedDict, total=False):
+    """Who reads the data, and the weights of the pairs; every fit takes these keywords, `second_moments` explains."""
 
     weights: Weights | None
     workers: int | None
@@ -156,8 +66,9 @@ def second_moments(
         ψ acts on ζ, the state and its past, as `Delay` makes it.
     route
         "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a
-        pilot, chunks sampled from up to 4 parts, chooses: Gram up to 1e6, else QR; if the whole turns out worse,
-        it is read again. A stream that can be read only once is summed in QR.
+        pilot, chunks sampled from up to 4 parts, chooses: up to 1e6 its Gram sums are kept and the other chunks
+        added to them, beyond it all is read in QR; so it is if the whole turns out worse than the pilot. A stream
+        that can be read only once is summed in QR.
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
     weights
@@ -184,78 +95,191 @@ def second_moments(
         embedding = embedding.fitted(source.states, source.inputs)
         source = embedding.source(source)
     bound = lifting_of(lifting).bind(source.states)
-    weights = changed(weights, source)
-    task = _Task(source, bound, multiplied(bound, bilinear), bilinear, weights, embedding)
+    reading = _Reading(None, bound, source.inputs, bilinear, _changed(weights, source))
+    zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
-    def whole(route: Route) -> Moments:
+    def read(route: Route, done: dict[int, tuple[int, ...]]) -> Iterable[Moments]:
+        """Yield the moments of the parts without the chunks that are done, in order."""
         parts = source.parts()
-        readings = (task.reading(part, route) for part in parts)
-        every = list(readings) if isinstance(parts, Sized) else readings
-        return task.total(map_tasks(read, every, workers=workers, scheduler=scheduler, progress=progress), route)
+        each = (replace(reading, part=p, route=route, done=done.get(i, ())) for i, p in enumerate(parts))
+        tasks = list(each) if isinstance(parts, Sized) else each
+        for sums in map_tasks(read_part, tasks, workers=workers, scheduler=scheduler, progress=progress):
+            yield replace(zero, route=route, **sums._asdict())
 
     if route is None and not source.replayable:
         route = "qr"
-    if route is not None:
-        return whole(route)
-    pilot, complete = task.pilot()
-    if pilot.condition <= _WELL_CONDITIONED:
-        total = pilot if complete else whole("gram")
-        if total.condition <= _WELL_CONDITIONED:
-            return total
-    return whole("qr")
+    if route is None:
+        pilot, done, complete = _pilot(source, reading)
+        total = replace(zero, route="gram", **pilot._asdict())
+        if not total.samples or total.condition <= _WELL_CONDITIONED:
+            if not complete:
+                total = reduce(Moments.__add__, read("gram", done), total)
+            if not total.samples:
+                raise DataError(_NO_WEIGHT)
+            if complete or total.condition <= _WELL_CONDITIONED:
+                return total
+    total = reduce(Moments.__add__, read(route or "qr", {}))
+    if not total.samples:
+        raise DataError(_NO_WEIGHT)
+    return total
+
+
+_NO_WEIGHT = "all weights are 0; give some pair a weight above 0"
+
+
+class _Sums(NamedTuple):
+    """Σ w dᵀd or R with RᵀR equal to it, the pairs of weight above 0, and Σ w."""
+
+    sums: Float[np.ndarray, "nd nd"]
+    samples: int
+    weight: float
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
-    """What a call of `moments` asks for."""
+class _Reading:
+    """What is to be summed: the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one part.
 
-    source: Source
+    Attributes
+    ----------
+    part
+        Where the episodes are from; None before one is chosen.
+    lifting, inputs, bilinear
+        What the rows hold; ψ is bound, and crosses processes as data, so that a lifting of the user's own does too.
+    weights
+        Weights of the steps; None weighs all by 1.
+    route
+        "gram" for Σ w dᵀd, "qr" for its triangular factor.
+    done
+        Numbers of chunks that are summed already.
+    """
+
+    part: Part | None
     lifting: Lifting
-    products: Int[np.ndarray, " np"]
+    inputs: tuple[str, ...]
     bilinear: bool
     weights: Weights | None
-    embedding: Delay | None
+    route: Route = "gram"
+    done: tuple[int, ...] = ()
 
-    @cached_property
-    def full(self) -> Lifting:
-        return with_states(self.lifting)
+    def __str__(self) -> str:
+        return str(self.part)
 
-    def reading(self, part: Part, route: Route, limit: int | None = None) -> Reading:
-        inputs, names = self.source.inputs, self.full.names
-        every = (*names, *inputs, *product_names(self.full, inputs, self.products), *names)
-        return Reading(part, self.full, every, self.products, route, self.weights, limit)
+    def __reduce__(self) -> tuple[Any, ...]:
+        arrays: Arrays = {}
+        rest = (self.inputs, self.bilinear, self.weights, self.route, self.done)
+        return _unpacked, (self.part, to_data(self.lifting, arrays), arrays, *rest)
 
-    def pilot(self) -> tuple[Moments, bool]:
-        """Return Gram sums of chunks sampled from a few parts, and whether they are all there are."""
-        parts = self.source.parts()
-        if isinstance(parts, list):
-            chosen = [parts[i] for i in spread(len(parts), _PILOT)]
-            every = len(chosen) == len(parts)
-        else:
-            chosen, every = list(islice(parts, _PILOT)), False
-        width = self.lifting.nz + self.source.nu * (1 + len(self.products))
-        limit = -(-max(_PILOT, -(-4 * width // ROWS)) // len(chosen))
-        read_now = [read(self.reading(part, "gram", limit)) for part in chosen]
-        return self.total(read_now, "gram"), every and all(sums.whole for sums in read_now)
 
-    def total(self, parts: Iterable[Sums], route: Route) -> Moments:
-        """Return the sums of the parts, added in their order."""
-        source = self.source
-        every = (
-            Moments(
-                lifting=self.lifting,
-                inputs=source.inputs,
-                dt=source.dt,
-                samples=s.samples,
-                weight=s.weight,
-                route=route,
-                sums=s.sums,
-                bilinear=self.bilinear,
-                embedding=self.embedding,
+def _unpacked(part: Part, lifting: Any, arrays: Arrays, *rest: Any) -> _Reading:
+    return _Reading(part, from_data(lifting, arrays), *rest)
+
+
+def read_part(reading: _Reading) -> _Sums:
+    """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten."""
+    assert reading.part is not None, "a reading is of a part"
+    episodes = reading.part.load()
+    done = set(reading.done)
+    which = [i for i in range(len(chunks(episodes))) if i not in done] if done else None
+    return _summed(reading, episodes, which)
+
+
+def _summed(reading: _Reading, episodes: Episodes, which: Sequence[int] | None) -> _Sums:
+    """Return the sums of these chunks of the episodes, by default of all."""
+    weights = None if reading.weights is None else _weights_of(reading.weights, episodes)
+    columns = row_columns(reading.lifting, reading.inputs, reading.bilinear)
+    names, total, samples, weight = columns.names, None, 0, 0.0
+    for chunk in lifted_chunks(episodes, columns, which, weights):
+        if total is None:
+            total = (Gram if reading.route == "gram" else Factor)(chunk.P.shape[1], chunk.nz)
+        count = len(chunk.P) - len(chunk.last)
+        samples += count if chunk.weights is None else int(np.count_nonzero(chunk.weights))
+        weight += count if chunk.weights is None else float(chunk.weights.sum())
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
+            total.add(chunk)
+        bad = np.flatnonzero(~np.isfinite(total.size))
+        if bad.size:
+            raise DataError(
+                f"the observable {names[int(bad[0])]!r} is NaN, infinite or above 1e154 in {reading.part}; "
+                "drop it, or the episodes where it is"
             )
-            for s in parts
-        )
-        result = reduce(Moments.__add__, every)
-        if result.samples == 0:
-            raise DataError("all weights are 0; give some pair a weight above 0")
-        return result
+    sums = np.zeros((len(names), len(names))) if total is None else total.sums
+    return _Sums(sums, samples, weight)
+
+
+def _pilot(source: Source, reading: _Reading) -> tuple[_Sums, dict[int, tuple[int, ...]], bool]:
+    """Return Gram sums of chunks sampled from a few parts, which they are, part by part, and whether they are all."""
+    parts = source.parts()
+    if isinstance(parts, list):
+        every = len(parts) <= _PILOT
+        chosen = {i: parts[i] for i in (range(len(parts)) if every else spread(len(parts), _PILOT))}
+    else:
+        chosen, every = dict(enumerate(islice(parts, _PILOT))), False
+    width = reading.lifting.nz + len(reading.inputs) * (1 + reading.lifting.nz * reading.bilinear)
+    limit = -(-max(_PILOT, -(-4 * width // ROWS)) // len(chosen))
+    done: dict[int, tuple[int, ...]] = {}
+    found: list[_Sums] = []
+    for i, part in chosen.items():
+        episodes = part.load()
+        count = -(-sum(len(e.U) for e in episodes.episodes) // ROWS)
+        done[i] = tuple(range(count) if count <= limit else spread(count, limit))
+        every = every and len(done[i]) == count
+        found.append(_summed(replace(reading, part=part), episodes, done[i]))
+    sums = reduce(np.add, (each.sums for each in found))
+    return _Sums(sums, sum(each.samples for each in found), sum(each.weight for each in found)), done, every
+
+
+def spread(total: int, wanted: int) -> list[int]:
+    """Return at most `wanted` of the indices 0 … total − 1, evenly spread."""
+    if wanted == 1:
+        return [0]
+    return sorted({round(i * (total - 1) / (wanted - 1)) for i in range(wanted)})
+
+
+def _weights_of(weights: Weights, episodes: Episodes) -> Steps:
+    """Return the weight of each step of each episode.
+
+    Raises
+    ------
+    ShapeError
+        There is not one item an episode, or an item is neither a number nor one a step.
+    DataError
+        A weight is below zero or not finite.
+    """
+    if callable(weights):
+        given = [weights(episode) for episode in episodes]
+    else:
+        single = isinstance(weights, np.ndarray) and weights.ndim == 0
+        if single or not isinstance(cast(object, weights), Iterable):
+            raise DataError(f"weights is {weights!r}; pass one item an episode, or a function of an Episode")
+        given = list(cast("Sequence[ArrayLike]", weights))
+        if len(given) != len(episodes):
+            raise ShapeError(
+                f"there are {len(given)} weights and {len(episodes)} episodes; give each episode a number, or "
+                "an array of one a step"
+            )
+    steps = [
+        checks.vector(item, f"the weight of episode {i}", len(episode))
+        for i, (item, episode) in enumerate(zip(given, episodes, strict=True))
+    ]
+    for i, own in enumerate(steps):
+        if own.min() < 0:
+            raise DataError(f"the weight of episode {i} is {own.min():g}; weights are 0 or above")
+    return steps
+
+
+def _changed(weights: Weights | None, source: Source) -> Weights | None:
+    """Return the weights that belong to the episodes as `source` changes them: an embedding drops their first steps.
+
+    Raises
+    ------
+    DataError
+        They are a list, and the source is not made from Episodes, which alone have an order that is known.
+    """
+    if weights is None or callable(weights):
+        return weights
+    dropped, inner = 0, source
+    while isinstance(inner, Changed):
+        dropped, inner = dropped + inner.history, inner.source
+    if not isinstance(inner, Held):
+        raise DataError("weights are a list, which only Episodes have an order for; pass a function of an Episode")
+    return [own[dropped:] for own in _weights_of(weights, inner.episodes) if len(own) > dropped]

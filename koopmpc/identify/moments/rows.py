@@ -1,21 +1,61 @@
-"""Snapshot pairs in chunks of fixed size, cut from episodes and never across two of them."""
+"""Rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]: their columns, and the chunks of fixed size in which states are lifted."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, cast
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.source import Changed, Held, Source
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import Constant, State
 
 ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
 
-_NONE = np.zeros(0, dtype=np.intp)
+Table = Float[np.ndarray, "m n"]
+
+
+@dataclass(frozen=True, eq=False)
+class RowColumns:
+    """The columns of the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]; in them the states that ψ lacks are appended to ψ(x).
+
+    Attributes
+    ----------
+    full
+        ψ, then the states that it lacks.
+    products
+        The observables in u⊗ψ(x): all but a Constant, for u times it is u; none where the model is not bilinear.
+    names
+        Of all columns.
+    regressors
+        The columns of ψ(x), u and u⊗ψ(x).
+    targets
+        The columns of ψ(x⁺), the appended states last.
+    """
+
+    full: Lifting
+    products: Int[np.ndarray, " np"]
+    names: tuple[str, ...]
+    regressors: Int[np.ndarray, " n"]
+    targets: Int[np.ndarray, " m"]
+
+
+def row_columns(lifting: Lifting, inputs: tuple[str, ...], bilinear: bool) -> RowColumns:
+    """Return the columns for the bound ψ and these inputs."""
+    points = lifting._states
+    states, one = State().bind(points), Constant().bind(points).names[0]
+    full = lifting if set(states.names) <= set(lifting.names) else lifting + states
+    products = np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
+    names = full.names + inputs + tuple(f"{u} * {lifting.names[int(i)]}" for u in inputs for i in products)
+    first = len(names)
+    return RowColumns(
+        full,
+        products,
+        names + full.names,
+        np.concatenate([np.arange(lifting.nz), np.arange(full.nz, first)]),
+        np.arange(first, first + full.nz),
+    )
 
 
 class Piece(NamedTuple):
@@ -30,8 +70,8 @@ def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
     """Return all pairs in order, in lists of pieces of `rows` pairs (the last may hold fewer)."""
     result: list[list[Piece]] = [[]]
     room = rows
-    for i, episode in enumerate(episodes):
-        first, length = 0, len(episode)
+    for i, episode in enumerate(episodes.episodes):
+        first, length = 0, len(episode.U)
         while first < length:
             if room == 0:
                 result.append([])
@@ -43,8 +83,8 @@ def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
     return result
 
 
-class Lifted(NamedTuple):
-    """A chunk, each state lifted once: rows p = [ψ(x) u u⊗ψ(x)]; the last state of a piece has u = 0.
+class LiftedChunk(NamedTuple):
+    """A chunk in which each state is lifted once: rows p = [ψ(x) u u⊗ψ(x)]; the last state of a piece has u = 0.
 
     Attributes
     ----------
@@ -54,50 +94,64 @@ class Lifted(NamedTuple):
         Where the pieces begin and end: rows that belong to one pair, where all others belong to two.
     nz
         Number of observables.
+    weights
+        w of each pair; None weighs all by 1.
     """
 
     P: Float[np.ndarray, "m n"]
     first: Int[np.ndarray, " k"]
     last: Int[np.ndarray, " k"]
     nz: int
+    weights: Float[np.ndarray, " M"] | None = None
 
-    def pairs(self, weights: Float[np.ndarray, " M"] | None = None) -> Float[np.ndarray, "M nd"]:
+    def pairs(self) -> Float[np.ndarray, "M nd"]:
         """Return the rows [p ψ(x⁺)] of the pairs, each times the root of its weight."""
         n = self.P.shape[1]
         D = np.empty((len(self.P) - len(self.last), n + self.nz))
         D[:, :n] = _without(self.P, self.last)
         D[:, n:] = _without(self.P[:, : self.nz], self.first)
-        if weights is not None:
-            D *= np.sqrt(weights)[:, None]
+        if self.weights is not None:
+            D *= np.sqrt(self.weights)[:, None]
         return D
 
 
-def lifted(
+def lifted_chunks(
     episodes: Episodes,
-    lifting: Lifting,
-    chunk: list[Piece],
-    products: Int[np.ndarray, " np"] = _NONE,
-    space: Float[np.ndarray, "_ n"] | None = None,
-) -> Lifted:
-    """Return the lifted states of one chunk.
+    columns: RowColumns,
+    which: Sequence[int] | None = None,
+    weights: list[Float[np.ndarray, " T"]] | None = None,
+) -> Iterator[LiftedChunk]:
+    """Yield the chunks of these numbers, by default all, lifted; the memory of one is used again for the next.
 
-    `products` are the observables that u is multiplied with. The rows are written into `space`, long enough for
-    twice the pairs, where it is given: fresh memory costs as much as the rows.
+    Parameters
+    ----------
+    episodes
+        With as many inputs as the columns name.
+    columns
+        What the rows hold.
+    which
+        Numbers of chunks, in the order of `chunks`.
+    weights
+        Of the steps of each episode.
     """
-    of, nz, nu = episodes.episodes, lifting.nz, episodes.nu
-    last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
-    first = np.concatenate([[0], last[:-1] + 1])
-    count = int(last[-1]) + 1
-    P = np.empty((count, nz + nu + nu * len(products))) if space is None else space[:count]
-    lifting._lift(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
-    if nu:
-        U = P[:, nz : nz + nu]
-        U[:] = np.insert(
-            _joined([of[i].U[start:end] for i, start, end in chunk]), last - np.arange(len(last)), 0.0, axis=0
-        )
-        for i, start in enumerate(range(nz + nu, P.shape[1], max(len(products), 1))):
-            np.multiply(U[:, i : i + 1], P[:, products], out=P[:, start : start + len(products)])
-    return Lifted(P, first, last, nz)
+    of, lifting, products = episodes.episodes, columns.full, columns.products
+    nz, nu = lifting.nz, len(episodes.inputs)
+    n = len(columns.names) - nz
+    pieces = chunks(episodes)
+    space = np.empty((2 * ROWS, n))  # fresh memory costs as much as the rows
+    for chunk in pieces if which is None else [pieces[i] for i in which]:
+        last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
+        first = np.concatenate([[0], last[:-1] + 1])
+        P = space[: int(last[-1]) + 1]
+        lifting._lift(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
+        if nu:
+            U = P[:, nz : nz + nu]
+            given = _joined([of[i].U[start:end] for i, start, end in chunk])
+            U[:] = np.insert(given, last - np.arange(len(last)), 0.0, axis=0)
+            for i, start in enumerate(range(nz + nu, n, max(len(products), 1))):
+                np.multiply(U[:, i : i + 1], P[:, products], out=P[:, start : start + len(products)])
+        w = None if weights is None else np.concatenate([weights[i][start:end] for i, start, end in chunk])
+        yield LiftedChunk(P, first, last, nz, w)
 
 
 def _joined(parts: list[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
@@ -109,57 +163,3 @@ def _without(P: Float[np.ndarray, "m n"], rows: Int[np.ndarray, " k"]) -> Float[
     if len(rows) > 1:
         return np.delete(P, rows, axis=0)
     return P[1:] if rows[0] == 0 else P[:-1]
-
-
-Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
-Steps = list[Float[np.ndarray, " T"]]  # of each episode, one a step
-
-
-def weights_of(weights: Weights, episodes: Episodes) -> Steps:
-    """Return the weight of each step of each episode.
-
-    Raises
-    ------
-    ShapeError
-        There is not one item an episode, or an item is neither a number nor one a step.
-    DataError
-        A weight is below zero or not finite.
-    """
-    if callable(weights):
-        given = [weights(episode) for episode in episodes]
-    else:
-        single = isinstance(weights, np.ndarray) and weights.ndim == 0
-        if single or not isinstance(cast(object, weights), Iterable):
-            raise DataError(f"weights is {weights!r}; pass one item an episode, or a function of an Episode")
-        given = list(cast("Sequence[ArrayLike]", weights))
-        if len(given) != len(episodes):
-            raise ShapeError(
-                f"there are {len(given)} weights and {len(episodes)} episodes; give each episode a number, or "
-                "an array of one a step"
-            )
-    steps = [
-        checks.vector(item, f"the weight of episode {i}", len(episode))
-        for i, (item, episode) in enumerate(zip(given, episodes, strict=True))
-    ]
-    for i, own in enumerate(steps):
-        if own.min() < 0:
-            raise DataError(f"the weight of episode {i} is {own.min():g}; weights are 0 or above")
-    return steps
-
-
-def changed(weights: Weights | None, source: Source) -> Weights | None:
-    """Return the weights that belong to the episodes as `source` changes them: an embedding drops their first steps.
-
-    Raises
-    ------
-    DataError
-        They are a list, and the source is not made from Episodes, which alone have an order that is known.
-    """
-    if weights is None or callable(weights):
-        return weights
-    dropped, inner = 0, source
-    while isinstance(inner, Changed):
-        dropped, inner = dropped + inner.history, inner.source
-    if not isinstance(inner, Held):
-        raise DataError("weights are a list, which only Episodes have an order for; pass a function of an Episode")
-    return [own[dropped:] for own in weights_of(weights, inner.episodes) if len(own) > dropped]
