@@ -32,8 +32,8 @@ class CartPole(km.Dynamics):
         """ẋ = [v, v̇, ω, ω̇]."""
         velocity, theta, omega = x[1], x[2], x[3]
         S, C = ca.sin(theta), ca.cos(theta)
-        push = u[0] + self.wind + self.m * S * (self.L * omega**2 + self.g * C)
-        acceleration = push / (self.M + self.m * S**2)
+        force = u[0] + self.wind + self.m * S * (self.L * omega**2 + self.g * C)
+        acceleration = force / (self.M + self.m * S**2)
         return ca.vertcat(velocity, acceleration, omega, -(acceleration * C + self.g * S) / self.L)
 
 

@@ -56,8 +56,8 @@ class CartPole(Dynamics):
     def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
         """ẋ = [v, v̇, ω, ω̇]."""
         S, C = ca.sin(x[2]), ca.cos(x[2])
-        push = u[0] - self.d * x[1] + self.m * S * (self.L * x[3] ** 2 + self.g * C)
-        acceleration = push / (self.M + self.m * S**2)
+        force = u[0] - self.d * x[1] + self.m * S * (self.L * x[3] ** 2 + self.g * C)
+        acceleration = force / (self.M + self.m * S**2)
         return ca.vertcat(x[1], acceleration, x[3], -(acceleration * C + self.g * S) / self.L)
 
 

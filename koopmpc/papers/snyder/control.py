@@ -37,8 +37,8 @@ LIFTINGS: Mapping[str, Lifting] = {
 }
 
 INPUTS = """\
-Under u = −K x the input is a function of the state: a fit without B tells the closed loop, and a fit with B
-cannot tell A and B apart. Noise on top of the feedback shows both. *Feedback data* are the one trajectory of the
+Under u = −K x the input is a function of the state: a fit without B describes the closed loop, and a fit with B
+cannot separate A from B. Noise on top of the feedback separates them. *Feedback data* are the one trajectory of the
 figures, with its input held over each sample; *exciting data* are {episodes} episodes of {lasting:g} s under the
 same feedback and uniform noise of ±{pendulum:g} N m or ±{cart_pole:g} N. Medians over ten episodes of 2 s that were
 not fitted, relative to ‖x − x_ref‖, each lifted once at its start."""
@@ -52,7 +52,7 @@ their ratio to nonlinear MPC on the true model with a horizon of {ahead:g} s."""
 
 LESSONS = (
     """\
-Hanging, with these weights, no limit, and time that is not sampled, u = −√10 ω is optimal for the nonlinear
+Hanging, with these weights, without limits and in continuous time, u = −√10 ω is optimal for the nonlinear
 pendulum too: 2√10 times its energy solves the Hamilton–Jacobi–Bellman equation. There no lifted model can do better
 than LQR on the linearisation.""",
     """\
@@ -60,7 +60,7 @@ Monomials of degree 3 rebuild the hanging pendulum best, and steer it at {cubic:
 small reconstruction error does not make a control model.""",
     """\
 Upright, from π/4, LQR on Fourier observables takes {lifted:.4f} times the best cost and LQR on the
-linearisation {local:.4f}: there the lifted model does see what the linearisation does not.""",
+linearisation {local:.4f}: there the lifted model describes what the linearisation leaves out.""",
     """\
 In the shift of the cart-pole, which stays within 0.04 rad of upright, all models are alike.""",
 )

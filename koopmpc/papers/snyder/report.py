@@ -25,8 +25,8 @@ snyder` writes this page, its figures, and one Rerun recording of all curves. Wh
 words. Of {total} claims {summary}."""
 
 SETTINGS = """\
-Masses, lengths, weights, starts, and the kinds of observables are the paper's. The rest it leaves open, and we
-chose: g = 9.81 m/s², one trajectory of 10 s sampled at 0.01 s, reconstruction from its first state with
+Masses, lengths, weights, starts, and the kinds of observables are the paper's. The rest it leaves open; we
+chose g = 9.81 m/s², one trajectory of 10 s sampled at 0.01 s, reconstruction from its first state with
 b = Φ⁺ψ(x₁), unscaled snapshots, truncated SVD. *Full rank* keeps every singular value above 10⁻¹⁰ σ₁; beside it
 stands rank n, the number of states. Monomials include the states and the constant; Fourier observables are x,
 sin kxᵢ, cos kxᵢ of every state. Where we differ: the pendulum starts at rest from π/4 but hangs at θ = 0, and the

@@ -22,8 +22,8 @@ from koopmpc.papers.snyder.settings import OBSERVABLES, TARGET
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
 
 CAUSES = """\
-Under LQR the state settles at (1, 0, π, 0). Its motion about that point has four eigenvalues of its own, and to
-stay away from the origin takes a fifth, λ = 1: one more than DMD on four states has, and one more than rank 4
+Under LQR the state settles at (1, 0, π, 0). Its motion about that point has four eigenvalues of its own, and
+staying away from the origin takes a fifth, λ = 1: one more than DMD on four states has, and one more than rank 4
 keeps of any lifting. Rank 5 does little better, for a truncated SVD keeps the directions of largest variance,
 which are not those of the motion. With the origin at the target, or a constant among the observables, DMD is
 right; with all singular values kept, EDMD is. No fault of Koopman theory is needed to explain what happens under
