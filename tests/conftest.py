@@ -29,10 +29,10 @@ def _every_qp_meets_kkt():
         yield
         return
     import koopmpc.control.target
-    from koopmpc.control.solvers import choose
+    from koopmpc.control.linear import koopman_mpc
     from tests.control.kkt import CheckedOSQP
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(choose.SOLVERS, "osqp", CheckedOSQP)
+        patch.setitem(koopman_mpc.SOLVERS, "osqp", CheckedOSQP)
         patch.setattr(koopmpc.control.target, "OSQP", CheckedOSQP)
         yield

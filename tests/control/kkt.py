@@ -27,7 +27,7 @@ class CheckedOSQP(OSQP):
     def solve(self, v, y, time_limit=None):
         solution = super().solve(v, y, time_limit)
         if solution.status is km.Status.OPTIMAL:
-            now = QP(self.qp.P, self.qp.q, self.qp.A, self._bounds.low, self._bounds.high)
+            now = QP(self.qp.P, self.qp.q, self.qp.A, self.low, self.high)
             meets_kkt(now, solution, *self.eps)
             CheckedOSQP.checked += 1
         return solution

@@ -3,6 +3,7 @@
 import numpy as np
 import scipy.linalg
 
+import koopmpc as km
 from koopmpc.control.riccati import stationary
 from tests.example_plants import linear as linear
 from tests.example_plants import random_pair as random_pair
@@ -140,3 +141,8 @@ def cvxpy_plan(model, cost, limits, z0, rows, targets, C=None, of=None):
     except cp.error.SolverError:
         return None
     return U.value if problem.status in ("optimal", "optimal_inaccurate") else None
+
+
+def in_coordinates(wanted, controller=km.KoopmanMPC):
+    """The class of controller whose QP is in these coordinates, whatever is usually chosen; None leaves the choice."""
+    return controller if wanted is None else type(controller.__name__, (controller,), {"_wanted": wanted})

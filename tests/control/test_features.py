@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control.riccati import stationary
-from tests.control.models import PRECISE, Told, linear, random_pair
+from tests.control.models import PRECISE, Told, in_coordinates, linear, random_pair
 from tests.control.oracle import oracle, targets_of
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -74,7 +74,7 @@ def draw(rng):
 
 
 @settings(max_examples=30)
-@given(seed=SEEDS, coordinates=st.sampled_from(["auto", "riccati", "plain"]))
+@given(seed=SEEDS, coordinates=st.sampled_from([None, "riccati", "plain"]))
 def test_everything_at_once_equals_cvxpy_along_a_closed_loop(seed, coordinates):
     equals_cvxpy(seed, coordinates)
 
@@ -82,7 +82,7 @@ def test_everything_at_once_equals_cvxpy_along_a_closed_loop(seed, coordinates):
 @pytest.mark.slow
 def test_everything_at_once_a_thousand_times():
     for seed in range(1000):
-        equals_cvxpy(seed, ("auto", "riccati", "plain")[seed % 3])
+        equals_cvxpy(seed, (None, "riccati", "plain")[seed % 3])
 
 
 def equals_cvxpy(seed, coordinates):
@@ -91,7 +91,7 @@ def equals_cvxpy(seed, coordinates):
     N, nx, nu, nw, nz = sum(blocks), model.nx, model.nu, model.nw, model.nz
     d = np.zeros(nz)
     told = Told(d) if disturbed else None
-    mpc = km.KoopmanMPC(model, cost, limits, N, moves=blocks, estimator=told, coordinates=coordinates, settings=PRECISE)
+    mpc = in_coordinates(coordinates)(model, cost, limits, N, moves=blocks, estimator=told, settings=PRECISE)
     P = terminal(model, cost, N)
     x = rng.normal(size=nx)
     u_prev = np.clip(0.3 * rng.normal(size=nu), *limits.inputs(nu))
@@ -148,15 +148,14 @@ def test_rates_that_cost_and_limit_nothing_change_nothing():
         km.KoopmanMPC(model, cost, limits, 12, moves=(1,) * 12, settings=PRECISE),
         km.KoopmanMPC(model, cost, limits, 12, moves=12, settings=PRECISE),
         km.KoopmanMPC(model, cost, limits, 12, estimator=Told([0, 0]), settings=PRECISE),
-        km.KoopmanMPC(
+        in_coordinates("riccati")(
             with_disturbances(model, np.ones((2, 1))),
             cost,
             limits,
             12,
-            coordinates="riccati",
             settings=PRECISE,
         ),
-        km.KoopmanMPC(model, cost, limits, 12, coordinates="plain", settings=PRECISE),
+        in_coordinates("plain")(model, cost, limits, 12, settings=PRECISE),
     ):
         np.testing.assert_allclose(inputs(closed_loop(other)), inputs(plain), atol=1e-5)
     zero = km.KoopmanMPC(model, km.Cost([2, 0.5], 0.1, R_delta=0), limits, 12, settings=PRECISE)
@@ -405,8 +404,7 @@ def test_the_coordinates_follow_the_condition_number():
     choose = lambda model, **o: km.KoopmanMPC(model, km.Cost(1, 1), km.Limits(-1, 1), 30, **o).coordinates  # noqa: E731
     assert choose(tame) == "plain"
     assert choose(wild) == "riccati"
-    assert choose(tame, coordinates="riccati") == "riccati"
-    assert choose(wild, coordinates="plain") == "plain"
+    assert choose(tame, solver="daqp") == "riccati"
 
 
 def test_messages():

@@ -77,7 +77,6 @@ def through_controllers(seed, count, share):
 
 
 def test_a_sample_of_random_qps_through_whole_controllers():
-    pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
     seen, _ = through_controllers(1, 540, 1.0)
     assert sum(n for key, n in seen.items() if key[-1] in {status.name for status in GOOD}) > 350
     assert sum(n for key, n in seen.items() if key[-1] == "INFEASIBLE") > 5
@@ -85,7 +84,6 @@ def test_a_sample_of_random_qps_through_whole_controllers():
 
 @pytest.mark.slow
 def test_a_hundred_thousand_random_qps_through_whole_controllers():
-    pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
     seen, worst = through_controllers(2, 100_000, 0.3)
     assert sum(n for key, n in seen.items() if key[-1] in km.Status.__members__) == 100_000
     lines = [f"{' '.join(key):40s} {n}" for key, n in sorted(seen.items())]

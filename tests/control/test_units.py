@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.control.models import in_coordinates
 
 A, B = np.array([[1.1, 0.2], [0.1, 0.95]]), np.array([[0.1, 0.0], [0.05, 0.2]])
 
@@ -27,7 +28,7 @@ def moves(solver, coordinates, states=(1.0, 1.0), inputs=(1.0, 1.0), price=1.0, 
         x_max=0.9 * sx,
         slack=None if slack is None else (price * slack[0] / sx, price * slack[1] / sx**2),
     )
-    mpc = km.KoopmanMPC(model, cost, limits, 8, solver=solver, coordinates=coordinates)
+    mpc = in_coordinates(coordinates)(model, cost, limits, 8, solver=solver)
     x, found = np.array([0.8, -0.9]), []
     for _ in range(6):
         move = mpc(x * sx, [0.0, 0.0])
@@ -40,8 +41,6 @@ def moves(solver, coordinates, states=(1.0, 1.0), inputs=(1.0, 1.0), price=1.0, 
 @pytest.mark.parametrize("coordinates", ["plain", "riccati"])
 @pytest.mark.parametrize("solver", ["osqp", "daqp"])
 def test_units_change_neither_plan_nor_iterations(solver, coordinates, slack):
-    if solver == "daqp":
-        pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
     base = moves(solver, coordinates, slack=slack)
     assert any(status is not km.Status.UNCONSTRAINED for status, *_ in base)
     for units in (

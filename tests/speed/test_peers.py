@@ -94,7 +94,6 @@ def pendulum():
 @pytest.mark.parametrize("condensed", [False, True], ids=["sparse", "condensed"])
 def test_against_cvxpy(benchmark, pendulum, condensed, name):
     """The states of closed loops from 12 starts: ours takes a loop, with OSQP and DAQP, then CVXPY the same one."""
-    pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
     parts, cost, N = pendulum
     limits, reference, rows = LIMITS[name], np.zeros(2), []
     ours, other = (km.KoopmanMPC(parts.model, cost, limits, N, solver=each) for each in ("osqp", "daqp"))

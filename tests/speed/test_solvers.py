@@ -3,18 +3,18 @@
 import sys
 import time
 
+import daqp
 import numpy as np
 import osqp
 import pytest
 import scipy.linalg
 
 import koopmpc as km
+from koopmpc.control.linear.koopman_mpc import SOLVERS
 from koopmpc.control.solvers.base import QP
-from koopmpc.control.solvers.choose import solver
 from koopmpc.control.solvers.osqp import DEFAULTS
 
 pytestmark = pytest.mark.speed
-daqp = pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
 
 A = np.array([[1, 0.1, 0, 0], [0, 1.02, 0.1, 0], [0, 0, 0.95, 0.1], [0, 0, 0, 0.9]])
 B = np.array([[0.0], [0.05], [0.1], [0.1]])
@@ -43,7 +43,7 @@ class Loop:
         self.offsets = list(self._offsets(F, episodes, steps))
 
     def _offsets(self, F, episodes, steps):
-        rng, exact = np.random.default_rng(0), solver("daqp")(self.qp, None)
+        rng, exact = np.random.default_rng(0), SOLVERS["daqp"](self.qp, None)
         D = self.qp.A
         for _ in range(episodes):
             x = rng.normal(size=4) * [2, 0.5, 0.5, 0.5]
@@ -74,7 +74,7 @@ class Loop:
 
 
 def ours(name, loop):
-    made = solver(name)(loop.qp, None)
+    made = SOLVERS[name](loop.qp, None)
 
     def step(low, high, v, y):
         made.set_bounds(low, high)
@@ -143,7 +143,7 @@ def test_a_millisecond_is_held_or_reported(benchmark, name):
     """Hard QPs of 100 variables and 300 rows, cold: how far past 1 ms a solve returns, and with which status."""
     rng, limit = np.random.default_rng(0), np.full(300, 0.03)
     qp = QP(np.eye(100), 30 * rng.normal(size=100), np.tril(rng.normal(size=(300, 100))), -limit, limit)
-    made, seen, times = solver(name)(qp, None), set(), []
+    made, seen, times = SOLVERS[name](qp, None), set(), []
 
     def solve():
         made.reset()

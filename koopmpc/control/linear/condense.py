@@ -5,16 +5,17 @@ constant + unit · Σ ‖w_j‖²: w = 0 is the unconstrained optimum, and the H
 unstable and plain condensing (u as the variable) has lost all its digits. In plain coordinates w is u less its
 unconstrained optimum, and the Hessian is what the Riccati coordinates say of it.
 
-References only add to the cost what is linear in w, −2 Σ (C z_k)ᵀQ r_k and so on, with z_k as w moves it: as the
-Hessian is unit · I, half of that gradient over −unit is the w that they ask for.
+References only add to the cost what is linear in w, −2 Σ (C z_k)ᵀQ r_k and so on, with z_k as w moves it. As the
+Hessian is unit · I, they shift the minimiser by −gradient / (2 unit).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.control.limits import Interval
 from koopmpc.control.linear.horizon import Horizon
 from koopmpc.control.riccati import Law
 from koopmpc.control.target import Targets
@@ -99,6 +100,25 @@ def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordina
         unit,
         chosen,
     )
+
+
+def scaled(maps: Condensed, inputs: Interval, stages: int) -> Condensed:
+    """Return the same maps for a w of which 1 moves the input with the most room, of its span, to its limit."""
+    D, n = maps.deviation, len(maps.hessian)
+    curvature = np.diag(maps.hessian).reshape(stages, -1).mean(axis=0)
+    columns = np.tile(1 / np.sqrt(curvature), stages)
+    reach = 0.5 * (inputs.high - inputs.low) / row_sizes(D[:n] * columns, stages)
+    known = reach[np.isfinite(reach) & (reach > 0)]
+    size = float(known.max()) if known.size else 1.0
+    columns, share = size * columns, size**2
+    hessian = maps.hessian * np.outer(columns, columns) / share
+    return replace(maps, deviation=D * columns, hessian=hessian, unit=maps.unit * share)
+
+
+def row_sizes(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray, " n"]:
+    """Return the norm of the rows of a stage, root mean square of all stages; 1 for rows that nothing moves."""
+    squares = (rows**2).sum(axis=1).reshape(stages, -1).mean(axis=0)
+    return np.sqrt(np.where(squares > 0, squares, 1.0))
 
 
 def _asked(

@@ -13,8 +13,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from koopmpc.control.riccati import Stage
+from koopmpc import checks
+from koopmpc.control.cost import Cost
+from koopmpc.control.riccati import Stage, one_step, stationary
 from koopmpc.control.target import Targets
+from koopmpc.control.tracking import LiftedTracking
+from koopmpc.errors import ShapeError
+from koopmpc.lifting.state import State
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class SignalLayout(NamedTuple):
@@ -168,3 +174,54 @@ def _weights(
         return Q, M if len(powers) > 1 else None, R
     R_delta = np.zeros((nu, nu)) if h.R_delta is None else h.R_delta
     return block_diag(Q, R_delta), np.vstack([M, -R_delta]), R + R_delta
+
+
+def horizon_of(
+    predictor: LinearPredictor,
+    cost: Cost,
+    track: LiftedTracking,
+    blocks: tuple[int, ...],
+    *,
+    disturbed: bool,
+) -> Horizon:
+    """Return the horizon with the terminal weight that the cost asks for."""
+    A, B, C, nz, nx = predictor.A, predictor.B, track.tracked, predictor.nz, predictor.nx
+    with_rates = track.with_rates
+    size = nz + predictor.nu * with_rates
+    bounded = track.rates is not None
+    CQ_N = None
+    if cost.Q_N is None:
+        step = one_step(A, B, C.T @ track.Q @ C, track.R, track.R_delta)
+        found = stationary(step.A, step.B, step.Q, step.R, 10 * sum(blocks), step.M).P
+    else:
+        given = np.asarray(cost.Q_N)
+        own = len(given) if given.ndim else nx
+        on_state = own == nx and isinstance(cost.of, State) and cost.of.whole
+        if own == nx != nz and not on_state:
+            raise ShapeError(
+                f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})"
+            )
+        if own not in (nx, nz):
+            raise ShapeError(f"Q_N has shape {given.shape}, expected ({nx}, {nx}) on the state or ({nz}, {nz}) on z")
+        found = checks.weight(given, "Q_N", own)
+        if on_state:
+            CQ_N = C.T @ found
+            found = CQ_N @ C
+    P_N = np.zeros((size, size))
+    P_N[: len(found), : len(found)] = found
+    return Horizon(
+        A=A,
+        B=B,
+        E=predictor.E,
+        C=C,
+        G=track.limited,
+        Q=track.Q,
+        R=track.R,
+        R_delta=track.R_delta,
+        P_N=P_N,
+        CQ_N=CQ_N,
+        blocks=blocks,
+        with_rates=with_rates,
+        bounded=bounded,
+        disturbed=disturbed,
+    )

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -14,14 +14,21 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan_map import PlanMap
-from koopmpc.control.linear.qp import Constrained
 from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.solvers.base import QPSolver, StepSolver
+from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.solvers.osqp import OSQP
 from koopmpc.control.target import reference_rows
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
+SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP}
+# Slacks and their large weights are slow work for OSQP: how far a limit gives way need not be known to 1e-5.
+SOFT_SETTINGS: Mapping[str, Mapping[str, Any]] = {"osqp": {"eps_abs": 1e-4, "eps_rel": 1e-4}, "daqp": {}}
+# DAQP is exact to rounding in either, and needs a Hessian whose condition number does not grow with the horizon.
+COORDINATES: Mapping[str, Coordinates] = {"osqp": "auto", "daqp": "riccati"}
 _VIEWS = ("_met", "_met_low", "_met_high")
 
 
@@ -53,11 +60,8 @@ class KoopmanMPC(MPCBase):
         Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts
         from the state predicted for then, under the inputs that are still to act; zero moved inside the limits
         acts before the first. `horizon` grows by it: more of the reference is read.
-    coordinates
-        Variables of the QP: "plain", the inputs; "riccati", those in which the Hessian is the identity however
-        unstable the plant; "auto" takes the plain ones where their Hessian is well conditioned.
     solver
-        "osqp", or "daqp", an active-set method that the extra ``koopmpc[daqp]`` installs.
+        "osqp", an operator-splitting method, or "daqp", an active-set method.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}``.
     time_limit
@@ -79,6 +83,8 @@ class KoopmanMPC(MPCBase):
     control", Automatica 93, 2018.
     """
 
+    _wanted: ClassVar[Coordinates | None] = None  # the coordinates of the QP whatever the solver, in comparisons
+
     def __init__(
         self,
         predictor: LinearPredictor,
@@ -89,13 +95,14 @@ class KoopmanMPC(MPCBase):
         estimator: Estimator | None = None,
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
-        coordinates: Coordinates = "auto",
         solver: Literal["osqp", "daqp"] = "osqp",
         settings: Mapping[str, Any] | None = None,
         time_limit: float | None = None,
     ) -> None:
-        if coordinates not in ("auto", "riccati", "plain"):
-            raise DataError(f'coordinates is {coordinates!r}; pass "auto", "riccati" or "plain"')
+        if solver not in SOLVERS:
+            raise DataError(f"solver is {solver!r}; there are {', '.join(map(repr, SOLVERS))}")
+        if settings is not None:
+            checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
         super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, moves, time_limit)
         self.predictor = predictor
@@ -106,10 +113,12 @@ class KoopmanMPC(MPCBase):
             self.limits,
             self._blocks,
             disturbed=self._disturbed,
-            coordinates="riccati" if (coordinates, solver) == ("auto", "daqp") else coordinates,
+            coordinates=self._wanted or COORDINATES[solver],
         )
         track = self._map.track
-        self._constrained = Constrained(self._map.hard, self._map.soft, solver, settings)
+        given = settings or {}
+        soft = {**SOFT_SETTINGS[solver], **given}
+        self._qps = StepSolver(self._map.hard, self._map.soft, SOLVERS[solver], given, soft)
         move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
         self._begin(predictor, track, estimator, with_rates=track.with_rates, move_of=move_of)
         rows = len(self._map.matrix)
@@ -135,13 +144,16 @@ class KoopmanMPC(MPCBase):
 
     @property
     def coordinates(self) -> str:
-        """The coordinates of the QP: "riccati" or "plain"."""
+        """The variables of the QP: "plain", the inputs, or "riccati", in which the Hessian is the identity.
+
+        OSQP works on the inputs where their Hessian is well conditioned, and DAQP always in Riccati coordinates.
+        """
         return self._map.maps.coordinates
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; see `MPCBase`."""
         super().reset(x0, u_prev)
-        self._constrained.reset()
+        self._qps.reset()
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
@@ -165,7 +177,7 @@ class KoopmanMPC(MPCBase):
             coordinates="plain" if self.coordinates == "plain" else "riccati",
         )
         self.predictor = predictor
-        self._constrained.update(self._map.hard, self._map.soft)
+        self._qps.update(self._map.hard, self._map.soft)
         self._reference_key = None
         self._initial.update(predictor)
 
@@ -229,7 +241,7 @@ class KoopmanMPC(MPCBase):
         self._map.aim(self._reference)
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
-        self._constrained.cool()
+        self._qps.cool()
         self._take(t)
         return self._move(t[: self._nu].copy(), Status.UNCONSTRAINED, 0, start)
 
@@ -259,7 +271,7 @@ class KoopmanMPC(MPCBase):
         if self._hard_rates is not None:
             room = Interval(inputs.low - u_prev, inputs.high - u_prev)
         deadline = None if np.isinf(self._allowed) else start + self._allowed
-        found, gave_way = self._constrained.solve(v, room, deadline)
+        found, gave_way = self._qps.solve(v, room, deadline)
         status = Status.FAILED if self.solver_fails else found.status
         if status is not Status.OPTIMAL:
             return self._fail(v[: self._nu], applied, status, found.iterations, start)
@@ -283,5 +295,5 @@ class KoopmanMPC(MPCBase):
         start: float,
     ) -> Move:
         """Return what stands in for a failed step, with the status that says why; the next one starts cold."""
-        self._constrained.cool()
+        self._qps.cool()
         return super()._fail(free, applied, status, iterations, start)

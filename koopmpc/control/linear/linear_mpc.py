@@ -1,22 +1,50 @@
 """LinearMPC: what a lifted MPC is compared with, the same class on a local linearisation."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.estimate.observer import Estimator
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
 
 
 class LinearMPC(KoopmanMPC):
-    """KoopmanMPC on the linearisation of `step_map` at (x, u): the linear MPC that a lifted one is compared with."""
+    """Minimise the Cost over N steps of x⁺ ≈ F(x̄, ū) + A (x − x̄) + B (u − ū) within the Limits.
+
+    A and B are the Jacobians of `step_map` at (x̄, ū). It is a KoopmanMPC on `LinearPredictor.local(step_map, x, u)`,
+    whose observables are the state and a constant, and it steps, copies and fails like one.
+
+    Parameters
+    ----------
+    step_map
+        The plant, x⁺ = F(x, u).
+    x, u
+        (nx,) and (nu,), the point of the linearisation; it need not be an equilibrium.
+    cost, limits
+        What to minimise, within what, in the plant's own coordinates.
+    horizon
+        N steps of the plant's dt.
+    **options
+        The other keywords of `KoopmanMPC`, with the same meaning: `estimator`, `latency`, `moves`, `solver`,
+        `settings`, `time_limit`.
+
+    Raises
+    ------
+    ObservableError
+        The cost or a limit is on an observable other than the states and the constant.
+    DefinitenessError
+        A weight, or R + BᵀPB, is not positive definite.
+    DataError, ShapeError
+        `step_map` is no StepMap; a horizon below 1, crossed limits, sizes that do not fit.
+
+    References
+    ----------
+    Rawlings, Mayne & Diehl, "Model Predictive Control: Theory, Computation, and Design", 2nd ed., 2017, chapter 1.
+    """
 
     def __init__(
         self,
@@ -26,26 +54,7 @@ class LinearMPC(KoopmanMPC):
         cost: Cost,
         limits: Limits | None = None,
         horizon: int = 20,
-        *,
-        estimator: Estimator | None = None,
-        latency: int = 0,
-        moves: int | Sequence[int] | None = None,
-        coordinates: Coordinates = "auto",
-        solver: Literal["osqp", "daqp"] = "osqp",
-        settings: Mapping[str, Any] | None = None,
-        time_limit: float | None = None,
+        **options: Any,
     ) -> None:
         checks.kind(step_map, "step_map", StepMap, "discretize the dynamics, or use KoopmanMPC for a predictor")
-        super().__init__(
-            LinearPredictor.local(step_map, x, u),
-            cost,
-            limits,
-            horizon,
-            estimator=estimator,
-            latency=latency,
-            moves=moves,
-            coordinates=coordinates,
-            solver=solver,
-            settings=settings,
-            time_limit=time_limit,
-        )
+        super().__init__(LinearPredictor.local(step_map, x, u), cost, limits, horizon, **options)

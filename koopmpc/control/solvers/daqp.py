@@ -23,7 +23,7 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import INFINITY, QP, Bounds, QPSolution, check_start
+from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
@@ -42,7 +42,7 @@ _STATUS = {
 }
 
 
-class DAQP:
+class DAQP(QPSolver):
     """A QP set up once in DAQP; limits move, solves start from the active rows of the last one.
 
     Parameters
@@ -55,13 +55,13 @@ class DAQP:
     Raises
     ------
     DataError
-        daqp is not installed, or it refuses the problem or a setting.
+        DAQP refuses the problem or a setting.
     """
 
     goes_on = True
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
-        self._qp, self._settings = qp, dict(settings or {})
+        super().__init__(qp, settings)
         self._model = _model(self._settings)
         known = self._model.settings
         self._time_limit = self._allowed = known["time_limit"]
@@ -72,11 +72,10 @@ class DAQP:
         flag, _ = self._model.setup(self._H, self._f, self._M, free, -free)
         if flag < 0:
             raise DataError(f"DAQP refuses the problem, exit flag {flag}; pass a convex QP, P ⪰ 0")
-        self._bounds = Bounds(qp)
         self._cold = True
 
     def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], Interval]:
-        return type(self), (self._qp, self._settings), Interval(self._bounds.low, self._bounds.high)
+        return type(self), (self._qp, self._settings), Interval(self.low, self.high)
 
     def __setstate__(self, limits: Interval) -> None:
         """Take over the limits that the original had."""
@@ -90,46 +89,14 @@ class DAQP:
         """Forget the active rows of the last solve."""
         self._cold = True
 
-    def shift(self, by: Float[np.ndarray, " m"]) -> None:
-        """Set the limits to those of the QP less `by`.
+    def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
+        """Solve: DAQP looks at the clock every 32 iterations, so that it gets as many as fit in, too.
 
-        Raises
-        ------
-        ShapeError
-            `by` has the wrong length.
-        DataError
-            It holds NaN, or moves a limit beyond 1e30.
+        It starts from the active rows of the last solve, whose factors it still holds: that is quicker than to start
+        from the shifted (v, y).
         """
-        self._bounds.shift(by)
-        self._send()
-
-    def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
-        """Set new limits; ±inf where there is none.
-
-        Raises
-        ------
-        ShapeError
-            They have the wrong length.
-        DataError
-            They hold NaN or cross.
-        """
-        self._bounds.set(low, high)
-        self._send()
-
-    def solve(
-        self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None = None
-    ) -> QPSolution:
-        """Solve within `time_limit` seconds: DAQP looks every 32 iterations, so that it gets as many as fit in, too.
-
-        (v, y) is only checked: to start from the active rows of the last solve, whose factors DAQP still holds, is
-        quicker than to start from the shifted ones.
-        """
-        check_start(self._qp, v, y)
-        if time_limit is not None and not time_limit > 0:
-            return QPSolution(v.copy(), y.copy(), Status.TIME_LIMIT, 0)
         start = perf_counter()
-        if self._cold:
-            self._send()
+        self._send()
         limit = self._time_limit if time_limit is None else time_limit
         x, multipliers, flag, iterations = self._run(limit)
         if flag in _DOUBTFUL:
@@ -169,7 +136,7 @@ class DAQP:
 
     def _send(self, wider: float = 0.0) -> None:
         """Give DAQP the limits, relaxed by the share `wider` of 1 + their size."""
-        self._low, self._high = self._bounds.low, self._bounds.high
+        self._low, self._high = self.low, self.high
         if self._scaled:
             self._low, self._high = self._rows * self._low, self._rows * self._high
         if wider:
@@ -209,10 +176,8 @@ class DAQP:
 
 def _model(settings: Mapping[str, Any]) -> Any:
     """Return an empty DAQP model with checked settings."""
-    try:
-        import daqp
-    except ImportError as error:
-        raise DataError('daqp is not installed: pip install "koopmpc[daqp]", or pass solver="osqp"') from error
+    import daqp
+
     model = daqp.Model()
     known = model.settings
     for name, value in settings.items():

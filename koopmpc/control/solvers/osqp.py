@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QP, Bounds, QPSolution, check_start
+from koopmpc.control.solvers.base import QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
 
 _FAR = 1e20  # limits beyond it are none
@@ -102,7 +102,7 @@ class Pattern:
         return found if found.all() and np.count_nonzero(matrix) == len(found) else None
 
 
-class OSQP:
+class OSQP(QPSolver):
     """A QP set up once in OSQP; limits move, solves start warm.
 
     Parameters
@@ -123,14 +123,13 @@ class OSQP:
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         import osqp
 
-        self._qp, self._settings = qp, dict(settings or {})
-        self._bounds = Bounds(qp)
+        super().__init__(qp, settings)
         P, A = qp.sparse()
         self._patterns = Pattern(P), Pattern(A)
         self._problem, self._status = osqp.OSQP(), _statuses()
         options = {"verbose": False, **DEFAULTS, **self._settings}
         try:
-            self._problem.setup(P, qp.q, A, self._bounds.low, self._bounds.high, **options)
+            self._problem.setup(P, qp.q, A, self.low, self.high, **options)
         except (osqp.OSQPException, TypeError, ValueError, AttributeError) as error:
             raise DataError(f"OSQP refuses the problem or its settings {self._settings}: {error}") from error
         self._solver = self._problem._solver
@@ -138,11 +137,10 @@ class OSQP:
         self._time_limit = self._solver.get_settings().time_limit
         self._most = self._solver.get_settings().max_iter
         self._first = True
-        self._moved = True
         prepare()
 
     def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Interval, float]]:
-        limits = Interval(self._bounds.low, self._bounds.high)
+        limits = Interval(self.low, self.high)
         return type(self), (self._qp, self._settings), (limits, self._solver.get_settings().rho)
 
     def __setstate__(self, state: tuple[Interval, float]) -> None:
@@ -163,55 +161,19 @@ class OSQP:
         if P is None or A is None:
             self.__init__(qp, self._settings)
             return
-        self._qp, self._bounds = qp, Bounds(qp)
-        self._solver.update_data_vec(q=qp.q, l=self._bounds.low, u=self._bounds.high)
+        self._hold(qp)
+        self._solver.update_data_vec(q=qp.q, l=self.low, u=self.high)
         if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
             raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
-        self._moved = True
 
     def reset(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""
         self._solver.update_rho(self._rho)
 
-    def shift(self, by: Float[np.ndarray, " m"]) -> None:
-        """Set the limits to those of the QP less `by`.
-
-        Raises
-        ------
-        ShapeError
-            `by` has the wrong length.
-        DataError
-            It holds NaN, or moves a limit beyond 1e30.
-        """
-        self._bounds.shift(by)
-        self._solver.update_data_vec(q=None, l=self._bounds.low, u=self._bounds.high)
-        self._moved = True
-
-    def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
-        """Set new limits; ±inf where there is none.
-
-        Raises
-        ------
-        ShapeError
-            They have the wrong length.
-        DataError
-            They hold NaN or cross.
-        """
-        self._bounds.set(low, high)
-        self._solver.update_data_vec(q=None, l=self._bounds.low, u=self._bounds.high)
-        self._moved = True
-
-    def solve(
-        self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None = None
-    ) -> QPSolution:
-        """Solve from the warm start (v, y), within `time_limit` seconds."""
-        check_start(self._qp, v, y)
-        if time_limit is not None and not time_limit > 0:
-            return QPSolution(v.copy(), y.copy(), Status.TIME_LIMIT, 0)
-        if not self._moved:  # OSQP keeps the last status until its data move
-            self._solver.update_data_vec(q=None, l=self._bounds.low, u=self._bounds.high)
+    def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
+        """Solve; new data also make OSQP forget its last status."""
+        self._solver.update_data_vec(q=None, l=self.low, u=self.high)
         self._allow(self._time_limit if time_limit is None else time_limit)
-        self._moved = False
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
         self._solver.solve()
         info, solution = self._solver.info, self._solver.solution
@@ -224,7 +186,7 @@ class OSQP:
 
     def _nothing_fits(self) -> bool:
         """Return whether no v meets the limits: OSQP's certificate of that may take longer than its iterations."""
-        return empty(self._qp.A, self._bounds.low, self._bounds.high)
+        return empty(self._qp.A, self.low, self.high)
 
     def _allow(self, seconds: float) -> None:
         """Set the time limit of the next solve: OSQP counts the setup, or the last updates, as a part of it."""

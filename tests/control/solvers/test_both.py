@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.control.linear.koopman_mpc import SOLVERS
 from koopmpc.control.solvers.base import QP, QPSolver
-from koopmpc.control.solvers.choose import solver
 from tests.control.kkt import meets_kkt
 from tests.control.solvers.random_qps import FEASIBLE, KINDS, exactness, random_qp
 
@@ -23,8 +23,6 @@ WELL_SCALED = ("box", "hard", "soft", "exact", "dense", "degenerate")
 
 @pytest.fixture(params=["osqp", "daqp"], scope="module")
 def name(request):
-    if request.param == "daqp":
-        pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
     return request.param
 
 
@@ -46,7 +44,7 @@ def answers(name, rng, count):
     for i in range(count):
         kind = KINDS[i % len(KINDS)]
         qp = random_qp(rng, kind)
-        made = solver(name)(qp, None)
+        made = SOLVERS[name](qp, None)
         solution = made.solve(*start(qp))
         if solution.status is km.Status.OPTIMAL:
             held(name, qp, solution)
@@ -103,7 +101,7 @@ def clarabel(qp):
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from((*WELL_SCALED, "infeasible")))
 def test_against_clarabel(name, seed, kind):
     qp = random_qp(np.random.default_rng(seed), kind)
-    solution = solver(name)(qp, TIGHT[name]).solve(*start(qp))
+    solution = SOLVERS[name](qp, TIGHT[name]).solve(*start(qp))
     v, value = clarabel(qp)
     if kind == "infeasible":
         assert v is None
@@ -125,11 +123,11 @@ def test_warm_starts_save_iterations(name):
     A = np.tril(rng.normal(size=(N, N)) / N) + np.eye(N)
     wish, drift, ones = 2 * rng.normal(size=N), 0.02 * rng.normal(size=N), np.ones(N)
     at = QP(np.eye(N), np.zeros(N), A, -ones - wish, ones - wish)
-    made, solution, spent = solver(name)(at, None), None, np.zeros(2)
+    made, solution, spent = SOLVERS[name](at, None), None, np.zeros(2)
     for k in range(30):
         at = QP(at.P, at.q, A, -ones - wish - k * drift, ones - wish - k * drift)
         made.set_bounds(at.low, at.high)
-        cold = solver(name)(at, None).solve(*start(at))
+        cold = SOLVERS[name](at, None).solve(*start(at))
         solution = made.solve(*start(at)) if solution is None else made.solve(solution.v, solution.y)
         assert solution.status is cold.status is km.Status.OPTIMAL
         held(name, at, solution)
@@ -142,7 +140,7 @@ def test_time_limits(name):
     rng, limit = np.random.default_rng(0), np.full(300, 0.03)  # DAQP has 400 rows to try here
     qp = QP(np.eye(100), 30 * rng.normal(size=100), np.tril(rng.normal(size=(300, 100))), -limit, limit)
     endless = {"eps_abs": 1e-300, "eps_rel": 0.0, "max_iter": 10**6} if name == "osqp" else {}
-    made, given_v, given_y = solver(name)(qp, endless), np.ones(100), np.ones(300)
+    made, given_v, given_y = SOLVERS[name](qp, endless), np.ones(100), np.ones(300)
     for over in (0.0, -1.0, np.nan):
         solution = made.solve(given_v, given_y, time_limit=over)
         assert solution.status is km.Status.TIME_LIMIT
@@ -157,9 +155,9 @@ def test_time_limits(name):
 def test_copies_and_pickles_solve_the_same(name):
     rng = np.random.default_rng(0)
     qp = random_qp(rng, "soft", 6)
-    made = solver(name)(qp, TIGHT[name])
+    made = SOLVERS[name](qp, TIGHT[name])
     made.set_bounds(qp.low - 0.1, qp.high + 0.2)
-    fresh = solver(name)(QP(qp.P, qp.q, qp.A, qp.low - 0.1, qp.high + 0.2), TIGHT[name]).solve(*start(qp))
+    fresh = SOLVERS[name](QP(qp.P, qp.q, qp.A, qp.low - 0.1, qp.high + 0.2), TIGHT[name]).solve(*start(qp))
     made.solve(*start(qp))
     for other in (copy.copy(made), copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         assert isinstance(other, QPSolver)
@@ -170,7 +168,7 @@ def test_copies_and_pickles_solve_the_same(name):
 
 def test_reset_repeats_to_the_bit(name):
     qp = random_qp(np.random.default_rng(0), "soft", 8)
-    made = solver(name)(qp, None)
+    made = SOLVERS[name](qp, None)
     made.solve(*start(qp))
     first = []
     for _ in range(2):
@@ -186,7 +184,7 @@ def test_two_in_two_threads_do_not_disturb_each_other(name):
     qps = [random_qp(np.random.default_rng(i), "hard", 20) for i in range(2)]
 
     def run(qp):
-        made = solver(name)(qp, None)
+        made = SOLVERS[name](qp, None)
         return [made.solve(*start(qp)).v for _ in range(50)]
 
     alone = [run(qp) for qp in qps]
@@ -198,7 +196,7 @@ def test_two_in_two_threads_do_not_disturb_each_other(name):
 
 def test_what_the_solvers_would_swallow_is_refused(name):
     three = np.ones(3)
-    made = solver(name)(QP(np.eye(3), 2 * three, np.eye(3), -three, three), TIGHT[name])
+    made = SOLVERS[name](QP(np.eye(3), 2 * three, np.eye(3), -three, three), TIGHT[name])
     with pytest.raises(km.errors.ShapeError, match=r"the limits have shapes \(2,\) and \(2,\), the QP has 3 rows"):
         made.set_bounds(-np.ones(2), np.ones(2))
     with pytest.raises(km.errors.ShapeError, match=r"the warm start has shapes \(3,\) and \(2,\), the QP is \(3,\), "):
@@ -212,8 +210,3 @@ def test_what_the_solvers_would_swallow_is_refused(name):
     strided = np.array([-0.1, 9, -0.2, 9, -0.3, 9])[::2]
     made.set_bounds(strided, three)
     np.testing.assert_allclose(made.solve(strided, strided).v, strided, atol=1e-8)
-
-
-def test_unknown_solvers():
-    with pytest.raises(km.errors.DataError, match=r"solver is 'gurobi'; there are 'osqp', 'daqp'"):
-        solver("gurobi")

@@ -1,16 +1,11 @@
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 import koopmpc as km
 from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.daqp import DAQP
 from tests.bare import shown
 from tests.control.solvers.random_qps import exactness, random_qp
-
-pytest.importorskip("daqp", reason="daqp is not installed: pip install koopmpc[daqp]")
-from koopmpc.control.solvers.daqp import DAQP
 
 ONE, EYE = np.ones(2), np.eye(2)
 
@@ -139,20 +134,3 @@ show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5})
 """
     )
     assert line == "DataError DAQP's iter_limit is 2.5; pass a whole number"
-
-
-def test_a_missing_daqp_says_what_to_install():
-    code = """
-import sys
-sys.modules["daqp"] = None
-import numpy as np, koopmpc as km
-from koopmpc.control.solvers.base import QP
-from koopmpc.control.solvers.choose import solver
-one = np.ones(1)
-try:
-    solver("daqp")(QP(np.eye(1), one, np.eye(1), -one, one), None)
-except km.errors.DataError as error:
-    print(error)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == 'daqp is not installed: pip install "koopmpc[daqp]", or pass solver="osqp"\n'

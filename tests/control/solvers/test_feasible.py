@@ -8,6 +8,7 @@ from scipy.optimize import linprog
 
 import koopmpc as km
 from koopmpc.control.solvers.osqp import empty
+from tests.control.models import in_coordinates
 
 
 @settings(max_examples=40, deadline=None)
@@ -34,7 +35,8 @@ def test_a_limit_that_cannot_be_kept_is_found(coordinates: str, solver: str, lim
     """θ would have to fall from 0.6 rad to the limit in 0.05 s; the input stays inside its limits."""
     plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
     limits = km.Limits(-25, 25, x_max=[limit, np.inf], slack=None)
-    mpc = km.LinearMPC(plant, [0, 0], [0], km.Cost([10, 1], 0.1), limits, 40, coordinates=coordinates, solver=solver)
+    make = in_coordinates(coordinates, km.LinearMPC)
+    mpc = make(plant, [0, 0], [0], km.Cost([10, 1], 0.1), limits, 40, solver=solver)
     move = mpc([0.6, 0.0], [0.0, 0.0])
     assert move.status is km.Status.INFEASIBLE
     assert abs(move.u[0]) <= 25
