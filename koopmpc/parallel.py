@@ -21,6 +21,7 @@ from koopmpc.errors import DataError, KoopmpcError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Progress = Callable[[int, int | None], None]
+StageProgress = Callable[[str, int, int | None], None]  # the same of work in several stages, each with its name
 
 _TRIES = 3  # how often a task may take its worker with it
 _AHEAD = 2  # tasks a worker that may be under way or done before their turn

@@ -9,20 +9,23 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks
+from koopmpc.bench.page import Page
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.folder import Files
 from koopmpc.fitting.hold_out import IN_MEMORY, PAST, Divided, divided
+from koopmpc.fitting.pictures import drawn
 from koopmpc.fitting.repair import noted, shortened
-from koopmpc.fitting.report import Page, drawn, write_page
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
+from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
-from koopmpc.synthesis.select import Progress, select
+from koopmpc.synthesis.select import select
 from koopmpc.synthesis.selection import Selection
 from koopmpc.validate.report import TrustReport, trust
 from koopmpc.validate.scoring import Score, score
+from koopmpc.validate.text import labelled, written
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 Say = Callable[[str], None]
@@ -40,13 +43,15 @@ class Fitted:
     report
         Whether to trust it, on episodes that it was not fitted to.
     plain
-        Errors of x⁺ = A x + B u + c on the same.
+        Errors of x⁺ = A x + B u + c on the same episodes.
     held_out
-        Those.
+        The held-out episodes.
     model, recording
         Paths of the model file, and of the Rerun log, None where it could not be written.
     page
         Path of the report, in Markdown.
+    usage
+        Lines of Python that load the model; where it is bilinear also the best linear one.
     failures
         Pictures, or the log, that could not be made, and why.
     """
@@ -58,20 +63,8 @@ class Fitted:
     model: Path
     recording: Path | None
     page: Path
+    usage: str
     failures: tuple[str, ...]
-
-    @property
-    def usage(self) -> str:
-        """Two lines of Python that load the model; where it is bilinear a third, for the best linear one."""
-        model, linear = self.model.as_posix(), (self.model.parent / LINEAR).as_posix()
-        lines = ["import koopmpc as km"]
-        if isinstance(self.selection.predictor, BilinearPredictor):
-            lines.append(f'model = km.load_model("{model}")  # for BilinearMPC')
-            if self.selection.linear is not None:
-                lines.append(f'linear = km.load_model("{linear}")  # for KoopmanMPC')
-        else:
-            lines.append(f'model = km.load_model("{model}")  # for KoopmanMPC')
-        return "\n".join(lines)
 
 
 def fit_data(
@@ -84,7 +77,7 @@ def fit_data(
     scheduler: str | None = None,
     memory: int = IN_MEMORY,
     say: Say | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
     **reading: Any,
 ) -> Fitted:
@@ -153,24 +146,52 @@ def fit_data(
     judged = f"{report}\n\n{_beside(report.score, plain)}"
     tell(judged)
     failures: list[str] = []
-    pictures = drawn(selection, report, plain, split.held_out, place, failures)
+    pictures = drawn(selection, report, plain, split.held_out)
     recording = place / "model.rrd"
     try:
         record_model(selection.predictor, split.held_out, recording, report=report)
     except Exception as error:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(error).__name__}: {error}")
-    whole = Fitted(
+    usage = _usage(selection, model)
+    page = Page(place)
+    page.text("# Model report", judged.partition("\n")[0])
+    page.code(usage, "python")
+    page.text("## Data")
+    page.code(understood)
+    page.text("## Trust")
+    page.code(judged)
+    for name, caption, draw_picture in pictures:
+        try:
+            page.picture(name, caption, draw_picture())
+        except Exception as error:  # a picture that cannot be drawn must not cost the model
+            failures.append(f"{name}.png: {type(error).__name__}: {error}")
+    page.text("## Choice")
+    page.code(chosen)
+    if failures:
+        page.text("## What could not be made")
+        page.items(failures)
+    return Fitted(
         selection=selection,
         report=report,
         plain=plain,
         held_out=split.held_out,
         model=model,
         recording=recording if recording.exists() else None,
-        page=place / "report.md",
+        page=page.write(),
+        usage=usage,
         failures=tuple(failures),
     )
-    write_page(whole.page, Page(understood, chosen, judged, pictures, whole.usage, whole.failures))
-    return whole
+
+
+def _usage(selection: Selection, path: Path) -> str:
+    lines = ["import koopmpc as km"]
+    if isinstance(selection.predictor, BilinearPredictor):
+        lines.append(f'model = km.load_model("{path.as_posix()}")  # for BilinearMPC')
+        if selection.linear is not None:
+            lines.append(f'linear = km.load_model("{(path.parent / LINEAR).as_posix()}")  # for KoopmanMPC')
+    else:
+        lines.append(f'model = km.load_model("{path.as_posix()}")  # for KoopmanMPC')
+    return "\n".join(lines)
 
 
 def _logs(data: Data) -> Data:
@@ -182,26 +203,29 @@ def _logs(data: Data) -> Data:
 
 def _understood(split: Divided, notes: list[str]) -> str:
     """Return what was made of the data: sizes, sample time, names and ranges, and all that was repaired."""
-    lines = [f"data      {split.size}", f"step      dt = {split.seen.dt:g} s"]
-    X = np.concatenate([e.X for e in split.seen])
-    V = np.concatenate([np.hstack([e.U, e.W]) for e in split.seen])
+    seen, X = split.seen, np.concatenate([e.X for e in split.seen])
+    pairs = [("data", split.size), ("step", f"dt = {seen.dt:g} s")]
+    V = np.concatenate([np.hstack([e.U, e.W]) for e in seen])
     for what, names, columns in (
-        ("states", split.seen.states, X),
-        ("inputs", split.seen.inputs, V[:, : split.seen.nu]),
-        ("measured", split.seen.disturbances, V[:, split.seen.nu :]),
+        ("states", seen.states, X),
+        ("inputs", seen.inputs, V[:, : seen.nu]),
+        ("measured", seen.disturbances, V[:, seen.nu :]),
     ):
         wide = max(map(len, names), default=0)
         for i, name in enumerate(names):
             low, high = columns[:, i].min(), columns[:, i].max()
-            lines.append(f"{what if i == 0 else '':<10}{name:<{wide}}  {low:>9.3g} … {high:.3g}")
+            pairs.append((what if i == 0 else "", f"{name:<{wide}}  {low:>9.3g} … {high:.3g}"))
         if not names and what == "inputs":
-            lines.append("inputs    none")
+            pairs.append(("inputs", "none"))
     steps = sum(map(len, split.held_out))
-    lines.append(
-        f"held out  {len(split.held_out)} episodes, {steps} steps; horizon {split.horizon} steps = "
-        f"{split.horizon * split.seen.dt:.3g} s"
+    pairs.append(
+        (
+            "held out",
+            f"{len(split.held_out)} episodes, {steps} steps; horizon {split.horizon} steps = "
+            f"{split.horizon * seen.dt:.3g} s",
+        )
     )
-    return "\n".join([*lines, *(f"! {note}" for note in (*notes, *split.notes))])
+    return "\n".join([written(labelled(pairs)), *(f"! {note}" for note in (*notes, *split.notes))])
 
 
 def _beside(score: Score, plain: Score) -> str:

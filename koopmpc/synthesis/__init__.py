@@ -6,6 +6,9 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.synthesis.candidates import Candidate as Candidate
+    from koopmpc.synthesis.selection import LeaderboardRow as LeaderboardRow
     from koopmpc.synthesis.selection import Selection as Selection
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"candidates": "Candidate", "selection": "Selection"})
+    __getattr__, __dir__, __all__ = attach(
+        __name__, {"candidates": "Candidate", "selection": "LeaderboardRow Selection"}
+    )

@@ -1,7 +1,7 @@
 """select: lifting, embedding, ridge and kind of model, chosen by multi-step cross-validation over episodes."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -14,15 +14,14 @@ from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
-from koopmpc.parallel import map_tasks
+from koopmpc.parallel import StageProgress, map_tasks
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.candidates import Candidate, expanded, jumps, usual
 from koopmpc.synthesis.cross_validation import Trial, ridges_of, tried
 from koopmpc.synthesis.folds import folded, sampled, usual_horizon
-from koopmpc.synthesis.selection import Row, Selection, choice, row_of
+from koopmpc.synthesis.selection import LeaderboardRow, Selection, choice, row_of
 from koopmpc.validate.scoring import AnyPredictor
 
-Progress = Callable[[str, int, int | None], None]
 RIDGES = (0.0, 1e-9, 1e-7, 1e-5, 1e-3)
 
 
@@ -38,7 +37,7 @@ def select(
     sample: int = 30_000,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
 ) -> Selection:
     """Choose the model with min over models of max over folds of the h-step error, h = 1 … horizon, and fit it to all.
@@ -134,7 +133,7 @@ def select(
         )
     linear = choice(rows, "linear") if any(row.kind == "linear" for row in rows) else chosen
 
-    def refit(row: Row) -> AnyPredictor:
+    def refit(row: LeaderboardRow) -> AnyPredictor:
         told = None if progress is None else partial(progress, f"fit of {row.title}")
         if row.kind == "linear":
             return edmd(

@@ -1,24 +1,24 @@
 """Selection: the model that was chosen, and how all that were tried did."""
 
-import textwrap
 from dataclasses import dataclass
 
 import numpy as np
+from rich.console import RenderableType
 
 from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.cross_validation import EXACT, Tried
 from koopmpc.validate.scoring import AnyPredictor
+from koopmpc.validate.text import table, written
 from koopmpc.values import Value
 
-PLAIN = "linear: x, 1"  # [x 1] as it is, the one that others have to beat
-_WIDTH = 100
-_SHOWN = 15  # rows of the printed table
+PLAIN = "linear: x, 1"  # z = [x, 1], the model that others have to beat
+_SHOWN = 15  # rows of the leaderboard that are printed
 
 
 @dataclass(frozen=True, eq=False)
-class Row(Value):
+class LeaderboardRow(Value):
     """A line of the leaderboard: one candidate with its best ridge.
 
     Errors are root-mean-squares over the states, each relative to its standard deviation in the data: 1 is what the
@@ -27,7 +27,7 @@ class Row(Value):
     Attributes
     ----------
     name
-        Of the candidate.
+        Name of the candidate.
     bilinear
         z⁺ = A z + B u + Σ uᵢ Nᵢ z instead of z⁺ = A z + B u.
     nz
@@ -49,7 +49,7 @@ class Row(Value):
     seconds
         Time of the trial, with all ridges and folds.
     lifting, embedding
-        Of the candidate.
+        Lifting and embedding of the candidate.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Row(Value):
 
     @property
     def title(self) -> str:
-        """Name, with kind and delays."""
+        """Kind, name and delays of the model."""
         past = f", {self.delays} delay{'s' if self.delays > 1 else ''}" if self.delays else ""
         return f"{self.kind}: {self.name}{past}"
 
@@ -88,9 +88,9 @@ class Selection(Value):
     Attributes
     ----------
     predictor
-        The chosen one, fitted to all data: a LinearPredictor or a BilinearPredictor.
+        The chosen model, fitted to all data: a LinearPredictor or a BilinearPredictor.
     linear
-        The best linear one, fitted to all data; `predictor` itself where that is linear, None where none was tried.
+        The best linear model, fitted to all data; `predictor` itself where that is linear, None where none was tried.
     leaderboard
         All candidates, the least error in its worst fold first.
     chosen, chosen_linear
@@ -103,7 +103,7 @@ class Selection(Value):
 
     predictor: AnyPredictor
     linear: LinearPredictor | None
-    leaderboard: tuple[Row, ...]
+    leaderboard: tuple[LeaderboardRow, ...]
     chosen: int
     chosen_linear: int
     horizon: int
@@ -111,55 +111,52 @@ class Selection(Value):
     notes: tuple[str, ...]
 
     @property
-    def best(self) -> Row:
+    def best(self) -> LeaderboardRow:
         """The row of `predictor`."""
         return self.leaderboard[self.chosen]
 
     @property
-    def best_linear(self) -> Row:
+    def best_linear(self) -> LeaderboardRow:
         """The row of `linear`."""
         return self.leaderboard[self.chosen_linear]
 
     def __str__(self) -> str:
-        """Return the choice, and the first rows of the leaderboard with those chosen."""
-        lines = [f"chosen: {self.best.title} ({self.best.nz} observables, ridge {self.best.ridge:g})"]
+        """Return the choice, and the first rows of the leaderboard with those chosen and the plain linear model."""
+        horizon, best, linear = self.horizon, self.best, self.best_linear
+        parts: list[RenderableType] = [_sentence("chosen", best)]
         if self.chosen != self.chosen_linear:
-            lines.append(
-                f"best linear: {self.best_linear.title} ({self.best_linear.nz} observables, ridge "
-                f"{self.best_linear.ridge:g})"
-            )
-        lines += ["", *self.table(), "", *self.notes]
-        return "\n".join(lines).rstrip()
-
-    def table(self, rows: int = _SHOWN) -> list[str]:
-        """Return the leaderboard in lines: a head, the first `rows`, the chosen, the plain linear one, a legend."""
-        dt, h = self.predictor.dt, self.horizon
+            parts.append(_sentence("best linear", linear))
         plain = [i for i, row in enumerate(self.leaderboard) if row.title == PLAIN]
-        shown = sorted({*range(min(rows, len(self.leaderboard))), self.chosen, self.chosen_linear, *plain})
-        wide = max(len(self.leaderboard[i].title) for i in shown)
-        steps = (f"{n} step{'s' * (n > 1)}" for n in (1, max(h // 2, 1), h))
-        head = "".join(f"{text:>9}" for text in (*steps, "worst", "ρ(A)", "ridge"))
-        lines = [f"    {'':<{wide}}{'nz':>4}{head}{'time':>7}"]
+        shown = sorted({*range(min(_SHOWN, len(self.leaderboard))), self.chosen, self.chosen_linear, *plain})
+        steps = [f"{n} step{'s' * (n > 1)}" for n in (1, max(horizon // 2, 1), horizon)]
+        headings = ["", "model", "observ-\nables", *(f"error\n{n}" for n in steps), "worst\nfold"]
+        headings += ["spectral\nradius", "ridge", "time\n[s]"]
+        rows: list[list[str]] = []
         for i in shown:
             row = self.leaderboard[i]
-            mark = "→" if i == self.chosen else ("l" if i == self.chosen_linear else " ")
-            errors = "".join(f"{e:>9.2g}" for e in (row.first, row.middle, row.last, row.worst))
-            lines.append(
-                f"{mark:>2}  {row.title:<{wide}}{row.nz:>4}{errors}{row.radius:>9.4g}"
-                f"{f'{row.ridge:.0e}' if row.ridge else '0':>9}{row.seconds:>5.1f} s"
-            )
-        hidden = len(self.leaderboard) - len(shown)
-        more = f" {hidden} more are in the leaderboard." if hidden else ""
+            mark = "→" if i == self.chosen else ("l" if i == self.chosen_linear else "")
+            errors = [f"{error:.2g}" for error in (row.first, row.middle, row.last, row.worst)]
+            ridge = f"{row.ridge:.0e}" if row.ridge else "0"
+            rows.append([mark, row.title, str(row.nz), *errors, f"{row.radius:.4g}", ridge, f"{row.seconds:.1f}"])
         legend = (
-            f"Errors relative to each state's standard deviation, {h} steps = {h * dt:.3g} s: median over "
-            f"{self.folds} folds, and over the whole horizon in the worst fold. →: chosen, the smallest model within "
-            f"one standard error of the best{'' if self.chosen == self.chosen_linear else '; l: best linear'}.{more}"
+            f"Errors are root-mean-squares over the states, each relative to its standard deviation, {horizon} steps = "
+            f"{horizon * self.predictor.dt:.3g} s: the median over {self.folds} folds at each number of steps ahead, "
+            "and in the worst fold over the whole horizon. → marks the chosen model, the smallest one within one "
+            "standard error of the best"
         )
-        lines += textwrap.wrap(legend, _WIDTH)
-        return lines
+        legend += "." if self.chosen == self.chosen_linear else "; l marks the best linear model."
+        hidden = len(self.leaderboard) - len(shown)
+        if hidden:
+            legend += f" The leaderboard has {hidden} more models."
+        parts += ["", table(headings, rows, left=2), "", legend]
+        return "\n".join([written(*parts), *([""] if self.notes else []), *self.notes])
 
 
-def row_of(trial: Tried) -> Row:
+def _sentence(role: str, row: LeaderboardRow) -> str:
+    return f"{role}: {row.title} ({row.nz} observables, ridge {row.ridge:g})"
+
+
+def row_of(trial: Tried) -> LeaderboardRow:
     """Return the line of the leaderboard for a trial."""
     candidate, scores, error = trial.candidate, trial.scores, trial.error
     horizon = error.shape[1]
@@ -167,7 +164,7 @@ def row_of(trial: Tried) -> Row:
     with np.errstate(invalid="ignore"):
         middle = np.median(error, axis=0)
         deviation = scores.std(ddof=1) / np.sqrt(len(scores))
-    return Row(
+    return LeaderboardRow(
         name=candidate.name,
         bilinear=candidate.bilinear,
         nz=nz,
@@ -187,7 +184,7 @@ def row_of(trial: Tried) -> Row:
     )
 
 
-def choice(rows: tuple[Row, ...], kind: str | None = None) -> int:
+def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None) -> int:
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
     Errors below 1e-10 are rounding, and all alike. Where every forecast ran away it is the smallest of all.

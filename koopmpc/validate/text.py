@@ -9,18 +9,23 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 WIDTH = 100  # columns of a report
+_WIDEST = 200  # columns of its tables, at most
 _LONG = 32  # characters of an observable's name in a sentence
 _HEADED = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)  # also Rerun's font has this line
 _SCALED = re.compile(r"~[0-9a-f]{8}")  # how names tell one standardization from another
 
 
 def written(*parts: RenderableType) -> str:
-    """Return the parts below one another as plain text: no colours, no blanks at the ends of lines."""
+    """Return the parts below one another as plain text: no colours, no blanks at the ends of lines.
+
+    Words are broken at 100 columns; a table of numbers is as wide as its cells.
+    """
     stream = StringIO()
     console = Console(
-        file=stream, width=WIDTH, color_system=None, markup=False, emoji=False, highlight=False, legacy_windows=False
+        file=stream, width=_WIDEST, color_system=None, markup=False, emoji=False, highlight=False, legacy_windows=False
     )
-    console.print(*parts, sep="\n")
+    for part in parts:
+        console.print(part, width=_WIDEST if isinstance(part, Table) and part.box is _HEADED else WIDTH)
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()).rstrip()
 
 

@@ -286,6 +286,6 @@ def test_a_selection_is_data():
 def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():
     lines = str(km.select(episodes_of(bilinear, count=8), horizon=5, folds=2, ridges=[0.0], delays=[0])).splitlines()
     assert lines[0].startswith("chosen: bilinear: ")
-    assert any(line.startswith(" → ") for line in lines)
+    assert any(line.startswith("→ ") for line in lines)
     assert any("linear: x, 1 " in line for line in lines)
     assert max(map(len, lines)) <= 120
