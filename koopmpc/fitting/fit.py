@@ -1,7 +1,8 @@
 """fit_data: from a file or a folder of logs to a model file, with its report, its pictures and its Rerun log."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ from koopmpc.bench.page import Page
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.folder import Files
+from koopmpc.figures.comparisons import error
+from koopmpc.figures.eigenvalues import spectrum
+from koopmpc.figures.series import rollout
 from koopmpc.fitting.hold_out import IN_MEMORY, PAST, Divided, divided
-from koopmpc.fitting.pictures import drawn
 from koopmpc.fitting.repair import noted, shortened
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
@@ -29,6 +32,7 @@ from koopmpc.validate.text import labelled, written
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 Say = Callable[[str], None]
+_ROLLOUTS = 3  # held-out episodes that are drawn
 LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 
@@ -150,8 +154,8 @@ def fit_data(
     recording = place / "model.rrd"
     try:
         record_model(selection.predictor, split.held_out, recording, report=report)
-    except Exception as error:  # a log that cannot be written must not cost the model
-        failures.append(f"{recording.name}: {type(error).__name__}: {error}")
+    except Exception as failure:  # a log that cannot be written must not cost the model
+        failures.append(f"{recording.name}: {type(failure).__name__}: {failure}")
     usage = _usage(selection, model)
     page = Page(place)
     page.text("# Model report", judged.partition("\n")[0])
@@ -163,8 +167,8 @@ def fit_data(
     for name, caption, draw_picture in pictures:
         try:
             page.picture(name, caption, draw_picture())
-        except Exception as error:  # a picture that cannot be drawn must not cost the model
-            failures.append(f"{name}.png: {type(error).__name__}: {error}")
+        except Exception as failure:  # a picture that cannot be drawn must not cost the model
+            failures.append(f"{name}.png: {type(failure).__name__}: {failure}")
     page.text("## Choice")
     page.code(chosen)
     if failures:
@@ -192,6 +196,42 @@ def _usage(selection: Selection, path: Path) -> str:
     else:
         lines.append(f'model = km.load_model("{path.as_posix()}")  # for KoopmanMPC')
     return "\n".join(lines)
+
+
+def drawn(
+    selection: Selection, report: TrustReport, plain: Score, held_out: Episodes
+) -> Iterator[tuple[str, str, Callable[[], Any]]]:
+    """Yield the name of each picture, its caption, and the call that draws it.
+
+    Parameters
+    ----------
+    selection
+        The chosen model.
+    report
+        Its trust report: errors, bands and residuals.
+    plain
+        Errors of x⁺ = A x + B u + c, which the model has to beat.
+    held_out
+        Episodes that no fit saw; the first three are forecast.
+    """
+    predictor, horizon = selection.predictor, selection.horizon
+    finite = bool(np.isfinite(report.band.width).all())
+    bands = report.band if finite else report.score
+    around = "band that holds whole forecasts nine times in ten" if finite else "5 to 95 % of the errors"
+
+    def errors() -> Any:
+        named = {selection.best.kind: report.score}
+        if selection.linear is not None and selection.linear is not predictor:
+            named["best linear"] = score(selection.linear, held_out, horizon)
+        named["plain linear"] = plain
+        return error(named, width="two columns")
+
+    yield "error", "Errors on held-out episodes against the steps ahead, beside those of x⁺ = A x + B u + c.", errors
+    for i, episode in enumerate(list(held_out)[:_ROLLOUTS]):
+        caption = f"Forecast of held-out episode {i} from its start, and the {around}."
+        yield f"rollout-{i}", caption, partial(rollout, predictor, episode, horizon, bands)
+    caption = "Eigenvalues of A and the unit circle; crosses are spurious on the held-out episodes."
+    yield "spectrum", caption, partial(spectrum, predictor, report.residuals)
 
 
 def _logs(data: Data) -> Data:

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 import koopmpc.fitting.fit
-import koopmpc.fitting.pictures
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.cli.app import app
 from koopmpc.fitting.fit import fit_data
@@ -243,7 +242,7 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
         raise RuntimeError("no ink")
 
     monkeypatch.setattr(koopmpc.fitting.fit, "record_model", fails)
-    monkeypatch.setattr(koopmpc.fitting.pictures, "spectrum", fails)
+    monkeypatch.setattr(koopmpc.fitting.fit, "spectrum", fails)
     write_csv(cart_pole(16), tmp_path / "csv")
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["fit", "csv", "--horizon", "10", "--linear"])
