@@ -1,4 +1,4 @@
-"""Faults: what breaks between plant and controller; frozen, composable, the same again for the same seed."""
+"""Faults: what breaks between plant and controller; frozen, composable, and equal for equal seeds."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -110,6 +110,13 @@ class _Windowed(Fault):
         checks.count(self.begin, "begin", 0)
         if self.end is not None:
             checks.count(self.end, "end", self.begin + 1)
+        for name in ("probability", "fraction"):
+            share = getattr(self, name, 0.0)
+            if not 0.0 <= float(checks.array(share, name, ())) <= 1.0:
+                raise DataError(f"{name} is {share:g}; it must be between 0 and 1")
+        channels: Sequence[int] | None = getattr(self, "channels", None)
+        if channels is not None:  # kept as a tuple, so that nobody changes the fault afterwards
+            object.__setattr__(self, "channels", tuple(checks.count(i, "channels", 0) for i in channels))
 
     def _at(self, k: int) -> bool:
         return self.begin <= k and (self.end is None or k < self.end)
@@ -121,11 +128,6 @@ class NaNSensor(_Windowed):
 
     channels: Sequence[int] | None = None
     probability: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _freeze(self)
-        _share(self.probability, "probability")
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the sensor of one run."""
@@ -145,10 +147,6 @@ class FrozenSensor(_Windowed):
     """`channels` of y_k (all by default) stay at what they showed at step `begin`, until `end`."""
 
     channels: Sequence[int] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _freeze(self)
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the sensor of one run."""
@@ -173,10 +171,6 @@ class DroppedSamples(_Windowed):
     """
 
     probability: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _share(self.probability, "probability")
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the line of one run."""
@@ -221,10 +215,6 @@ class ActuatorLoss(_Windowed):
     """
 
     fraction: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _share(self.fraction, "fraction")
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the actuator of one run."""
@@ -275,27 +265,13 @@ class SolverFailure(_Windowed):
 
     probability: float
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _share(self.probability, "probability")
-
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return which steps of one run lose the solver's answer."""
         return Injection(solver_fails=lambda k: rng.random() < self.probability and self._at(k))
 
 
-def _share(value: float, name: str) -> None:
-    if not 0.0 <= float(checks.array(value, name, ())) <= 1.0:
-        raise DataError(f"{name} is {value:g}; it must be between 0 and 1")
-
-
-def _freeze(fault: NaNSensor | FrozenSensor) -> None:
-    """Make the channels a tuple, so that the fault stays what it is."""
-    if fault.channels is not None:
-        object.__setattr__(fault, "channels", tuple(checks.count(i, "channels", 0) for i in fault.channels))
-
-
 def _picked(channels: Sequence[int] | None, ny: int) -> list[int]:
+    """Return the channels of a fault as indices of the ny measurements."""
     picked = list(range(ny)) if channels is None else list(channels)
     outside = [i for i in picked if not 0 <= i < ny]
     if outside:

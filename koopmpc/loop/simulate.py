@@ -103,10 +103,10 @@ def simulate(
         Sizes do not fit; plant or controller lack a member; a controller returned a u that is not finite.
     """
     steps, rng, x0 = checks.count(steps, "steps"), checks.generator(rng), checks.array(x0, "x0", (None,))
+    checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if isinstance(plant, StepMap):
         plant = SimulatedPlant(plant)
     require_plant(plant)
-    checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
         raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
     first = plant.reset(x0, rng)

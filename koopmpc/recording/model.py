@@ -153,7 +153,7 @@ def _pictures(
     plane: Axes,
     at: ArrayLike | None,
 ) -> tuple[list[Picture], Plane | None, str]:
-    """Return the eigenfunctions, their plane, and why there are none where nobody asked for some."""
+    """Return the eigenfunctions, their plane, and why there are none, where none were asked for."""
     if not isinstance(predictor, LinearPredictor) or (predictor.nx < 2 and which is None):
         why = "has no eigenfunctions" if predictor.nx > 1 else "has one state: there is no plane to draw them on"
         if which is not None:

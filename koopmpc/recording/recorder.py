@@ -1,4 +1,4 @@
-"""record a Run at once, or step by step with a Recorder while it happens: the same log either way."""
+"""record writes a Run at once; a Recorder writes it step by step while the loop runs. The log is the same."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ _BATCH = 0.2  # time between two batches [s]
 
 
 class BackgroundWriter:
-    """Steps go into `put`, which returns at once; a thread writes them in batches until `close`."""
+    """Write steps in a thread: `put` queues a step and returns at once, and `close` waits for the rest."""
 
     def __init__(self, about: About, writer: Writer) -> None:
         self.queue: SimpleQueue[Step] = SimpleQueue()
@@ -46,12 +46,12 @@ class BackgroundWriter:
         return self._failure
 
     def _work(self, writer: Writer) -> None:
-        """Write batches until the end; after a failure nothing more is written, and `close` tells."""
+        """Write batches until the end; after a failure nothing more is written, and `close` returns the failure."""
         written: list[StepRows] = []  # for the metrics at the end
-        last: list[Step] = []  # held back, for the state that it led to may come with the end
+        last: list[Step] = []  # held back: if it is the last one, the state that it led to is written with it
         closing = False
         while not closing:
-            closing = self._closing.wait(_BATCH)  # the thread wakes at its own pace, never at a step's
+            closing = self._closing.wait(_BATCH)  # a step never wakes the thread
             steps = last + self._drained()
             if self._failure is not None:
                 continue
@@ -114,8 +114,8 @@ class Recorder:
     is missing, slow or dies costs one UserWarning, and no step.
 
     It is an observer: ``with km.Recorder("run.rrd", dt=…) as recorder: km.simulate(…, observers=[recorder])``. In a
-    loop of one's own, k, y, u and reference of a Step are enough; give the last Step its y_next too, for a Run ends
-    with the state that its last input led to.
+    loop of your own, k, y, u and reference of a Step are enough. Give the last Step its y_next too: a Run ends with
+    the state that its last input led to.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # pyright: basic
-"""view: logs in one Rerun viewer; screenshot: a picture of a log without a screen."""
+"""view opens logs in one Rerun viewer; screenshot draws a picture of a log without a screen."""
 
 import os
 import socket

@@ -1,5 +1,5 @@
 # pyright: basic
-"""LogColumns: what an .rrd file holds, by entity and component; torn ends are cut off, changed columns found."""
+"""LogColumns: what an .rrd file holds, by entity and component; a torn end is cut off, changed columns are found."""
 
 import json
 import struct
@@ -31,7 +31,7 @@ class LogColumns:
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
         for chunk in chunks:
             if not chunk.is_static and "step" not in chunk.timeline_names:
-                continue  # of no log of ours
+                continue  # something else than koopmpc wrote it
             batch = chunk.to_record_batch()
             k = None if chunk.is_static else batch.column("step").to_numpy(zero_copy_only=False).astype(np.int64)
             for name in batch.schema.names:

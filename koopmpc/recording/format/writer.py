@@ -1,5 +1,5 @@
 # pyright: basic
-"""Writer: the one way in which rows become a Rerun recording."""
+"""Writer: how the rows of a run become a Rerun recording, in one way for logs at once and logs of running loops."""
 
 import json
 import uuid
@@ -65,10 +65,10 @@ def _require_writable(path: str | Path) -> None:
 
 
 class Writer:
-    """One recording: `about` first, then blocks of rows in order, then the end.
+    """One recording: the description first, then blocks of rows in order, then the metrics, which mark a complete log.
 
-    In a block the states go last: a state that can be read says that all else of its row can be read. So a file that
-    was cut holds whole blocks, and long rows are written as several.
+    The states are the last column of each block to be written. Where a state can be read, all else of its row can be
+    read too. So a file that was cut is read up to its last whole block, and long runs are written as several blocks.
     """
 
     def __init__(
@@ -81,18 +81,18 @@ class Writer:
         model: Predictor | None = None,
         steps: int | None = None,
     ) -> None:
-        """Check what is told; `viewer` is the address of a viewer that is up."""
+        """Check that `about` can be saved and `path` be written; `viewer` is the address of a viewer that is up."""
         import rerun as rr
 
         self._about, self._scene, self._model = about, scene, model
-        self._page, self._json = to_markdown(about), to_json(about, steps)  # refuses what cannot be saved
+        self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._path, self._viewer = path, viewer
         self._rec = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
         self._opened, self._ahead = False, False  # ahead: whether a plan was ever drawn
         self._extent, self._shown = Extent(), Extent().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
-        self._sums: dict[str, int] = {}  # of each column's bytes: a damaged log must not read as a whole one
+        self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
         self._u: np.ndarray | None = None
         self._names = Names()
         if path is not None:
@@ -101,7 +101,9 @@ class Writer:
     def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""
         parts = blocks(rows)
-        drawings = [self._drawings(part) for part in parts]  # all, for the layout shows as much as they fill
+        drawings = [
+            self._drawings(part) for part in parts
+        ]  # all before the first is written: the layout is as wide as they are
         if not self._opened:
             self._open()
         for part, drawn in zip(parts, drawings, strict=True):

@@ -88,7 +88,7 @@ _SEPARATE = 4  # up to so many states have a plot each
 
 
 def blueprint(about: About, *, extent: Extent | None, model: Predictor | None) -> Any:
-    """Return the layout of one run: what the data cannot fill has no view.
+    """Return the layout of one run; there is no view without data.
 
     `extent` is what the animation shows, None where there is no scene.
     """

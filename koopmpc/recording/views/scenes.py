@@ -1,5 +1,5 @@
 # pyright: basic
-"""Scenes: shapes over time as columns for Rerun; recording knows shapes, no plant."""
+"""Scenes: the shapes that scene(x, u) returns over time, as columns for Rerun."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
