@@ -248,12 +248,15 @@ def _evidence(report: TrustReport) -> Iterator[tuple[str, str]]:
             f"{shares}",
         )
     band = report.band
-    widths = ", ".join(quantity(name, f"± {w:.3g}") for name, w in zip(band.states, band.width[-1], strict=True))
-    yield (
-        "band",
-        f"{percent(band.level)} of forecasts stay within a band at all of their steps, at the last one {widths}; "
-        f"calibrated on {band.episodes} episodes, and promised for inputs of the same distribution only",
-    )
+    if np.isfinite(band.width[-1]).all():
+        widths = ", ".join(quantity(name, f"± {w:.3g}") for name, w in zip(band.states, band.width[-1], strict=True))
+        yield (
+            "band",
+            f"{percent(band.level)} of forecasts stay within a band at all of their steps, at the last one {widths}; "
+            f"calibrated on {band.episodes} episodes, and promised for inputs of the same distribution only",
+        )
+    else:
+        yield "band", f"no finite band holds {percent(band.level)} of forecasts ({band.episodes} calibration episodes)"
     loop, again = report.closed_loop, report.recalibrated
     if loop is not None and again is not None:
         text = (
