@@ -139,12 +139,12 @@ class BilinearMPC(StagedMPC):
 
     def _solve(
         self,
-        x: Float[np.ndarray, " nx"],
+        s: Float[np.ndarray, " ns"],
         u_prev: Float[np.ndarray, " nu"],
         first: Interval,
         deadline: float,
     ) -> StagePlan:
-        s, iteration = self._start(x, u_prev), self._iteration
+        iteration = self._iteration
         if self._with_rates:
             iteration.low[0, : self._nu], iteration.high[0, : self._nu] = first
         status, iterations = Status.FAILED, 0
@@ -154,6 +154,7 @@ class BilinearMPC(StagedMPC):
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
             u = np.clip(u_prev if self._with_rates else np.zeros(self._nu), *self._outputs.inputs)
             # rest at x: the free motion of a learned model may leave its data, and lead to a plan there
+            x = s[: self._map.nx]
             self._enter(np.tile(x, (self._N + 1, 1)), np.tile(u, (self._N, 1)), u_prev)
             status, more = self._improve(s, u_prev, max(FIRST, self._sqp_iterations), deadline)
             iterations += more

@@ -1,7 +1,6 @@
 """The equilibrium x = F(x, u) + e that holds a reference, or comes nearest to it, and what the end of a horizon costs.
 
-Near a guess an equilibrium is found by Gauss–Newton steps that hold the active limits; from afar, or where these fail,
-by ipopt.
+Near a guess it is found by Gauss–Newton steps that hold the active limits; from afar, or where these fail, by ipopt.
 """
 
 from typing import Any, NamedTuple, cast
@@ -70,18 +69,17 @@ class Linearisation(NamedTuple):
 class Equilibria:
     """Reference row and disturbance e → Equilibrium: minimises ‖of(x) − r‖²_Q inside all limits.
 
-    Where no equilibrium is inside all limits, those of the inputs alone count. Of all that hold r it is the one with
-    the least x and u.
+    Where none is inside all limits, those of the inputs alone count. Of all that hold r it has the least x and u.
     """
 
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking) -> None:
-        self.model, self._outputs, o = model, outputs, outputs
+        self.model, self._cost, self._outputs, o = model, cost, outputs, outputs
         self.of_state = isinstance(cost.of, State) and cost.of.whole
         x, u, theta = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("t", len(model.theta))
         F, of, g = model.F(x, u, theta), o.tracked(x), o.limited(x)
         found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
         local = ca.Function("local", [x, u, theta], [ca.densify(each) for each in found])
-        self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local)
+        self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local).slot()
         least = 1e-8 * max(float(np.trace(o.Q)), 1e-12)
         r, e = ca.MX.sym("r", len(o.Q)), ca.MX.sym("e", model.nx)
         f = ca.mtimes([(of - r).T, ca.DM(o.Q), of - r]) + least * (ca.sumsqr(u) + ca.sumsqr(x))
@@ -90,10 +88,15 @@ class Equilibria:
         self._weight, self._small = root(o.Q), np.sqrt(1e-6 * least)
         self._low, self._high = (np.concatenate([o.inputs[i], o.outputs[i]]) for i in (0, 1))
 
+    def __reduce__(self) -> tuple[type["Equilibria"], tuple[LearnedMap, Cost, StateTracking]]:
+        return Equilibria, (self.model, self._cost, self._outputs)
+
     def linearise(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Linearisation:
         """Return the linearisation at (x, u)."""
-        nx = len(x)
-        F, A, B, of, J, g, G = self._local(x, u, self.model.theta)
+        nx, local = len(x), self._local
+        local.arguments[0][:], local.arguments[1][:], local.arguments[2][:] = x, u, self.model.theta
+        local.evaluate()
+        F, A, B, of, J, g, G = (result.copy() for result in local.results)
         A, B = (M.reshape((nx, -1), order="F") for M in (A, B))
         J, G = (M.reshape((-1, nx), order="F") for M in (J, G))
         return Linearisation(F, A, B, of, J, g, G)

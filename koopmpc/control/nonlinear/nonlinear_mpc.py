@@ -103,13 +103,12 @@ class NonlinearMPC(StagedMPC):
 
     def _solve(
         self,
-        x: Float[np.ndarray, " nx"],
+        s: Float[np.ndarray, " ns"],
         u_prev: Float[np.ndarray, " nu"],
         first: Interval,
         deadline: float,
     ) -> StagePlan:
-        starts = [self._next] if self._warm else self._guesses(x, u_prev)
-        s = self._start(x, u_prev)
+        starts = [self._next] if self._warm else self._guesses(s[: self._map.nx], u_prev)
         solved = [self._shooting.solve(s, self._now, self._e, start, first) for start in starts]
         iterations = sum(found.iterations for found in solved)
         good = [found for found in solved if found.status is Status.OPTIMAL]

@@ -126,12 +126,12 @@ class StagedMPC(MPCBase):
         initial = self._initial
         initial.take(y, self._given, applied, w)
         x, u_prev = initial.z, self._known_input()
+        s, first, conflict = self._first_stage(x, u_prev)
         target = checks.numbers(reference, "reference")
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
         if not (known and self._aim(target)):
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
-        first, conflict = self._first_inputs(u_prev)
-        found = self._solve(x, u_prev, first, start + self._allowed)
+        found = self._solve(s, u_prev, first, start + self._allowed)
         status = Status.FAILED if self.solver_fails else found.status
         if status not in GOOD:
             return self._lose(applied, status, found.iterations, start, found.free)
@@ -148,12 +148,12 @@ class StagedMPC(MPCBase):
     @abstractmethod
     def _solve(
         self,
-        x: Float[np.ndarray, " nx"],
+        s: Float[np.ndarray, " ns"],
         u_prev: Float[np.ndarray, " nu"],
         first: Interval,
         deadline: float,
     ) -> StagePlan:
-        """Return the plan from x on, with v_0 inside `first`."""
+        """Return the plan from s on, with v_0 inside `first`."""
 
     @abstractmethod
     def _track(self, targets: StageTargets) -> None:
@@ -214,18 +214,17 @@ class StagedMPC(MPCBase):
         L_s[n : n + nu, last], m_s[n : n + nu] = self._R_root, self._R_root @ U[-1]
         return StageTargets(np.hstack([R, U]), np.zeros_like(U), M_s, L_s, m_s)
 
-    def _first_inputs(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, bool]:
-        """Return the limits of v_0, and whether rates were widened: where they exclude the limits of u, these win."""
+    def _first_stage(
+        self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]
+    ) -> tuple[Float[np.ndarray, " ns"], Interval, bool]:
+        """Return s_0, the limits of v_0, and whether rates were widened: where they exclude those of u, these win."""
         low, high = self._problem.inputs
         if not self._with_rates:
-            return self._problem.inputs, False
+            return x, self._problem.inputs, False
         inputs = self._outputs.inputs
         widened = Interval(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
-        return widened, bool((widened.low < low - 1e-9).any() or (widened.high > high + 1e-9).any())
-
-    def _start(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " ns"]:
-        """Return s_0."""
-        return np.concatenate([x, u_prev, np.zeros(len(self._problem.soft_rates))]) if self._with_rates else x
+        conflict = bool((widened.low < low - 1e-9).any() or (widened.high > high + 1e-9).any())
+        return np.concatenate([x, u_prev, np.zeros(len(self._problem.soft_rates))]), widened, conflict
 
     def _stages(
         self,
