@@ -25,7 +25,7 @@ Array = NDArray[Any]
 Arrays = dict[str, Array]
 _SHOWN, _LONG = 4, 80  # items and characters that a repr shows of a field
 
-ALIASES: dict[str, str] = {"Row": "LeaderboardRow"}
+ALIASES: dict[str, str] = {"Row": "LeaderboardRow", "Storage": "Dissipation"}
 """Old name of a class → its name now: files of earlier versions name classes as they were called then."""
 
 _ROOMS = ("predict", "lifting", "data", "identify", "validate", "estimate", "control", "loop", "synthesis")

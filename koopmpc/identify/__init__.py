@@ -6,6 +6,6 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.identify.fits.prior import Combination as Combination
-    from koopmpc.identify.fits.prior import Storage as Storage
+    from koopmpc.identify.fits.prior import Dissipation as Dissipation
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"fits.prior": "Combination Storage"})
+    __getattr__, __dir__, __all__ = attach(__name__, {"fits.prior": "Combination Dissipation"})

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.prior import Combination, Storage
+from koopmpc.identify.fits.prior import Combination, Dissipation
 from koopmpc.values import from_data, to_data
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 
@@ -67,7 +67,7 @@ CASES = {
         lambda A, B: [cp.sum(A) == 1, cp.sum(B) >= 0.2],
     ),
     "contraction": (
-        km.Prior(storage=Storage(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
+        km.Prior(dissipation=Dissipation(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
         lambda A, B: [
             A[:2, 2] == 0,
             cp.bmat([[0.25 * STORE[:2, :2], (np.sqrt(STORE[:2]) @ A[:, :2]).T],
@@ -91,7 +91,7 @@ def test_equals_brute_force_on_all_rows(name: str, ridge: float) -> None:
 def test_passivity_holds_and_equals_the_program_in_raw_units() -> None:
     data = random_episodes(5, [60], 2, 1)
     P, C, D = np.diag([1.0, 2.0]), np.array([[0.3, 0.1]]), np.array([[0.2]])
-    model = km.constrained_edmd(data, km.State(), prior=km.Prior(storage=Storage(P, C=C, D=D)))
+    model = km.constrained_edmd(data, km.State(), prior=km.Prior(dissipation=Dissipation(P, C=C, D=D)))
 
     def passive(A, B):  # in z, u directly: P⁻¹ instead of a factor
         return [cp.bmat([[P, C.T, A.T], [C, D + D.T, B.T], [A, B, np.linalg.inv(P)]]) >> 0]
@@ -132,7 +132,7 @@ TRUTHS = [
     km.Prior(lower_A=-1e-9, lower_B=-1e-9, upper_A=1.0),
     km.Prior(symmetric=True),
     km.Prior(combinations=[Combination(2.1, 2.1, A=np.eye(3))]),
-    km.Prior(storage=Storage([1, 1, 1])),
+    km.Prior(dissipation=Dissipation([1, 1, 1])),
 ]
 
 
@@ -180,7 +180,7 @@ REFUSED = [
     ({"A": np.full((3, 3), 2.0), "upper_A": 1.0}, km.errors.DataError, "contradict each other at 'x0'"),
     ({"lower_B": 1.0, "upper_B": 0.0}, km.errors.DataError, "contradict each other"),
     ({"combinations": [Combination(0, 1, A=np.eye(2))]}, km.errors.ShapeError, "Combination.A has shape"),
-    ({"storage": Storage([1, 1])}, km.errors.ShapeError, "Storage.P has shape"),
+    ({"dissipation": Dissipation([1, 1])}, km.errors.ShapeError, "Dissipation.P has shape"),
     (
         {"combinations": [Combination(5, 6, A=np.eye(3))], "upper_A": 1.0},
         km.errors.DataError,
@@ -202,8 +202,8 @@ def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
     with pytest.raises(km.errors.DataError, match="limits cross"):
         Combination(1, 0, A=np.eye(2))
     with pytest.raises(km.errors.DataError, match="has D but no C"):
-        Storage([1.0], D=[[1.0]])
+        Dissipation([1.0], D=[[1.0]])
     with pytest.raises(km.errors.DataError, match="decay is 0"):
-        Storage([1.0], decay=0)
+        Dissipation([1.0], decay=0)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
         km.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.Prior(), ridge=-1)

@@ -30,7 +30,7 @@ def test_without_forgetting_it_is_the_batch_fit(seed: int, nu: int, lengths: lis
     online = km.OnlineEDMD.start(data[:-1], LIFTING)
     last = data[-1]
     for x, u, x_next in zip(last.X[:-1], last.U, last.X[1:], strict=True):
-        online.update(x, u, x_next)
+        online.learn(x, u, x_next)
     batch, model = km.edmd(data, LIFTING), online.predictor()
     assert online.pairs == sum(lengths) + 40
     assert np.allclose(model.A, batch.A, rtol=0, atol=1e-10)
@@ -61,7 +61,7 @@ def test_a_window_is_the_fit_of_its_pairs(seed: int, window: int, extra: int) ->
     data = random_episodes(seed, [window + extra, 37], 2, 1)
     online = km.OnlineEDMD.start(data[:1], LIFTING, window=window)
     for x, u, x_next in zip(data[1].X[:-1], data[1].U, data[1].X[1:], strict=True):
-        online.update(x, u, x_next)
+        online.learn(x, u, x_next)
     expected = weighted(data, LIFTING, np.ones(window))
     assert np.allclose(found(online), expected, rtol=0, atol=1e-8 * max(1, np.abs(expected).max()))
     assert online.predictor().report.samples == window
@@ -73,7 +73,7 @@ def test_every_moment_of_a_window(window: int) -> None:
     X = data[0].X
     online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=data.states, window=window)
     for k in range(230):
-        online.update(X[k], [], X[k + 1])
+        online.learn(X[k], [], X[k + 1])
         R, count = online._memory.factor(online._rows[: online._waiting])
         first = max(k + 1 - window, 0)
         Z = np.column_stack([X, np.ones(231)])
@@ -136,16 +136,16 @@ def test_a_plant_at_rest_unlearns_nothing_and_learns_again(forgetting: float) ->
     U = rng.uniform(-1, 1, (300, 1))
     X = moving(A_ONE, B_ONE, np.zeros(2), U)
     online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=("a", "b"), inputs=("u",), forgetting=forgetting)
-    online.update(X[:-1], U, X[1:])
+    online.learn(X[:-1], U, X[1:])
     before = found(online)
     for _ in range(3):
-        online.update(*rest_of(10_000))  # 0.9^30000 is below the smallest number by far
+        online.learn(*rest_of(10_000))  # 0.9^30000 is below the smallest number by far
     assert np.allclose(found(online), before, rtol=0, atol=1e-9)
     noise = 1e-5 * rng.standard_normal((5000, 2))
-    online.update(noise[:-1], np.zeros((4999, 1)), noise[1:])  # a sensor's noise about rest
+    online.learn(noise[:-1], np.zeros((4999, 1)), noise[1:])  # a sensor's noise about rest
     assert np.abs(found(online) - before).max() < 0.3
     X = moving(A_TWO, B_ONE, np.zeros(2), U)
-    online.update(X[:-1], U, X[1:])
+    online.learn(X[:-1], U, X[1:])
     assert np.allclose(found(online)[:2, :2], A_TWO, rtol=0, atol=1e-3)
 
 
@@ -155,12 +155,12 @@ def test_one_silent_input_does_not_keep_the_others_from_adapting() -> None:
     U = rng.uniform(-1, 1, (400, 2))
     X = moving(A_ONE, B, np.zeros(2), U)
     online = km.OnlineEDMD(km.State(), dt=0.1, states=("a", "b"), inputs=("u", "v"), forgetting=0.97)
-    online.update(X[:-1], U, X[1:])
+    online.learn(X[:-1], U, X[1:])
     for _ in range(10):
         U = rng.uniform(-1, 1, (500, 2))
         U[:, 1] = 0
         X = moving(A_TWO, 2 * B, X[-1], U)
-        online.update(X[:-1], U, X[1:])
+        online.learn(X[:-1], U, X[1:])
     model = online.predictor()
     assert np.allclose(model.A, A_TWO, rtol=0, atol=1e-6)
     assert np.allclose(model.B[:, 0], 2 * B[:, 0], rtol=0, atol=1e-6)
@@ -178,14 +178,14 @@ def long_run(updates: int, block: int, forgetting: float, rest: int) -> float:
     while done < updates:
         if rest and done >= updates // 2:
             for _ in range(rest // block):
-                online.update(*rest_of(block))
+                online.learn(*rest_of(block))
             D[2, 2] += rest  # of the Constant
             D[2, 6] += rest
             rest = 0
         U = rng.uniform(-1, 1, (block, 1))
         X = moving(A_ONE, B_ONE, x, U)
         X[1:] += 0.01 * rng.standard_normal((block, 2))
-        online.update(X[:-1], U, X[1:]) if block > 1 else online.update(X[0], U[0], X[1])
+        online.learn(X[:-1], U, X[1:]) if block > 1 else online.learn(X[0], U[0], X[1])
         rows = np.hstack([X[:-1], np.ones((block, 1)), U, X[1:], np.ones((block, 1))]).astype(np.longdouble)
         if forgetting == 1:
             D += rows.T @ rows
@@ -228,7 +228,7 @@ def test_a_window_over_ten_million_updates() -> None:
     online = km.OnlineEDMD(km.State() + km.Constant(), dt=0.1, states=("a", "b"), inputs=("u",), window=1234)
     for _ in range(1000):
         X, U = rng.standard_normal((10_000, 2)), rng.standard_normal((10_000, 1))
-        online.update(X, U, X[::-1] * 1e3)
+        online.learn(X, U, X[::-1] * 1e3)
     Z = np.column_stack([X, np.ones(10_000), U])[-1234:]
     T = np.column_stack([X[::-1] * 1e3, np.ones(10_000)])[-1234:]
     error = float(np.abs(found(online) - np.linalg.lstsq(Z, T, rcond=None)[0].T).max())
@@ -246,7 +246,7 @@ def run(mpc: km.KoopmanMPC, online: km.OnlineEDMD | None) -> float:
         u = mpc(x, target).u
         x_next = x + 0.1 * np.array([x[1], -stiffness * x[0] - 0.5 * x[1] + 4 * gain * u[0]])
         if online is not None:
-            online.update(x, u, x_next)
+            online.learn(x, u, x_next)
             if k % 10 == 0:
                 mpc.update(online.predictor())
         x = x_next
@@ -274,7 +274,7 @@ def test_few_pairs_are_told_in_the_report_and_do_not_warn() -> None:
     online = km.OnlineEDMD(LIFTING, dt=0.1, states=("a", "b"), inputs=("u",))
     with pytest.raises(km.errors.DataError, match="nothing was learned yet"):
         online.predictor()
-    online.update([1, 2], [3], [4, 5])
+    online.learn([1, 2], [3], [4, 5])
     model = online.predictor()
     assert "rank-deficient: 1 snapshot pairs" in model.report.warnings[0]
     assert np.allclose(model.rollout([1, 2], [[3]])[1], [4, 5])
@@ -299,15 +299,15 @@ def test_bad_arguments() -> None:
         make(ridge=-1.0)
     online = make()
     with pytest.raises(km.errors.ShapeError, match=r"x has shape \(3,\), expected \(2,\)"):
-        online.update([1, 2, 3], [1], [1, 2])
+        online.learn([1, 2, 3], [1], [1, 2])
     with pytest.raises(km.errors.ShapeError, match="u has shape"):
-        online.update([1, 2], [1, 2], [1, 2])
+        online.learn([1, 2], [1, 2], [1, 2])
     with pytest.raises(km.errors.ShapeError, match="x_next has shape"):
-        online.update([[1, 2]], [[1]], [1, 2])
+        online.learn([[1, 2]], [[1]], [1, 2])
     with pytest.raises(km.errors.DataError, match="x_next holds 1 NaN"):
-        online.update([1, 2], [1], [1, np.nan])
+        online.learn([1, 2], [1], [1, np.nan])
     with pytest.raises(km.errors.DataError, match=r"observable 'a\^2' is not finite"):
-        km.OnlineEDMD(km.State() + km.Monomials(2), dt=0.1, states=("a",)).update([1e200], [], [1])
+        km.OnlineEDMD(km.State() + km.Monomials(2), dt=0.1, states=("a",)).learn([1e200], [], [1])
     pushed = km.OnlineEDMD(km.State(), dt=0.1, states=("a",), disturbances=("w",))
     with pytest.raises(km.errors.DataError, match="1 measured disturbances; pass w"):
-        pushed.update([1], [], [1])
+        pushed.learn([1], [], [1])

@@ -19,7 +19,7 @@ def learner(width: int, **options: float) -> tuple[km.OnlineEDMD, np.ndarray, np
     online = km.OnlineEDMD(lifting, dt=0.1, states=states, inputs=inputs, **options)
     rng = np.random.default_rng(0)
     X, U = rng.standard_normal((4001, nx)), rng.standard_normal((4000, nu))
-    online.update(X[:-1], U, X[1:])
+    online.learn(X[:-1], U, X[1:])
     return online, X, U
 
 
@@ -34,9 +34,9 @@ def test_updates(benchmark, width: int, options: dict[str, float]) -> None:
     def run() -> None:
         start = time.perf_counter()
         for k in range(2000):
-            online.update(X[k], U[k], X[k + 1])
+            online.learn(X[k], U[k], X[k + 1])
         middle = time.perf_counter()
-        online.update(X[:-1], U, X[1:])
+        online.learn(X[:-1], U, X[1:])
         later = time.perf_counter()
         for _ in range(5):
             online.predictor()
@@ -63,7 +63,7 @@ def test_the_longest_single_update(benchmark, width: int) -> None:
             times = np.empty(6000)
             for k in range(6000):
                 start = time.perf_counter()
-                online.update(X[k % 4000], U[k % 4000], X[k % 4000 + 1])
+                online.learn(X[k % 4000], U[k % 4000], X[k % 4000 + 1])
                 times[k] = time.perf_counter() - start
             peaks[f"{name}: p99 [us]"] = round(1e6 * float(np.quantile(times, 0.99)), 1)
             peaks[f"{name}: p99.9 [us]"] = round(1e6 * float(np.quantile(times, 0.999)), 1)

@@ -11,7 +11,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.prior import Combination, Entries, Prior, Storage, entries_of
+from koopmpc.identify.fits.prior import Combination, Dissipation, Entries, Prior, entries_of
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, ridge_of, rule, solve
@@ -85,8 +85,8 @@ def violation(
             float(np.sum(w * m)) for w, m in ((each.A, A), (each.B, B)) if w is not None
         )  # the sum of weighted entries
         worst = max(worst, each.low - value, value - each.high)
-    if prior.storage is not None:
-        M = _dissipation(prior.storage, A, B, size[:nz], size[nz:], np.block)
+    if prior.dissipation is not None:
+        M = _dissipation(prior.dissipation, A, B, size[:nz], size[nz:], np.block)
         worst = max(worst, -float(np.linalg.eigvalsh(M)[0]))
     return worst
 
@@ -103,8 +103,8 @@ def _coupling(cp, prior: Prior, X, scale, size) -> list:
         found.append(cp.upper_tri(S) == cp.upper_tri(S.T))
     for each in prior.combinations:
         found += _limits(cp, each, A, B)
-    if prior.storage is not None:
-        M = _dissipation(prior.storage, A, B, size[:nz], size[nz:], cp.bmat)
+    if prior.dissipation is not None:
+        M = _dissipation(prior.dissipation, A, B, size[:nz], size[nz:], cp.bmat)
         found.append(0.5 * (M + M.T) >> 0)
     return found
 
@@ -124,22 +124,22 @@ def _limits(cp, each: Combination, A, B) -> list:
     return ends
 
 
-def _dissipation(storage: Storage, A, B, size, force, block):
+def _dissipation(dissipation: Dissipation, A, B, size, force, block):
     """Return M ⪰ 0 ⇔ V(A z + B u) ≤ decay² V(z) + uᵀ(C z + D u): a Schur complement, P = LᵀL.
 
     z and u are taken in units of their sizes, V in units of its largest diagonal entry there.
     """
-    values, vectors = np.linalg.eigh(storage.P)
+    values, vectors = np.linalg.eigh(dissipation.P)
     held = values > 1e-12 * max(values[-1], 0.0)
     L = np.sqrt(values[held])[:, None] * vectors[:, held].T
-    unit = max(float((storage.P.diagonal() * size**2).max()), 1e-300) ** -0.5
+    unit = max(float((dissipation.P.diagonal() * size**2).max()), 1e-300) ** -0.5
     z, u = np.diag(size * unit), np.diag(force * unit)
-    P = storage.decay**2 * z @ storage.P @ z
+    P = dissipation.decay**2 * z @ dissipation.P @ z
     LA = (L @ A) @ z
-    if storage.C is None:
+    if dissipation.C is None:
         return block([[P, LA.T], [LA, np.eye(len(L))]])
-    D = np.zeros((len(force), len(force))) if storage.D is None else storage.D
-    C, LB = u @ storage.C @ z, (L @ B) @ u
+    D = np.zeros((len(force), len(force))) if dissipation.D is None else dissipation.D
+    C, LB = u @ dissipation.C @ z, (L @ B) @ u
     return block([[P, C.T, LA.T], [C, u @ (D + D.T) @ u, LB.T], [LA, LB, np.eye(len(L))]])
 
 
@@ -163,7 +163,7 @@ def constrained_edmd(
 
     The misfit is Σᵢ ‖ψᵢ(x⁺) − …‖² / ‖ψᵢ(x⁺)‖², each observable in units of its own size; this matters only where
     the prior couples the rows of A. Known entries and rows are solved by linear algebra, bounds by one QP a row,
-    symmetry, combinations and storage by one program of all rows. A prior that the plain fit agrees with changes
+    symmetry, combinations and dissipation by one program of all rows. A prior that the plain fit agrees with changes
     nothing.
 
     Parameters
@@ -218,7 +218,7 @@ def constrained_edmd(
 _COUPLINGS = {
     "A is symmetric": "symmetric",
     "combinations of entries are limited": "combinations",
-    "energy that is stored is dissipated as the prior says": "storage",
+    "energy that is stored is dissipated as the prior says": "dissipation",
 }
 
 

@@ -29,7 +29,7 @@ class OnlineEDMD:
     Without either it is the batch fit.
 
     It takes no embedding, for it remembers no steps. A model with delays learns from points ζ, as its states:
-    ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``update(zeta, u, zeta_next)``.
+    ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.
 
     Parameters
     ----------
@@ -122,10 +122,10 @@ class OnlineEDMD:
             keep=keep,
         )
         for episode in episodes:
-            online.update(episode.X[:-1], episode.U, episode.X[1:], episode.W)
+            online.learn(episode.X[:-1], episode.U, episode.X[1:], episode.W)
         return online
 
-    def update(self, x: ArrayLike, u: ArrayLike, x_next: ArrayLike, w: ArrayLike | None = None) -> None:
+    def learn(self, x: ArrayLike, u: ArrayLike, x_next: ArrayLike, w: ArrayLike | None = None) -> None:
         """Learn that u (and w) led from x to x_next: one pair, or rows of pairs, the newest last.
 
         Parameters
@@ -177,10 +177,10 @@ class OnlineEDMD:
         Raises
         ------
         DataError
-            There was no update yet.
+            Nothing was learned yet.
         """
         if self.pairs == 0:
-            raise DataError("nothing was learned yet; call update first")
+            raise DataError("nothing was learned yet; call learn first")
         R, weight = self._memory.factor(self._rows[: self._waiting])
         regression = regression_of(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
         rows = regression.rows.leading(self._lifting.nz)

@@ -45,7 +45,7 @@ class Combination(Value):
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Storage(Value):
+class Dissipation(Value):
     """Dissipation with V(z) = ½ zᵀP z: V(A z + B u) ≤ decay² V(z) + uᵀ(C z + D u) for every z and u.
 
     With decay = 1 this is passivity from u to y = C z + D u in discrete time. Without C it is V(A z) ≤ decay² V(z)
@@ -77,12 +77,12 @@ class Storage(Value):
         self, P: ArrayLike, *, decay: float = 1.0, C: ArrayLike | None = None, D: ArrayLike | None = None
     ) -> None:
         if C is None and D is not None:
-            raise DataError("Storage has D but no C; pass the output C that D belongs to")
+            raise DataError("Dissipation has D but no C; pass the output C that D belongs to")
         for name, value in {
-            "P": checks.weight(P, "Storage.P"),
+            "P": checks.weight(P, "Dissipation.P"),
             "decay": checks.positive(decay, "decay"),
-            "C": None if C is None else checks.array(C, "Storage.C", (None, None)),
-            "D": None if D is None else checks.array(D, "Storage.D", (None, None)),
+            "C": None if C is None else checks.array(C, "Dissipation.C", (None, None)),
+            "D": None if D is None else checks.array(D, "Dissipation.D", (None, None)),
         }.items():
             object.__setattr__(self, name, value)
 
@@ -107,7 +107,7 @@ class Prior(Value):
         A = Aᵀ.
     combinations
         Weighted sums of entries between limits.
-    storage
+    dissipation
         Passivity or contraction.
 
     Raises
@@ -127,7 +127,7 @@ class Prior(Value):
     upper_B: Float[np.ndarray, "..."]
     symmetric: bool
     combinations: tuple[Combination, ...]
-    storage: Storage | None
+    dissipation: Dissipation | None
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class Prior(Value):
         upper_B: ArrayLike = np.inf,
         symmetric: bool = False,
         combinations: Sequence[Combination] = (),
-        storage: Storage | None = None,
+        dissipation: Dissipation | None = None,
     ) -> None:
         known = {
             name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
@@ -161,14 +161,14 @@ class Prior(Value):
             "upper_B": checks.array(upper_B, "upper_B", infinite=True),
             "symmetric": bool(symmetric),
             "combinations": tuple(combinations),
-            "storage": storage,
+            "dissipation": dissipation,
         }.items():
             object.__setattr__(self, name, value)
 
     @property
     def coupled(self) -> bool:
         """Whether rows of [A B] depend on each other."""
-        return self.symmetric or bool(self.combinations) or self.storage is not None
+        return self.symmetric or bool(self.combinations) or self.dissipation is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,11 +232,11 @@ def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) 
         ):
             if weights is not None:
                 _sized(weights, shape, what)
-    if prior.storage is not None:
-        _sized(prior.storage.P, (nz, nz), "Storage.P")
+    if prior.dissipation is not None:
+        _sized(prior.dissipation.P, (nz, nz), "Dissipation.P")
         for matrix, shape, what in (
-            (prior.storage.C, (nu, nz), "Storage.C"),
-            (prior.storage.D, (nu, nu), "Storage.D"),
+            (prior.dissipation.C, (nu, nz), "Dissipation.C"),
+            (prior.dissipation.D, (nu, nu), "Dissipation.D"),
         ):
             if matrix is not None:
                 _sized(matrix, shape, what)
