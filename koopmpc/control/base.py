@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import numbers
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status, blocked
@@ -47,7 +48,7 @@ class InitialCondition:
         self._model, self.observer, self._latency = model, observer, latency
         self._sizes = model.nz, model.nu, model.nw, N
         self._with_rates, self._estimated = with_rates, estimated
-        self._plain = not (estimated or latency or model.embedding is not None)
+        self._plain = not (estimated or latency or with_rates or model.nw or model.embedding is not None)
         self._shape = (observer.ny,)
         self.known = np.zeros(model.nz + model.nu * with_rates + N * model.nw + model.nz * estimated + 1)
         self.known[-1] = 1.0
@@ -97,8 +98,12 @@ class InitialCondition:
         w
             Measured disturbances (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
-        measured, observer = checks.numbers(y, "y"), self.observer
-        got = None if applied is None else checks.numbers(applied, "applied")
+        measured, observer = numbers(y, "y"), self.observer
+        if self._plain and applied is None and w is None and measured.shape == self._shape:  # y is all that counts
+            observer.observe(measured, last, self._w)
+            self.z[:] = observer.z
+            return
+        got = None if applied is None else numbers(applied, "applied")
         if got is not None and got.shape != last.shape:
             raise ShapeError(f"applied has shape {got.shape}, expected {last.shape}")
         if measured.shape != self._shape:
@@ -108,10 +113,6 @@ class InitialCondition:
             self.u_prev[:] = last if got is None or self._latency else got
         if self.W.size or w is not None:
             self._preview(w)
-        if self._plain:
-            observer.observe(measured, last, self._w)
-            self.z[:] = observer.z
-            return
         self._sent.append(last.copy())
         acted = self._sent[0]
         if got is not None and (np.abs(got) < HUGE).all():
@@ -131,7 +132,7 @@ class InitialCondition:
         if w is None:
             self.W[:] = self._ahead[:] = 0.0
             return
-        rows, (_, _, nw, N) = checks.numbers(w, "w"), self._sizes
+        rows, (_, _, nw, N) = numbers(w, "w"), self._sizes
         if nw == 0:
             raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
         steps = N + self._latency
@@ -146,9 +147,8 @@ class InitialCondition:
 class MPCBase:
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
-    A subclass calls `_begin` once its tracking is known, `_keep` with every good plan, and ends a step with `_move`
-    or `_fail`. A failed step returns the next input of the last good plan, then the unconstrained input clipped, then
-    the last input; always inside the limits of the inputs, and of their rates as far as those allow.
+    A subclass calls `_begin` once, `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step
+    returns the next input of the last good plan, then the unconstrained input clipped, then the last input.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class MPCBase:
     horizon, latency
         Steps of the plan, and until its first input acts.
     moves
-        How many inputs the plan has, or the lengths of the blocks of steps in which each is held.
+        See `blocked`.
     time_limit
         Wall-clock time a step may take [s]; None for any.
     """
@@ -234,10 +234,9 @@ class MPCBase:
         return self._initial.observer
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget all earlier steps, so that a run repeats to the bit.
+        """Forget all earlier steps, so that a run repeats to the bit; a filter starts at x0, by default at zero.
 
-        Rates count from `u_prev`, zero moved inside the limits by default; it is held if the first step fails. A
-        filter starts at x0, by default at zero.
+        Rates count from `u_prev`, zero moved inside the limits by default; it is held if the first step fails.
         """
         zero = np.clip(np.zeros(self._nu), *self._inputs)
         self._kept: Float[np.ndarray, " nv"] | None = None

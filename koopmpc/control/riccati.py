@@ -208,9 +208,8 @@ def stationary(
 
     K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
     weight may take that long to reach an input. The steps before that are taken by doubling, as far as it is safe.
-    Never refused: a Constant, or any other mode that u cannot move, only makes its own entries of P grow, which
-    z − z_r does not see. Where P has grown by 1e12, an unstable mode that u cannot move has taken over; the iteration
-    then runs on the controllable part alone.
+    A Constant, or any other mode that u cannot move, only makes its own entries of P grow. Where P has grown by 1e12,
+    such a mode is unstable and has taken over; the iteration then runs on the controllable part alone.
     """
     try:
         start, taken = _leap(A, B, Q, R, M, most)
@@ -262,9 +261,7 @@ def _leap(
     """Return P after so many steps of the difference equation, a power of two below `most`, by doubling.
 
     P = Q + H after n steps, and after 2n with
-
         H + ΦᵀH(I + GH)⁻¹Φ,   G + Φ(I + GH)⁻¹GΦᵀ,   Φ(I + GH)⁻¹Φ,
-
     from H = P_1 − Q, G = BS⁻¹Bᵀ, Φ = A − BK of the first step: R itself may be singular. It ends where K rests, or
     before Φ, the closed loop of n steps, is so large that rounding would show.
 

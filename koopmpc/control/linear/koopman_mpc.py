@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import numbers
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits, admitted
@@ -205,7 +206,7 @@ class KoopmanMPC(MPCBase):
         start = perf_counter()
         origin = self._initial
         origin.take(y, self._given, applied, w)
-        target = checks.numbers(reference, "reference")
+        target = numbers(reference, "reference")
         key = target.tobytes()
         if key != self._reference_key:
             self._aim(target)
@@ -243,7 +244,7 @@ class KoopmanMPC(MPCBase):
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._qps.cool()
         self._take(t)
-        return self._move(t[: self._nu].copy(), Status.UNCONSTRAINED, 0, start)
+        return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
 
     def _take(self, t: Float[np.ndarray, " nt"]) -> None:
         """Make t the plan; the array of the plan before it is free for the next step."""

@@ -82,16 +82,9 @@ class QPSolution:
 
 
 class QPSolver(ABC):
-    """A QP set up once in a solver: its limits move from solve to solve, P, q and A now and then.
+    """A QP set up once in a solver with its own `settings`: limits move from solve to solve, P, q and A now and then.
 
     Copies go on from the last limits. Limits are checked here, for solvers take what is short, strided or NaN.
-
-    Parameters
-    ----------
-    qp
-        The problem.
-    settings
-        The solver's own settings.
     """
 
     goes_on: ClassVar[bool]
