@@ -105,6 +105,25 @@ def weight(value: ArrayLike, name: str, size: int | None = None, *, definite: bo
     return result
 
 
+def names(given: Sequence[str] | None, what: str, letter: str, size: int) -> tuple[str, ...]:
+    """Return `size` names: those given, or ``x0, x1, …`` with this letter.
+
+    Raises
+    ------
+    DataError
+        A single text is given.
+    ShapeError
+        There are more or fewer names.
+    """
+    if given is None:
+        return tuple(f"{letter}{i}" for i in range(size))
+    if isinstance(given, str):
+        raise DataError(f"{what} is {given!r}; pass a tuple of names")
+    if len(given) != size:
+        raise ShapeError(f"{what} has {len(given)} names, expected {size}; give one name each: got {tuple(given)}")
+    return tuple(given)
+
+
 def positive(value: float, name: str, unit: str = "") -> float:
     """Return `value` as a finite float above zero."""
     number = float(array(value, name, ()))

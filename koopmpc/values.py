@@ -63,6 +63,26 @@ class Value:
         return self
 
 
+class Named:
+    """What has named states and inputs, and so knows how many there are."""
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(cast("Any", self).states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(cast("Any", self).inputs)
+
+
+def freeze(value: object, **fields: object) -> None:
+    """Set fields of a frozen dataclass; only its own constructor does so."""
+    for name, field in fields.items():
+        object.__setattr__(value, name, field)
+
+
 def same(a: Any, b: Any) -> bool:
     """Return whether two trees of values are equal to the bit."""
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):

@@ -58,6 +58,7 @@ for suffix in (".npz", ".parquet", ".csv"):
     assert list(data.states) == told["states"] and data.dt == told["dt"]
     assert data == km.load_episodes(folder / "episodes.npz")
     wind = km.load_episodes(folder / ("wind" + suffix))
+    assert len(km.load_episodes(folder / "mpc.rrd")[0]) == 30
     assert wind.disturbances == ("wind [N]",) and wind[0].W.tolist() == [[0.1]] * 3
 """
 

@@ -14,7 +14,7 @@ from koopmpc.data.excitation import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.simulated import Plant, require_plant
 from koopmpc.plants.step_map import StepMap
-from koopmpc.values import Value
+from koopmpc.values import Value, freeze
 
 # u = function(k, y, rng): a user's own excitation
 InputFunction = Callable[[int, Float[np.ndarray, " ny"], np.random.Generator], ArrayLike]
@@ -29,8 +29,7 @@ class Uniform(Value):
 
     def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
         lows = np.atleast_1d(checks.array(low, "low"))
-        object.__setattr__(self, "low", checks.array(lows, "low", (None,)))
-        object.__setattr__(self, "high", checks.vector(high, "high", len(lows)))
+        freeze(self, low=checks.array(lows, "low", (None,)), high=checks.vector(high, "high", len(lows)))
         checks.crossed(self.low, self.high, "initial state")
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count nx"]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.values import Value
+from koopmpc.values import Named, Value, freeze
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -54,9 +54,7 @@ class Episode(Value):
         disturbances = np.empty((len(inputs), 0)) if W is None else checks.array(W, "W", (None, None))
         if len(disturbances) != len(inputs):
             raise ShapeError(f"W has {len(disturbances)} rows and U {len(inputs)}; both have one a step")
-        object.__setattr__(self, "U", inputs)
-        object.__setattr__(self, "X", states)
-        object.__setattr__(self, "W", disturbances)
+        freeze(self, U=inputs, X=states, W=disturbances)
 
     def __len__(self) -> int:
         """Return the number of steps T."""
@@ -77,7 +75,7 @@ class Snapshots(Value):
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Episodes(Value):
+class Episodes(Named, Value):
     """Episodes of one plant at one sample time; a sequence of `Episode`.
 
     Parameters
@@ -138,25 +136,18 @@ class Episodes(Value):
                     f"episode {i} has {episode.W.shape[1]} measured disturbances, episode 0 has {nw}; "
                     "measure the same ones throughout"
                 )
-        object.__setattr__(self, "episodes", tuple(episodes))
-        object.__setattr__(self, "dt", checks.positive(dt, "dt", "s"))
-        object.__setattr__(self, "states", _names(states, "states", "x", nx))
-        object.__setattr__(self, "inputs", _names(inputs, "inputs", "u", nu))
-        object.__setattr__(self, "disturbances", _names(disturbances, "disturbances", "w", nw))
+        freeze(
+            self,
+            episodes=tuple(episodes),
+            dt=checks.positive(dt, "dt", "s"),
+            states=checks.names(states, "states", "x", nx),
+            inputs=checks.names(inputs, "inputs", "u", nu),
+            disturbances=checks.names(disturbances, "disturbances", "w", nw),
+        )
         names = self.states + self.inputs + self.disturbances
         repeated = [name for name, n in Counter(names).items() if n > 1]
         if repeated:
             raise DataError(f"two states or inputs are named {repeated[0]!r}; rename one")
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return len(self.states)
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
 
     @property
     def nw(self) -> int:
@@ -175,20 +166,12 @@ class Episodes(Value):
     @overload
     def __getitem__(self, index: slice) -> "Episodes": ...
     def __getitem__(self, index: int | slice) -> "Episode | Episodes":
-        return self._of(self.episodes[index]) if isinstance(index, slice) else self.episodes[index]
+        return self.with_episodes(self.episodes[index]) if isinstance(index, slice) else self.episodes[index]
 
     def __add__(self, other: "Episodes") -> "Episodes":
         """Return both sets as one; they must agree in dt and in names."""
-        if self.dt != other.dt:
-            raise DataError(f"the episodes have unequal dt: {self.dt!r} s and {other.dt!r} s; resample one of them")
-        for mine, theirs, what in (
-            (self.states, other.states, "states"),
-            (self.inputs, other.inputs, "inputs"),
-            (self.disturbances, other.disturbances, "disturbances"),
-        ):
-            if mine != theirs:
-                raise DataError(f"the episodes differ in {what}: {', '.join(mine)} and {', '.join(theirs)}; rename one")
-        return self._of(self.episodes + other.episodes)
+        PlantSignature.of(self, "the first set").check(other, "the second set", tolerance=0.0)
+        return self.with_episodes(self.episodes + other.episodes)
 
     def snapshots(self) -> Snapshots:
         """Return all rows (x_k, u_k, x_{k+1}); none pairs the end of an episode with the start of another."""
@@ -224,15 +207,16 @@ class Episodes(Value):
         order = checks.generator(rng).permutation(total)
         train: list[int] = np.sort(order[:count]).tolist()
         held_out: list[int] = np.sort(order[count:]).tolist()
-        return self._of([self.episodes[i] for i in train]), self._of([self.episodes[i] for i in held_out])
+        first, second = ([self.episodes[i] for i in side] for side in (train, held_out))
+        return self.with_episodes(first), self.with_episodes(second)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write a .npz or .parquet file, its folders made, which `load_episodes` reads back to the bit.
+        """Write a .npz, .parquet or .csv file, its folders made, which `load_episodes` reads back to the bit.
 
         Raises
         ------
         DataError
-            The suffix is another, or a .parquet column would be named twice.
+            The suffix is another, or a state is named like a column that .parquet and .csv files add.
         LogError
             The path cannot be written.
         """
@@ -240,18 +224,9 @@ class Episodes(Value):
 
         save_episodes(self, path)
 
-    def _of(self, episodes: Sequence[Episode]) -> "Episodes":
+    def with_episodes(self, episodes: Sequence[Episode]) -> "Episodes":
+        """Return other episodes of the same plant: dt and all names are those of this set."""
         return Episodes(episodes, self.dt, self.states, self.inputs, self.disturbances)
-
-
-def _names(names: Sequence[str] | None, what: str, letter: str, count: int) -> tuple[str, ...]:
-    if names is None:
-        return tuple(f"{letter}{i}" for i in range(count))
-    if isinstance(names, str):
-        raise DataError(f"{what} is {names!r}; pass a tuple of names")
-    if len(names) != count:
-        raise ShapeError(f"{what} has {len(names)} names and the data {count} columns; give one name each")
-    return tuple(names)
 
 
 def episodes_of(given: object) -> Episodes:
@@ -269,12 +244,12 @@ def episodes_of(given: object) -> Episodes:
     )
 
 
-_CLOSE = 1e-6  # relative; clocks that wrote the files round
+_CLOSE = 1e-6  # relative; the clocks that wrote the files round
 
 
 @dataclass(frozen=True)
-class About:
-    """What the first set says: its sample time [s] and names, and where it is from."""
+class PlantSignature:
+    """What all sets of episodes of one plant share: sample time [s] and names. `place` says where they are from."""
 
     dt: float
     states: tuple[str, ...]
@@ -282,21 +257,23 @@ class About:
     disturbances: tuple[str, ...]
     place: str
 
-    def check(self, episodes: Episodes, place: str) -> None:
-        """Raise where the episodes at `place` are not of the same plant.
+    @classmethod
+    def of(cls, episodes: Episodes, place: str) -> "PlantSignature":
+        """Return the signature of the episodes that stand at `place`."""
+        return cls(episodes.dt, episodes.states, episodes.inputs, episodes.disturbances, place)
+
+    def check(self, episodes: Episodes, place: str, tolerance: float = _CLOSE) -> None:
+        """Raise where the episodes at `place` are of another plant.
 
         Raises
         ------
         DataError
-            They differ in dt or in names.
+            They differ in dt by more than the relative `tolerance`, or in names.
         """
-        if not isclose(self.dt, episodes.dt, rel_tol=_CLOSE):
+        if not isclose(self.dt, episodes.dt, rel_tol=tolerance):
             raise DataError(f"{place} has dt = {episodes.dt!r} s, {self.place} has {self.dt!r} s; resample one of them")
-        for mine, theirs, what in (
-            (self.states, episodes.states, "states"),
-            (self.inputs, episodes.inputs, "inputs"),
-            (self.disturbances, episodes.disturbances, "disturbances"),
-        ):
+        for what in ("states", "inputs", "disturbances"):
+            mine, theirs = getattr(self, what), getattr(episodes, what)
             if mine != theirs:
                 raise DataError(
                     f"{place} names the {what} {_listed(theirs)}, {self.place} {_listed(mine)}; "
@@ -304,18 +281,9 @@ class About:
                 )
 
 
-def about(episodes: Episodes, place: str) -> About:
-    """Return what the episodes at `place` say."""
-    return About(episodes.dt, episodes.states, episodes.inputs, episodes.disturbances, place)
-
-
 def joined(sets: Sequence[Episodes]) -> Episodes:
-    """Return sets of one plant as one, dt and names those of the first."""
-    first = sets[0]
-    if len(sets) == 1:
-        return first
-    every = [episode for one in sets for episode in one]
-    return Episodes(every, first.dt, first.states, first.inputs, first.disturbances)
+    """Return sets of one plant as one set, with the sample time and the names of the first."""
+    return sets[0] if len(sets) == 1 else sets[0].with_episodes([episode for one in sets for episode in one])
 
 
 def _listed(names: tuple[str, ...]) -> str:

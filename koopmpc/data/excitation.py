@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.values import Value
+from koopmpc.values import Value, freeze
 
 Policy = Callable[[int, Float[np.ndarray, " ny"]], Float[np.ndarray, " nu"]]
 
@@ -42,57 +42,30 @@ class OpenLoop(Excitation):
         return lambda k, _: U[k]
 
 
-# Feedback taps of a primitive polynomial for each order (Golomb, Shift Register Sequences, 1967).
-_TAPS = {
-    3: (3, 2),
-    4: (4, 3),
-    5: (5, 3),
-    6: (6, 5),
-    7: (7, 6),
-    8: (8, 6, 5, 4),
-    9: (9, 5),
-    10: (10, 7),
-    11: (11, 9),
-    12: (12, 6, 4, 1),
-    13: (13, 4, 3, 1),
-    14: (14, 5, 3, 1),
-    15: (15, 14),
-    16: (16, 15, 13, 4),
-}
-ORDERS = tuple(_TAPS)
-
-
-@lru_cache
-def maximal_length(order: int) -> Bool[np.ndarray, " period"]:
-    """Return one period b_k = b_{k−t₁} ⊕ b_{k−t₂} ⊕ …, of 2^order − 1 bits, read-only.
-
-    Its ones exceed its zeros by one and its periodic autocorrelation is −1 off zero (levels ±1): the spectrum
-    is flat but for the mean.
-    """
-    period = 2**order - 1
-    bits = [True] * order
-    for k in range(order, period):
-        bits.append(sum(bits[k - tap] for tap in _TAPS[order]) % 2 == 1)
-    sequence = np.array(bits)
-    sequence.flags.writeable = False
-    return sequence
-
-
 @dataclass(frozen=True, eq=False, init=False)
-class Noise(OpenLoop):
-    """u uniform between `low` and `high`, drawn anew every `hold` steps."""
+class Levels(OpenLoop):
+    """Inputs between `low` and `high`, (nu,) each, that change every `hold` steps."""
 
     low: Float[np.ndarray, " nu"]
     high: Float[np.ndarray, " nu"]
     hold: int
 
     def __init__(self, low: ArrayLike, high: ArrayLike, hold: int = 1) -> None:
-        _freeze_levels(self, low, high, hold)
+        lows, highs = _inputs(low, "low"), _inputs(high, "high")
+        nu = max(len(lows), len(highs))
+        lows = checks.vector(lows[0] if len(lows) == 1 else lows, "low", nu)
+        highs = checks.vector(highs[0] if len(highs) == 1 else highs, "high", nu)
+        checks.crossed(lows, highs, "excitation")
+        freeze(self, low=lows, high=highs, hold=checks.count(hold, "hold"))
 
     @property
     def nu(self) -> int:
         """Number of inputs."""
         return len(self.low)
+
+
+class Noise(Levels):
+    """u uniform between `low` and `high`, drawn anew every `hold` steps."""
 
     def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
         """Return the draws, each held."""
@@ -100,8 +73,25 @@ class Noise(OpenLoop):
         return np.repeat(draws, self.hold, axis=0)[:steps]
 
 
+ORDERS = range(3, 17)
+
+
+@lru_cache
+def maximal_length(order: int) -> Bool[np.ndarray, " period"]:
+    """Return one period of a maximal-length sequence, 2^order − 1 bits, read-only.
+
+    Its ones exceed its zeros by one and its periodic autocorrelation is −1 off zero (levels ±1): the spectrum
+    is flat but for the mean.
+    """
+    from scipy.signal import max_len_seq  # imported here, for scipy.signal takes a quarter of a second
+
+    sequence = max_len_seq(order)[0].astype(bool)
+    sequence.flags.writeable = False
+    return sequence
+
+
 @dataclass(frozen=True, eq=False, init=False)
-class PRBS(OpenLoop):
+class PRBS(Levels):
     """u switches between `low` and `high` as a maximal-length shift register does, with a flat spectrum.
 
     Parameters
@@ -115,21 +105,13 @@ class PRBS(OpenLoop):
         the inputs run nu-th parts of the period apart, so that they are hardly correlated.
     """
 
-    low: Float[np.ndarray, " nu"]
-    high: Float[np.ndarray, " nu"]
-    hold: int
     order: int
 
     def __init__(self, low: ArrayLike, high: ArrayLike, hold: int = 1, order: int = 10) -> None:
-        _freeze_levels(self, low, high, hold)
+        super().__init__(low, high, hold)
         if order not in ORDERS:
             raise DataError(f"order is {order}; choose {ORDERS[0]} … {ORDERS[-1]}")
-        object.__setattr__(self, "order", order)
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return len(self.low)
+        freeze(self, order=order)
 
     def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
         """Return the two levels from a random bit on."""
@@ -164,10 +146,14 @@ class Multisine(OpenLoop):
         self, amplitude: ArrayLike, period: float, harmonics: int | Sequence[int], offset: ArrayLike = 0.0
     ) -> None:
         chosen = range(1, checks.count(harmonics, "harmonics") + 1) if isinstance(harmonics, int) else harmonics
-        object.__setattr__(self, "amplitude", _inputs(amplitude, "amplitude"))
-        object.__setattr__(self, "period", checks.positive(period, "period", "s"))
-        object.__setattr__(self, "harmonics", tuple(checks.count(j, "harmonic") for j in chosen))
-        object.__setattr__(self, "offset", checks.vector(offset, "offset", self.nu))
+        size = _inputs(amplitude, "amplitude")
+        freeze(
+            self,
+            amplitude=size,
+            period=checks.positive(period, "period", "s"),
+            harmonics=tuple(checks.count(j, "harmonic") for j in chosen),
+            offset=checks.vector(offset, "offset", len(size)),
+        )
 
     @property
     def nu(self) -> int:
@@ -212,11 +198,15 @@ class Chirp(OpenLoop):
     offset: Float[np.ndarray, " nu"]
 
     def __init__(self, amplitude: ArrayLike, f0: float, f1: float, duration: float, offset: ArrayLike = 0.0) -> None:
-        object.__setattr__(self, "amplitude", _inputs(amplitude, "amplitude"))
-        object.__setattr__(self, "f0", checks.positive(f0, "f0", "Hz"))
-        object.__setattr__(self, "f1", checks.positive(f1, "f1", "Hz"))
-        object.__setattr__(self, "duration", checks.positive(duration, "duration", "s"))
-        object.__setattr__(self, "offset", checks.vector(offset, "offset", self.nu))
+        size = _inputs(amplitude, "amplitude")
+        freeze(
+            self,
+            amplitude=size,
+            f0=checks.positive(f0, "f0", "Hz"),
+            f1=checks.positive(f1, "f1", "Hz"),
+            duration=checks.positive(duration, "duration", "s"),
+            offset=checks.vector(offset, "offset", len(size)),
+        )
 
     @property
     def nu(self) -> int:
@@ -270,12 +260,15 @@ class Feedback(Excitation):
         gain = checks.array(K, "K", (None, None))
         if noise is not None and noise.nu != len(gain):
             raise ShapeError(f"noise has {noise.nu} inputs and K {len(gain)} rows; pass one level for each input")
-        object.__setattr__(self, "K", gain)
-        object.__setattr__(self, "noise", noise)
-        object.__setattr__(self, "x_ref", checks.vector(x_ref, "x_ref", gain.shape[1]))
-        object.__setattr__(self, "u_ref", checks.vector(u_ref, "u_ref", len(gain)))
-        object.__setattr__(self, "u_min", checks.vector(u_min, "u_min", len(gain), infinite=True))
-        object.__setattr__(self, "u_max", checks.vector(u_max, "u_max", len(gain), infinite=True))
+        freeze(
+            self,
+            K=gain,
+            noise=noise,
+            x_ref=checks.vector(x_ref, "x_ref", gain.shape[1]),
+            u_ref=checks.vector(u_ref, "u_ref", len(gain)),
+            u_min=checks.vector(u_min, "u_min", len(gain), infinite=True),
+            u_max=checks.vector(u_max, "u_max", len(gain), infinite=True),
+        )
         checks.crossed(self.u_min, self.u_max, "u")
 
     @property
@@ -303,14 +296,3 @@ def _inputs(value: ArrayLike, name: str) -> Float[np.ndarray, " nu"]:
     """Return a scalar or a vector as one entry for each input."""
     levels = np.atleast_1d(checks.array(value, name))
     return levels if levels.ndim == 1 else checks.array(levels, name, (None,))
-
-
-def _freeze_levels(excitation: Noise | PRBS, low: ArrayLike, high: ArrayLike, hold: int) -> None:
-    lows, highs = _inputs(low, "low"), _inputs(high, "high")
-    nu = max(len(lows), len(highs))
-    lows = checks.vector(lows[0] if len(lows) == 1 else lows, "low", nu)
-    highs = checks.vector(highs[0] if len(highs) == 1 else highs, "high", nu)
-    checks.crossed(lows, highs, "excitation")
-    object.__setattr__(excitation, "low", lows)
-    object.__setattr__(excitation, "high", highs)
-    object.__setattr__(excitation, "hold", checks.count(hold, "hold"))

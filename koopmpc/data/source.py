@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import cast
 
-from koopmpc.data.episodes import Episodes, about, joined
+from koopmpc.data.episodes import Episodes, PlantSignature, joined
 from koopmpc.errors import DataError
+from koopmpc.values import Named
 
 Change = Callable[[Episodes], Episodes]
 
@@ -20,7 +21,7 @@ class Part(ABC):
         """Return its episodes; where it pickles, in another process too."""
 
 
-class Source(ABC):
+class Source(Named, ABC):
     """Episodes of one plant at one sample time, in an ordered sequence of parts.
 
     The source alone fixes its parts: whoever reads them, wherever, sees the same episodes in the same order.
@@ -59,16 +60,6 @@ class Source(ABC):
         history
             Where a part begins inside an episode, it begins this many rows earlier: an embedding needs them.
         """
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return len(self.states)
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
 
     @property
     def nw(self) -> int:
@@ -205,7 +196,7 @@ class Stream(Source):
         first = next(again, None)
         if first is None:
             raise DataError("the stream is empty; it must give at least one set of Episodes")
-        self._about = about(_set(first, "set 0 of the stream"), "set 0")
+        self._plant = PlantSignature.of(_set(first, "set 0 of the stream"), "set 0")
         self._sets = sets if replayable else chain([first], again)
         self._read = False
         super().__init__(first.dt, first.states, first.inputs, first.disturbances, replayable=replayable)
@@ -225,7 +216,7 @@ class Stream(Source):
         start, size = 0, 0
         for i, one in enumerate(self._sets):
             place = f"set {i} of the stream"
-            self._about.check(_set(one, place), place)
+            self._plant.check(_set(one, place), place)
             own = sum(e.X.nbytes + e.U.nbytes + e.W.nbytes for e in one)
             if held and size + own > _PART:
                 yield Loaded(joined(held), _place(start, len(held)))

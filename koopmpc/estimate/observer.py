@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from koopmpc.data.delay import Delay
 from koopmpc.errors import ObservableError
 from koopmpc.lifting.base import Lifting, short
-from koopmpc.lifting.state import Constant
 from koopmpc.predict.predictors import LinearPredictor
 
 
@@ -162,9 +161,7 @@ class Estimator(Protocol):
 
 def constant_index(predictor: LinearPredictor) -> int | None:
     """Return where the lifting holds the Constant, which is known; None where it does not."""
-    name = Constant().bind(predictor.states).names[0]
-    names = predictor.lifting.names
-    return names.index(name) if name in names else None
+    return predictor.lifting.constant_index
 
 
 def places(lifting: Lifting, names: tuple[str, ...]) -> list[int]:

@@ -81,8 +81,8 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     )
     return Divided(
         rest,
-        _like(judged, _long(list(seen), ahead + PAST)),
-        _like(judged, held_out),
+        judged.with_episodes(_long(list(seen), ahead + PAST)),
+        judged.with_episodes(held_out),
         ahead,
         told,
         (*repair.notes, note),
@@ -116,18 +116,14 @@ def _in_memory(
     order = [int((i + 0.5) * len(long) / count) for i in range(count)]
     drawn = order if notes else [int(i) for i in rng.permutation(len(long))[:count]]
     out = {long[i] for i in drawn}
-    train = _like(episodes, [episode for i, episode in enumerate(whole) if i not in out])
-    seen, _ = sampled(Held(_like(episodes, _long(list(train), needed))), _JUDGED)
-    held_out, _ = sampled(Held(_like(episodes, [whole[i] for i in sorted(out)])), _JUDGED)
-    return Divided(train, _like(episodes, _long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes))
+    train = episodes.with_episodes([episode for i, episode in enumerate(whole) if i not in out])
+    seen, _ = sampled(Held(episodes.with_episodes(_long(list(train), needed))), _JUDGED)
+    held_out, _ = sampled(Held(episodes.with_episodes([whole[i] for i in sorted(out)])), _JUDGED)
+    return Divided(train, episodes.with_episodes(_long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes))
 
 
 def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:
     return [episode for episode in episodes if len(episode) >= needed]
-
-
-def _like(given: Episodes, episodes: Sequence[Episode]) -> Episodes:
-    return Episodes(episodes, given.dt, given.states, given.inputs, given.disturbances)
 
 
 def _too_short(episodes: int, horizon: int) -> str:

@@ -9,8 +9,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.lifting.base import Indices, Lifting, short
-from koopmpc.lifting.state import Constant
+from koopmpc.lifting.base import CONSTANT, Indices, Lifting, short
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +53,6 @@ class Sum(Lifting):
         return tuple(new)
 
 
-_ONE = Constant().bind(()).names[0]
-
-
 @dataclass(frozen=True, eq=False)
 class Product(Lifting):
     """ψ(x) = aᵢ(x) bⱼ(x) for every i and j; written ``a * b``.
@@ -93,9 +89,9 @@ class Product(Lifting):
     @cached_property
     def _pairs(self) -> dict[str, tuple[int, int]]:
         """Indices of the two factors by the name of their product; of those with one name the first."""
-        plain = [short(state) for state in self._states]
-        names = plain if len(set(plain)) == len(plain) else list(self._states)
-        order = {state: (i, name) for i, (state, name) in enumerate(zip(self._states, names, strict=True))}
+        plain = [short(state) for state in self.bound_states]
+        names = plain if len(set(plain)) == len(plain) else list(self.bound_states)
+        order = {state: (i, name) for i, (state, name) in enumerate(zip(self.bound_states, names, strict=True))}
         found: dict[str, tuple[int, int]] = {}
         for i, left in enumerate(self.first.names):
             for j, right in enumerate(self.second.names):
@@ -105,8 +101,8 @@ class Product(Lifting):
 
 def _name(left: str, right: str, states: dict[str, tuple[int, str]]) -> str:
     """Return the name of the product; `states` gives the place and the plain name of each state."""
-    if _ONE in (left, right):
-        return right if left == _ONE else left
+    if CONSTANT in (left, right):
+        return right if left == CONSTANT else left
     pair = sorted((left, right), key=lambda name: (name not in states, states.get(name, (0, ""))[0], name))
     a, b = (states[name][1] if name in states else name for name in pair)
     if left == right:

@@ -22,6 +22,7 @@ from koopmpc.plants.graph import Graph
 from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
+CONSTANT = "1"  # the name of the observable that is always 1
 _BLOCK = 1024  # rows evaluated at once, about: a block of observables stays in the cache
 
 
@@ -63,7 +64,7 @@ class Lifting(Value, ABC):
         return bound
 
     @property
-    def _states(self) -> tuple[str, ...]:
+    def bound_states(self) -> tuple[str, ...]:
         """Names of the states that the lifting is bound to."""
         if self.bound is None:
             raise DataError(
@@ -81,6 +82,11 @@ class Lifting(Value, ABC):
         """Names of the observables, each once."""
         return self._names
 
+    @cached_property
+    def constant_index(self) -> int | None:
+        """Index of the observable ``"1"``, which is always 1; None where the lifting holds no `Constant`."""
+        return self.names.index(CONSTANT) if CONSTANT in self.names else None
+
     def __call__(self, X: ArrayLike) -> Float[np.ndarray, "..."]:
         """Return Z = ψ(X), row by row.
 
@@ -95,17 +101,17 @@ class Lifting(Value, ABC):
             Observables, (M, nz) or (nz,).
         """
         rows = checks.array(X, "x", finite=False)
-        nx = len(self._states)
+        nx = len(self.bound_states)
         if rows.ndim not in (1, 2) or rows.shape[-1] != nx:
             raise ShapeError(self._misfit(rows.shape[-1] if rows.ndim in (1, 2) else rows.shape))
         table = rows.reshape(-1, nx)
         Z = np.empty((len(table), self.nz))
-        self._lift(table, Z)
+        self.lift_into(table, Z)
         return Z if rows.ndim == 2 else Z[0]
 
     def symbolic(self, x: ca.SX) -> ca.SX:
         """Return ψ(x), (nz, 1), for a symbolic column x, (nx, 1)."""
-        if x.shape != (len(self._states), 1):
+        if x.shape != (len(self.bound_states), 1):
             raise ShapeError(self._misfit(x.shape[0] if x.shape[1] == 1 else x.shape))
         z = self.formula(x)
         if z.shape != (self.nz, 1):
@@ -138,10 +144,10 @@ class Lifting(Value, ABC):
         """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
         if Value._kinds.get(type(self).__name__) is type(self):
             return self
-        return Traced(self._graph, self.names, bound=self._states)
+        return Traced(self._graph, self.names, bound=self.bound_states)
 
-    def _lift(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
-        """Write ψ of the rows of X into the rows of Z, a block at a time."""
+    def lift_into(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
+        """Write ψ of the rows of X into the rows of Z, a block at a time; nothing is checked."""
         rows = -(-len(X) // max(round(len(X) / _BLOCK), 1))
         for first in range(0, len(X), max(rows, 1)):
             block = slice(first, first + rows)
@@ -153,16 +159,16 @@ class Lifting(Value, ABC):
 
     @cached_property
     def _graph(self) -> Graph:
-        x = ca.SX.sym("x", len(self._states))
+        x = ca.SX.sym("x", len(self.bound_states))
         return Graph.trace(ca.Function("lifting", [x], [self.symbolic(x)]))
 
     @cached_property
     def _names(self) -> tuple[str, ...]:
-        for names, what in ((self._states, "states"), (self.observables(self._states), "observables")):
+        for names, what in ((self.bound_states, "states"), (self.observables(self.bound_states), "observables")):
             repeated = [name for name, n in Counter(names).items() if n > 1]
             if repeated:
                 raise DataError(f"{type(self).__name__}: two {what} are named {repeated[0]!r}; rename one")
-        return self.observables(self._states)
+        return self.observables(self.bound_states)
 
     def _common(self, other: "Lifting") -> tuple[str, ...] | None:
         """Return the states that one of the two is bound to, None where neither is."""
@@ -172,7 +178,7 @@ class Lifting(Value, ABC):
 
     def _misfit(self, got: object) -> str:
         what = f"has {got} states" if isinstance(got, int) else f"has shape {got}"
-        return f"x {what}, the lifting was bound to {len(self._states)} ({', '.join(self._states)})"
+        return f"x {what}, the lifting was bound to {len(self.bound_states)} ({', '.join(self.bound_states)})"
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import casadi as ca
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, Traced
 from koopmpc.plants.graph import Graph
-from koopmpc.values import Value
+from koopmpc.values import Value, freeze
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -27,9 +27,7 @@ class Expressions(Lifting):
     labels: tuple[str, ...]
 
     def __init__(self, fn: Callable[[ca.SX], Sequence[ca.SX]], names: Sequence[str]) -> None:
-        object.__setattr__(self, "fn", fn)
-        object.__setattr__(self, "labels", (names,) if isinstance(names, str) else tuple(names))
-        object.__setattr__(self, "bound", None)
+        freeze(self, fn=fn, labels=(names,) if isinstance(names, str) else tuple(names), bound=None)
 
     def bind(self, states: Sequence[str]) -> Traced:
         """Return the traced list of operations, which needs `fn` no more."""

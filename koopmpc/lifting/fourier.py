@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.lifting.base import Chosen, Lifting, frozen, indices, short
+from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +28,7 @@ class Fourier(Lifting):
     states: Chosen | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "harmonics", checks.count(self.harmonics, "harmonics"))
-        object.__setattr__(self, "states", frozen(self.states))
+        freeze(self, harmonics=checks.count(self.harmonics, "harmonics"), states=frozen(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"sin(theta)"`` and ``"cos(2 theta)"``."""
@@ -55,4 +55,4 @@ class Fourier(Lifting):
 
     @cached_property
     def _chosen(self) -> list[int]:
-        return indices(self.states, self._states, "Fourier")
+        return indices(self.states, self.bound_states, "Fourier")

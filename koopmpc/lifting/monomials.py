@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.lifting.base import Lifting, short
+from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +24,7 @@ class Monomials(Lifting):
     degree: int
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "degree", checks.count(self.degree, "degree", 2))
+        freeze(self, degree=checks.count(self.degree, "degree", 2))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"theta^2*omega"``."""
@@ -48,7 +49,7 @@ class Monomials(Lifting):
 
     @cached_property
     def _all(self) -> list[tuple[int, ...]]:
-        return _factors(len(self._states), self.degree)
+        return _factors(len(self.bound_states), self.degree)
 
 
 def _factors(nx: int, degree: int) -> list[tuple[int, ...]]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
+from koopmpc.values import freeze
 
 _CANCELS = 1e-3  # share of ‖x‖² + ‖c‖² below which a distance squared has lost three digits
 
@@ -83,9 +84,7 @@ class Gaussian(Lifting):
     width: float
 
     def __init__(self, centers: ArrayLike, width: float, *, bound: tuple[str, ...] | None = None) -> None:
-        object.__setattr__(self, "centers", checked_centers(centers))
-        object.__setattr__(self, "width", checks.positive(width, "width"))
-        object.__setattr__(self, "bound", bound)
+        freeze(self, centers=checked_centers(centers), width=checks.positive(width, "width"), bound=bound)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"gaussian(0.5, -1; 0.3)"``, which hold the centre and the width."""
@@ -121,8 +120,7 @@ class ThinPlate(Lifting):
     centers: Float[np.ndarray, "nc nx"]
 
     def __init__(self, centers: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
-        object.__setattr__(self, "centers", checked_centers(centers))
-        object.__setattr__(self, "bound", bound)
+        freeze(self, centers=checked_centers(centers), bound=bound)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"thinplate(0.5, -1)"``, which hold the centre."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
+from koopmpc.values import freeze
 
 _SEEDS = 2**32
 
@@ -62,15 +63,15 @@ class RandomFourier(Lifting):
             raise DataError("frequencies and phases belong together; pass both or none")
         if drawn is not None and bound is not None and drawn.shape[1] != len(bound):
             raise ShapeError(f"frequencies has {drawn.shape[1]} columns and there are {len(bound)} states")
-        for name, value in {
-            "count": n,
-            "width": checks.positive(width, "width"),
-            "rng": seed,
-            "frequencies": drawn,
-            "phases": turned,
-            "bound": bound,
-        }.items():
-            object.__setattr__(self, name, value)
+        freeze(
+            self,
+            count=n,
+            width=checks.positive(width, "width"),
+            rng=seed,
+            frequencies=drawn,
+            phases=turned,
+            bound=bound,
+        )
 
     def bind(self, states: Sequence[str]) -> "RandomFourier":
         """Return the copy with its frequencies and phases: the same seed draws the same ones."""

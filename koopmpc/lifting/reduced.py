@@ -10,6 +10,7 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
+from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +34,7 @@ class Projected(Lifting):
     basis: Float[np.ndarray, "nz r"]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "basis", checks.array(self.basis, "basis", (None, None)))
+        freeze(self, basis=checks.array(self.basis, "basis", (None, None)))
 
     def bind(self, states: Sequence[str]) -> "Projected":
         """Return the copy on the bound lifting."""
@@ -80,7 +81,7 @@ class Picked(Lifting):
     which: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "which", tuple(int(i) for i in self.which))
+        freeze(self, which=tuple(int(i) for i in self.which))
 
     def bind(self, states: Sequence[str]) -> "Picked":
         """Return the copy on the bound lifting."""

@@ -13,10 +13,8 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting, lifting_of
-from koopmpc.lifting.state import Constant
-
-_ONE = Constant().bind(()).names[0]
+from koopmpc.lifting.base import CONSTANT, Lifting, lifting_of
+from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -53,10 +51,7 @@ class Standardized(Lifting):
         spread = checks.array(scale, "scale", center.shape)
         if (spread <= 0).any():
             raise DataError(f"scale holds {spread.min():g}; it must be above zero for every state")
-        object.__setattr__(self, "lifting", lifting_of(lifting))
-        object.__setattr__(self, "mean", center)
-        object.__setattr__(self, "scale", spread)
-        object.__setattr__(self, "bound", bound)
+        freeze(self, lifting=lifting_of(lifting), mean=center, scale=spread, bound=bound)
 
     @classmethod
     def of(cls, episodes: Episodes | Source, lifting: Lifting) -> "Standardized":
@@ -99,7 +94,7 @@ class Standardized(Lifting):
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the inner names with ``~`` and a sum over mean and scale: other numbers are other observables."""
         tag = f"~{crc32(self.mean.tobytes() + self.scale.tobytes()):08x}"
-        return tuple(name if name == _ONE else name + tag for name in self.lifting.bind(states).names)
+        return tuple(name if name == CONSTANT else name + tag for name in self.lifting.bind(states).names)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the inner formula of the standardized states."""

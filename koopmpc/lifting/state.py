@@ -7,7 +7,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.lifting.base import Chosen, Lifting, frozen, indices
+from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, frozen, indices
+from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +24,7 @@ class State(Lifting):
     states: Chosen | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "states", frozen(self.states))
+        freeze(self, states=frozen(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the chosen states."""
@@ -33,8 +34,9 @@ class State(Lifting):
         """Return the chosen states."""
         return x if self.whole else x[self.chosen]
 
-    def _lift(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
-        Z[:] = X if self.whole else X[:, self.chosen]  # no need to turn the rows into columns
+    def lift_into(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
+        """Write the chosen states of the rows of X; rows need not be turned into columns for it."""
+        Z[:] = X if self.whole else X[:, self.chosen]
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         Z[:] = (x if self.whole else x[self.chosen]).T
@@ -47,7 +49,7 @@ class State(Lifting):
     @cached_property
     def chosen(self) -> list[int]:
         """Indices of the chosen states, once bound."""
-        return indices(self.states, self._states, "State")
+        return indices(self.states, self.bound_states, "State")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class Constant(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the one name."""
-        return ("1",)
+        return (CONSTANT,)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return 1."""

@@ -127,8 +127,7 @@ class Prediction:
 def centred(episodes: Episodes, x_ref: ArrayLike) -> Episodes:
     """Return the same episodes in the coordinates x − x_ref."""
     target = checks.vector(x_ref, "x_ref", episodes.nx)
-    moved = [Episode(X=e.X - target, U=e.U) for e in episodes]
-    return Episodes(moved, episodes.dt, episodes.states, episodes.inputs)
+    return episodes.with_episodes([Episode(X=e.X - target, U=e.U, W=e.W) for e in episodes])
 
 
 def prediction(

@@ -6,9 +6,10 @@ from typing import ClassVar, cast
 import casadi as ca
 
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import Named
 
 
-class Dynamics(ABC):
+class Dynamics(Named, ABC):
     """A plant ẋ = f(x, u), y = h(x): a frozen dataclass whose fields are the parameters, with units.
 
     `states` and `inputs` name the rows of x and u, unit included: ``("theta [rad]", "omega [rad/s]")``.
@@ -16,16 +17,6 @@ class Dynamics(ABC):
 
     states: ClassVar[tuple[str, ...]]
     inputs: ClassVar[tuple[str, ...]]
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return len(self.states)
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
 
     @abstractmethod
     def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.errors import ShapeError
 from koopmpc.plants.batch import Batch, march, warn_of
 from koopmpc.plants.buffered import Buffered, dense
 from koopmpc.plants.dynamics import Dynamics, output, right_side
 from koopmpc.plants.integrators import RK4, Integrator
-from koopmpc.values import Value
+from koopmpc.values import Named, Value, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Affine(Value):
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class StepMap:
+class StepMap(Named):
     """x⁺ = F(x, u), y = h(x), one sample of dt [s].
 
     Parameters
@@ -74,27 +74,19 @@ class StepMap:
         if h is None:
             x = ca.SX.sym("x", nx)
             h = ca.Function("h", [x], [x], ["x"], ["y"])
-            outputs = states or _names(None, "states", "x", nx) if outputs is None else outputs
+            outputs = checks.names(states, "states", "x", nx) if outputs is None else outputs
         _check_signature(h, "h", 1)
         if h.size1_in(0) != nx:
             raise ShapeError(f"h takes {h.size1_in(0)} states, F has {nx}; pass h of the same x")
-        freeze = object.__setattr__
-        freeze(self, "F", dense(F))
-        freeze(self, "h", dense(h))
-        freeze(self, "dt", checks.positive(dt, "dt", "s"))
-        freeze(self, "states", _names(states, "states", "x", nx))
-        freeze(self, "inputs", _names(inputs, "inputs", "u", nu))
-        freeze(self, "outputs", _names(outputs, "outputs", "y", h.size1_out(0)))
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return len(self.states)
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
+        freeze(
+            self,
+            F=dense(F),
+            h=dense(h),
+            dt=checks.positive(dt, "dt", "s"),
+            states=checks.names(states, "states", "x", nx),
+            inputs=checks.names(inputs, "inputs", "u", nu),
+            outputs=checks.names(outputs, "outputs", "y", h.size1_out(0)),
+        )
 
     @property
     def ny(self) -> int:
@@ -206,13 +198,3 @@ def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
     sizes = [function.size2_in(i) for i in range(arguments) if function.size1_in(i)] + [function.size2_out(0)]
     if any(columns != 1 for columns in sizes):
         raise ShapeError(f"{name} is {function}, expected columns: {name}{wanted} with one column each")
-
-
-def _names(names: Sequence[str] | None, field: str, letter: str, count: int) -> tuple[str, ...]:
-    if names is None:
-        return tuple(f"{letter}{i}" for i in range(count))
-    if isinstance(names, str):
-        raise DataError(f"{field} is {names!r}; pass a tuple of names, one a row")
-    if len(names) != count:
-        raise ShapeError(f"{field} has {len(names)} names, expected {count}, one a row: got {tuple(names)}")
-    return tuple(names)

@@ -150,8 +150,7 @@ def _scores(error: Float[np.ndarray, "folds horizon"]) -> Float[np.ndarray, " fo
 
 def _only(trial: Trial, fold: int) -> Episodes:
     of = trial.episodes
-    kept = [episode for episode, own in zip(of, trial.fold, strict=True) if own == fold]
-    return Episodes(kept, of.dt, of.states, of.inputs, of.disturbances)
+    return of.with_episodes([episode for episode, own in zip(of, trial.fold, strict=True) if own == fold])
 
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:

@@ -138,7 +138,7 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
         for i in rng.permutation(len(long)):
             fold[i] = np.argmin(size)
             size[fold[i]] += lengths[i]
-    kept = Episodes(long, episodes.dt, episodes.states, episodes.inputs, episodes.disturbances)
+    kept = episodes.with_episodes(long)
     if fold.max() == 0:
         raise DataError(f"all {len(long)} episodes fell into one fold; pass more of them, or a shorter horizon")
     return Folds(kept, tuple(fold.tolist()), tuple(notes))
@@ -159,4 +159,4 @@ def _thinned(episodes: Episodes, quota: int) -> Episodes:
     wanted = max(len(episodes) * quota // total, 1)
     kept = [episodes[i] for i in spread(len(episodes), wanted)]
     cut = [e if len(e) <= quota else Episode(X=e.X[: quota + 1], U=e.U[:quota], W=e.W[:quota]) for e in kept]
-    return Episodes(cut, episodes.dt, episodes.states, episodes.inputs, episodes.disturbances)
+    return episodes.with_episodes(cut)

@@ -13,7 +13,6 @@ from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments, both_sides
 from koopmpc.identify.solve import norms, orthonormal, unit
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.state import Constant
 from koopmpc.validate.residuals import moments_of
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
@@ -127,8 +126,8 @@ def explained_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
     """Return what `feedback_share` returns, from the moments, in the order of their inputs."""
     P, _, cut = both_sides(total)
     nz, nu = total.nz, len(total.inputs)
-    one = Constant().bind(total.lifting._states).names[0]
-    constant = [i for i, name in enumerate(total.lifting.names) if name == one]
+    one = total.lifting.constant_index
+    constant = [] if one is None else [one]
     U = P[:, nz : nz + nu]
     around = _outside(U, P[:, constant], cut)
     left = _outside(U, P[:, :nz], cut)

@@ -77,7 +77,7 @@ def test_messages():
         ),
         (
             km.errors.ShapeError,
-            r"disturbances has 2 names and the data 1 columns",
+            r"disturbances has 2 names, expected 1; give one name each",
             lambda: km.Episodes([one], 0.1, disturbances=("p", "q")),
         ),
         (km.errors.DataError, r"which dmdc does not fit; use edmd on State\(\)", lambda: km.dmdc(data())),
@@ -89,7 +89,7 @@ def test_messages():
         ),
         (
             km.errors.DataError,
-            r"the episodes differ in disturbances: gust and w0",
+            r"the second set names the disturbances 'w0', the first set 'gust'; rename them",
             lambda: named + km.Episodes([one], 0.1, ("a", "b"), ("u",)),
         ),
         (

@@ -131,7 +131,7 @@ def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> km.Episode:
             "episode 1 has 3 states and 1 inputs, episode 0 has 2 and 1; episodes of one set come from one plant",
         ),
         (lambda: km.Episodes([zeros(4, 3)], -0.1), km.errors.DataError, "dt is -0.1 s; it must be above zero"),
-        (lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a"]), km.errors.ShapeError, "states has 1 names and the data 2 columns"),
+        (lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a"]), km.errors.ShapeError, "states has 1 names, expected 2; give one name each"),
         (lambda: km.Episodes([zeros(4, 3)], 0.1, inputs="u"), km.errors.DataError, "inputs is 'u'; pass a tuple of names"),
         (
             lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a", "b"], inputs=["a"]),
@@ -141,12 +141,12 @@ def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> km.Episode:
         (
             lambda: km.Episodes([zeros(4, 3)], 0.1) + km.Episodes([zeros(4, 3)], 0.2),
             km.errors.DataError,
-            "the episodes have unequal dt: 0.1 s and 0.2 s; resample one of them",
+            "the second set has dt = 0.2 s, the first set has 0.1 s; resample one of them",
         ),
         (
             lambda: km.Episodes([zeros(4, 3)], 0.1) + km.Episodes([zeros(4, 3)], 0.1, states=["a", "b"]),
             km.errors.DataError,
-            "the episodes differ in states: x0, x1 and a, b; rename one",
+            "the second set names the states 'a', 'b', the first set 'x0', 'x1'; rename them, or leave it out",
         ),
     ],
 )  # fmt: skip

@@ -57,8 +57,8 @@ def test_lifted_chunks_hold_the_rows_of_all_pairs() -> None:
 def test_each_chunk_is_lifted_once_where_gram_sums_serve(monkeypatch: pytest.MonkeyPatch) -> None:
     data = random_episodes(0, [3000] * 4, 2, 1)
     lifted: list[int] = []
-    count = km.State._lift
-    monkeypatch.setattr(km.State, "_lift", lambda self, X, Z: (lifted.append(len(X)), count(self, X, Z))[1])
+    count = km.State.lift_into
+    monkeypatch.setattr(km.State, "lift_into", lambda self, X, Z: (lifted.append(len(X)), count(self, X, Z))[1])
     km.edmd(data, km.State())
     assert sum(lifted) <= 12_000 * (1 + 2 / ROWS) + 4
 

@@ -183,7 +183,7 @@ GOOD = ca.Function("F", [x2, u1], [x2])
         (
             lambda: km.StepMap(GOOD, 1.0, states=["a"]),
             km.errors.ShapeError,
-            "states has 1 names, expected 2, one a row",
+            "states has 1 names, expected 2; give one name each",
         ),
         (lambda: km.StepMap(GOOD, 1.0, inputs="ab"), km.errors.DataError, "inputs is 'ab'; pass a tuple of names"),
     ],

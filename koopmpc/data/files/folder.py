@@ -7,23 +7,25 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from koopmpc.data.episodes import About, Episodes, about, joined
-from koopmpc.data.files.npz import RangePart, ranges
+from koopmpc.data.episodes import Episodes, PlantSignature, joined
+from koopmpc.data.files.parquet import RowGroup, row_groups
 from koopmpc.data.files.storage import load_episodes
 from koopmpc.data.source import Part, Source
 from koopmpc.errors import DataError, KoopmpcError, LogError
 
 Reader = Callable[[Path], Episodes]
 SUFFIXES = (".npz", ".parquet", ".csv", ".rrd")
-_PART = 8_000_000  # bytes of a part of several files, or of a range of one
-_LARGE = 32_000_000  # bytes from which a file is cut
+_PART = 8_000_000  # bytes of a part of several files
+_LARGE = 32_000_000  # bytes from which a file is read in groups of rows
 
 
 class Files(Source):
     """The episodes of a folder's .npz, .parquet, .csv and .rrd files, in the order of their names.
 
-    A part is a file, or several small neighbours, or a range of rows of a large .npz file; it is read when its
-    turn comes, and not kept. The first file tells dt and names, and each other must agree.
+    A part is a file, or several small neighbours, or a group of rows of a large .parquet file that `Episodes.save`
+    wrote; it is read when its turn comes, and not kept. All other files are read whole: a .npz of 10 GB needs 10 GB
+    of memory and more, the same episodes as .parquet some 10 MB. The first file tells dt and names, and each other
+    must agree.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ class Files(Source):
         self._plain = reader is None and not reading
         cut = self._cut(self.files[0], 0, None)
         first = cut[0].load() if cut else _read(self.files[0], self._reader)
-        self._about = about(first, str(self.files[0]))
+        self._signature = PlantSignature.of(first, str(self.files[0]))
         super().__init__(first.dt, first.states, first.inputs, first.disturbances)
 
     def parts(self, history: int = 0) -> list[Part]:
@@ -66,9 +68,9 @@ class Files(Source):
         room = _PART
         for file in self.files:
             size = file.stat().st_size
-            cut = self._cut(file, history, self._about)
+            cut = self._cut(file, history, self._signature)
             if group and (cut or size > room):
-                parts.append(FilePart(tuple(group), self._reader, self._about))
+                parts.append(FilePart(tuple(group), self._reader, self._signature))
                 group, room = [], _PART
             if cut:
                 parts += cut
@@ -76,14 +78,14 @@ class Files(Source):
                 group.append(file)
                 room -= size
         if group:
-            parts.append(FilePart(tuple(group), self._reader, self._about))
+            parts.append(FilePart(tuple(group), self._reader, self._signature))
         return parts
 
-    def _cut(self, file: Path, history: int, about: About | None) -> list[RangePart] | None:
-        """Return the parts of a large file that can be read in ranges."""
-        if not self._plain or file.suffix != ".npz" or file.stat().st_size < _LARGE:
+    def _cut(self, file: Path, history: int, plant: PlantSignature | None) -> list[RowGroup] | None:
+        """Return the parts of a large file that can be read in groups of rows."""
+        if not self._plain or file.suffix != ".parquet" or file.stat().st_size < _LARGE:
             return None
-        return ranges(file, _PART, history, about)
+        return row_groups(file, history, plant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +94,7 @@ class FilePart(Part):
 
     files: tuple[Path, ...]
     reader: Reader
-    about: About
+    plant: PlantSignature
 
     def __str__(self) -> str:
         more = len(self.files) - 1
@@ -103,7 +105,7 @@ class FilePart(Part):
         sets: list[Episodes] = []
         for file in self.files:
             sets.append(_read(file, self.reader))
-            self.about.check(sets[-1], str(file))
+            self.plant.check(sets[-1], str(file))
         return joined(sets)
 
 

@@ -1,15 +1,22 @@
 # pyright: basic
-"""The door to pyarrow: episodes as one table, a row a time step, a column a state or an input."""
+"""The door to Parquet: episodes as one table, a row a time step, a column a state or an input, in groups of rows.
+
+A group of rows is read without the rest of the file, so that a fit never holds a large file.
+"""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from koopmpc.data.episodes import Episode, Episodes, PlantSignature
+from koopmpc.data.source import Part
 from koopmpc.errors import DataError, LogError
 
 _KEY = b"koopmpc.episodes"
+_GROUP = 8_000_000  # bytes of a group of rows, about
 ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
 
@@ -38,7 +45,8 @@ def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names
     columns = [pa.array(column) for column in (episode, step, *X.T)]
     columns += [pa.array(column, mask=last) for column in full.T]
     table = pa.table(columns, names=["episode", "step", *names])
-    pq.write_table(table.replace_schema_metadata({_KEY: about.encode()}), file)
+    rows = max(_GROUP // (8 * len(columns)), 1)
+    pq.write_table(table.replace_schema_metadata({_KEY: about.encode()}), file, row_group_size=rows)
 
 
 def described(path: Path) -> bool:
@@ -78,8 +86,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
         It is damaged; its rows were changed.
     """
     table = _table(path)
-    metadata = table.schema.metadata
-    about = metadata[_KEY].decode()
+    about = table.schema.metadata[_KEY].decode()
     named = json.loads(about)
     episode, step = (table[name].to_numpy() for name in ("episode", "step"))
     steps = np.bincount(episode) - 1
@@ -87,14 +94,102 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
         raise ValueError("rows are missing or out of order")
     last = step == steps[episode]
-    X = [table[name].to_numpy() for name in named["states"]]
-    U = [table[name].to_numpy()[~last] for name in named["inputs"] + named.get("disturbances", [])]
-    return (
-        np.stack(X, axis=1),
-        np.array(U).reshape(len(U), -1).T if U else np.empty((steps.sum(), 0)),
-        steps,
-        about,
-    )
+    X = _stacked(table, named["states"])
+    return X, _stacked(table, named["inputs"] + named.get("disturbances", []))[~last], steps, about
+
+
+@dataclass(frozen=True, eq=False)
+class RowGroup(Part):
+    """Stretches of the episodes of one file, whose pairs end in one group of its rows.
+
+    Attributes
+    ----------
+    file
+        What `Episodes.save` wrote.
+    stretches
+        (first row, steps) of each.
+    plant
+        What the file must agree with; None for the file that tells it.
+    """
+
+    file: Path
+    stretches: tuple[tuple[int, int], ...]
+    plant: PlantSignature | None
+
+    def __str__(self) -> str:
+        return f"{self.file} (rows {self.stretches[0][0]} to {sum(self.stretches[-1])})"
+
+    def load(self) -> Episodes:
+        """Return the stretches as episodes of their own; only the groups that hold their rows are read."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        first, last = self.stretches[0][0], sum(self.stretches[-1])
+        try:
+            with pq.ParquetFile(self.file) as held:
+                ends = np.cumsum([held.metadata.row_group(i).num_rows for i in range(held.num_row_groups)])
+                groups = np.arange(np.searchsorted(ends, first, "right"), np.searchsorted(ends, last, "right") + 1)
+                table = held.read_row_groups(groups.tolist())
+            named = json.loads(table.schema.metadata[_KEY])
+            disturbances = named.get("disturbances", [])
+            X, U, W = (_stacked(table, some) for some in (named["states"], named["inputs"], disturbances))
+            episode, step = (table[name].to_numpy() for name in ("episode", "step"))
+            before = ends[groups[0] - 1] if groups[0] else 0
+            found: list[Episode] = []
+            for row, steps in self.stretches:
+                a, b = row - before, row - before + steps
+                if np.ptp(episode[a : b + 1]) or (np.diff(step[a : b + 1]) != 1).any():
+                    raise ValueError("rows are missing or out of order")
+                found.append(Episode(X=X[a : b + 1], U=U[a:b], W=W[a:b]))
+            episodes = Episodes(found, named["dt"], named["states"], named["inputs"], disturbances)
+        except (KeyError, IndexError, TypeError, ValueError, OSError, pa.ArrowException) as error:
+            raise LogError(f"{self} holds no episodes that can be read: {error}") from error
+        if self.plant is not None:
+            self.plant.check(episodes, str(self.file))
+        return episodes
+
+
+def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[RowGroup] | None:
+    """Return a part for each group of rows of the file, in order; None where it is a plain table or damaged.
+
+    No pair is lost or comes twice: x_k → x_{k+1} belongs to the group that holds x_{k+1}. A stretch that begins inside
+    an episode begins `history` rows earlier, and one that an embedding would use up is left out.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    counts, lengths = np.zeros(0, dtype=np.intp), list[int]()
+    try:
+        with pq.ParquetFile(file) as held:
+            if _KEY not in (held.schema_arrow.metadata or {}):
+                return None
+            for i in range(held.num_row_groups):
+                episode = held.read_row_group(i, columns=["episode"])["episode"].to_numpy()
+                own = np.bincount(episode, minlength=len(counts))
+                own[: len(counts)] += counts
+                counts, lengths = own, [*lengths, len(episode)]
+    except (KeyError, TypeError, ValueError, OSError, pa.ArrowException):
+        return None
+    ends = np.cumsum(counts)
+    parts: list[RowGroup] = []
+    for stop, length in zip(np.cumsum(lengths).tolist(), lengths, strict=True):
+        stretches: list[tuple[int, int]] = []
+        first, last = (int(np.searchsorted(ends, row, "right")) for row in (stop - length, stop - 1))
+        for e in range(first, last + 1):
+            row = int(ends[e] - counts[e])  # that holds x_0
+            start = max(stop - length - 1 - history, row)
+            steps = min(stop, int(ends[e])) - 1 - start
+            if steps > history:
+                stretches.append((start, steps))
+        if stretches:
+            parts.append(RowGroup(file, tuple(stretches), plant))
+    return parts
+
+
+def _stacked(table: Any, names: list[str]) -> np.ndarray:
+    """Return the columns of these names side by side, (rows, columns); null is NaN."""
+    columns = [table[name].to_numpy() for name in names]
+    return np.stack(columns, axis=1) if columns else np.empty((len(table), 0))
 
 
 def positions(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

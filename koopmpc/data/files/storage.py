@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from functools import reduce
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.episodes import Episode, Episodes, PlantSignature, joined
 from koopmpc.data.files import csv, parquet
 from koopmpc.data.files.npz import read_arrays
 from koopmpc.data.files.tables import Told, read_table
@@ -86,7 +85,12 @@ def load_episodes(
         Gaps, columns that are constant or repeat another, or no column that is named as an input.
     """
     told = Told(dt, states, inputs, disturbances, resample)
-    return reduce(Episodes.__add__, [_read(Path(file), told) for file in (path, *more)])
+    files = [Path(file) for file in (path, *more)]
+    sets = [_read(file, told) for file in files]
+    plant = PlantSignature.of(sets[0], str(files[0]))
+    for file, one in zip(files, sets, strict=True):
+        plant.check(one, str(file), tolerance=0.0)
+    return joined(sets)
 
 
 def _read(file: Path, told: Told) -> Episodes:

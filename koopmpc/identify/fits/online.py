@@ -142,7 +142,7 @@ class OnlineEDMD:
         ShapeError, DataError
             The parts do not fit together, or one holds NaN or inf: leave such a sample out.
         """
-        nx, nu, nw = len(self._full._states), len(self._inputs), len(self._disturbances)
+        nx, nu, nw = len(self._full.bound_states), len(self._inputs), len(self._disturbances)
         now = checks.array(x, "x")
         single = now.ndim == 1
         lead = () if single else (len(now),)

@@ -153,7 +153,7 @@ def sparse_edmd(
     stay = np.flatnonzero(kept)
     columns = np.concatenate([stay, np.arange(nz, len(used))])
     few = RegressionRows(rows.P[:, columns], rows.T[:, stay], rows.rest[stay], rows.samples)
-    picked = Picked(regression.lifting, tuple(map(int, stay))).bind(regression.lifting._states)
+    picked = Picked(regression.lifting, tuple(map(int, stay))).bind(regression.lifting.bound_states)
     sentences = doubts(few, picked.names, regression.inputs, regular=False)[0]
     if missed > 1e-6:
         sentences.append(

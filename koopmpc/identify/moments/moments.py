@@ -168,7 +168,7 @@ class Moments(Value):
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states x, without their past."""
-        return self.lifting._states if self.embedding is None else self.embedding.states
+        return self.lifting.bound_states if self.embedding is None else self.embedding.states
 
     @property
     def products(self) -> Int[np.ndarray, " np"]:

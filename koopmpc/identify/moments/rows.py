@@ -43,7 +43,7 @@ class RowColumns:
 
 def row_columns(lifting: Lifting, inputs: tuple[str, ...], bilinear: bool) -> RowColumns:
     """Return the columns for the bound ψ and these inputs."""
-    points = lifting._states
+    points = lifting.bound_states
     states, one = State().bind(points), Constant().bind(points).names[0]
     full = lifting if set(states.names) <= set(lifting.names) else lifting + states
     products = np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
@@ -143,7 +143,7 @@ def lifted_chunks(
         last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
         first = np.concatenate([[0], last[:-1] + 1])
         P = space[: int(last[-1]) + 1]
-        lifting._lift(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
+        lifting.lift_into(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
         if nu:
             U = P[:, nz : nz + nu]
             given = _joined([of[i].U[start:end] for i, start, end in chunk])
