@@ -61,7 +61,7 @@ class FitReport(Value):
     changes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Predictor(Value):
     """A model on lifted coordinates: z = ψ(x), x ≈ C z, and A z is the motion without input.
 
