@@ -96,7 +96,7 @@ class InitialCondition:
         applied
             What acted since the last call; by default the input that was computed L + 1 calls ago.
         w
-            Measured disturbances (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
+            (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
         measured, observer = numbers(y, "y"), self.observer
         if self._plain and applied is None and w is None and measured.shape == self._shape:  # y is all that counts
@@ -118,8 +118,7 @@ class InitialCondition:
         if got is not None and (np.abs(got) < HUGE).all():
             acted = got
         good = observer.observe(measured, acted, self._w)
-        now = self._ahead[0]
-        self._w = np.where(np.abs(now) < HUGE, now, self._w)  # a disturbance that is not known stays as it was
+        self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)  # an unknown one stays as it was
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         for i in range(self._latency):
             z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d)
@@ -161,7 +160,7 @@ class MPCBase:
     moves
         See `blocked`.
     time_limit
-        Wall-clock time a step may take [s]; None for any.
+        Wall-clock time of a step [s].
     """
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
@@ -203,8 +202,7 @@ class MPCBase:
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
         self._with_rates = with_rates
         self._move_of = np.arange(self._N) if move_of is None else move_of
-        estimated = estimator is not None
-        observer = estimator.start(model) if estimated else Measured(model)
+        observer, estimated = (Measured(model), False) if estimator is None else (estimator.start(model), True)
         self._initial = InitialCondition(
             state_model(model), observer, self._N, self._latency, with_rates=with_rates, estimated=estimated
         )
@@ -263,8 +261,8 @@ class MPCBase:
     ) -> Move:
         """Return a good step; a late one says so."""
         taken = perf_counter() - start
-        in_time = status if taken <= self._allowed else Status.TIME_LIMIT
-        return Move(u, in_time, Fallback.NONE, taken, iterations, slack)
+        status = status if taken <= self._allowed else Status.TIME_LIMIT
+        return Move(u, status, Fallback.NONE, taken, iterations, slack)
 
     def _fail(
         self,

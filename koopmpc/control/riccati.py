@@ -72,8 +72,7 @@ def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
 def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
     """Minimise Σ xᵀQx + uᵀRu for x⁺ = A x + B u: K = (R + BᵀPB)⁻¹BᵀPA, P = Q + AᵀP(A − BK).
 
-    Parameters and errors as in `lqr`. For a lifted pair with a Constant observable there is no stabilising
-    solution; `LQR` and `KoopmanMPC` iterate the difference equation instead.
+    Parameters and errors as in `lqr`. With a Constant observable there is no such solution; `LQR` iterates instead.
     """
     A, B, Q, R = _pair(A, B, Q, R, definite=True)
     try:
