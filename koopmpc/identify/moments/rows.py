@@ -119,7 +119,7 @@ def lifted_chunks(
     episodes: Episodes,
     columns: RowColumns,
     which: Sequence[int] | None = None,
-    weights: list[Float[np.ndarray, " T"]] | None = None,
+    weights: list[Float[np.ndarray, " _"]] | None = None,
 ) -> Iterator[LiftedChunk]:
     """Yield the chunks of these numbers, by default all, lifted; the memory of one is used again for the next.
 
