@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,20 @@ def die_once(task: tuple[str, int]) -> int:
         mark.touch()
         die(i)
     return i
+
+
+def die_at_two(i: int) -> int:
+    if i == 2:
+        die(i)
+    return i
+
+
+def sleep(task: tuple[str, float]) -> float:
+    """Write this process's number into the folder, and return after so many seconds."""
+    folder, seconds = task
+    (Path(folder) / str(os.getpid())).touch()
+    time.sleep(seconds)
+    return seconds
 
 
 def fail(i: int) -> int:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import dedent
@@ -68,6 +69,54 @@ def test_a_task_that_kills_each_worker_is_named(where: dict) -> None:
         list(map_tasks(tasks.die, ["the first"], **where))
 
 
+def test_among_others_the_task_that_kills_is_named_after_the_results_before_it() -> None:
+    results = map_tasks(tasks.die_at_two, range(6), **PROCESSES)
+    assert [next(results), next(results)] == [0, 1]
+    with pytest.raises(km.KoopmpcError, match=r"task 2, 2: each worker that did it died"):
+        next(results)
+
+
+def test_workers_that_are_busy_end_when_nobody_waits_for_them(tmp_path: Path) -> None:
+    results = map_tasks(tasks.sleep, [(str(tmp_path), seconds) for seconds in (0, 60, 60, 60)], **PROCESSES)
+    assert next(results) == 0
+    started = time.perf_counter()
+    results.close()
+    assert time.perf_counter() - started < 20
+    pids = [int(file.name) for file in tmp_path.iterdir()]
+    assert pids
+    assert not [pid for pid in pids if _is_alive(pid)]
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        dedent(f"""
+        import os, signal
+        from koopmpc.parallel import map_tasks
+        from tests import tasks
+        if __name__ == "__main__":
+            results = map_tasks(tasks.sleep, [({str(tmp_path / "pids")!r}, 0)] * 4, workers=2)
+            next(results)
+            os.kill(os.getpid(), signal.SIGKILL)
+        """)
+    )
+    (tmp_path / "pids").mkdir()
+    subprocess.run([sys.executable, script], capture_output=True, timeout=60, check=False)
+    pids = [int(file.name) for file in (tmp_path / "pids").iterdir()]
+    assert pids
+    ends = time.perf_counter() + 20
+    while time.perf_counter() < ends and any(map(_is_alive, pids)):
+        time.sleep(0.1)
+    assert not [pid for pid in pids if _is_alive(pid)]
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+
+
 @EVERYWHERE
 def test_what_a_task_raises_is_raised_after_the_results_before_it(where: dict) -> None:
     results = map_tasks(tasks.fail, range(5), **where)
@@ -127,7 +176,7 @@ def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("koopmpc.parallel._ANSWER", 0.5)
+    monkeypatch.setattr("koopmpc.cluster._ANSWER", 0.5)
     with pytest.raises(km.KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9; start one"):
         list(map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:9"))
 
@@ -147,7 +196,7 @@ def test_a_cluster_is_reached_by_its_address_and_one_without_workers_is_told(
         address = cluster.scheduler_address
         assert list(map_tasks(tasks.square, range(3), scheduler=address)) == [0, 1, 4]
         cluster.scale(0)
-        monkeypatch.setattr("koopmpc.parallel._PATIENCE", 1.0)
+        monkeypatch.setattr("koopmpc.cluster._PATIENCE", 1.0)
         with pytest.raises(km.KoopmpcError, match="task 0, 5: the cluster has had no worker for 1 s"):
             list(map_tasks(tasks.square, [5], scheduler=address))
 
