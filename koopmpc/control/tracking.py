@@ -14,7 +14,7 @@ from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
-Read = TypeVar("Read", Float[np.ndarray, "n nz"], ca.Function)
+Read = TypeVar("Read", np.ndarray, ca.Function)
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Tracking(Generic[Read]):
         return Interval(np.where(hard, self.rates.low, -np.inf), np.where(hard, self.rates.high, np.inf))
 
 
-LiftedTracking: TypeAlias = Tracking[Float[np.ndarray, "n nz"]]
+LiftedTracking: TypeAlias = Tracking[np.ndarray]
 StateTracking: TypeAlias = Tracking[ca.Function]
 
 
