@@ -57,7 +57,7 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
-    from koopmpc.estimate.measured import LiftedDisturbance as LiftedDisturbance
+    from koopmpc.estimate.observer import LiftedDisturbance as LiftedDisturbance
     from koopmpc.identify import moments as moments
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
     from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
@@ -129,7 +129,7 @@ else:
             "data.files.storage": "load_episodes",
             "data.source": "Stream",
             "errors": "FitWarning KoopmpcError",
-            "estimate.measured": "LiftedDisturbance",
+            "estimate.observer": "LiftedDisturbance",
             "estimate.kalman": "LiftedKalman",
             "identify.fits.bilinear": "bilinear_edmd",
             "identify.fits.constrained": "constrained_edmd",

@@ -17,8 +17,7 @@ from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status, blocked
 from koopmpc.control.tracking import Tracking, checked
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.measured import Measured
-from koopmpc.estimate.observer import Estimator, StateModel, StateObserver, state_model
+from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 

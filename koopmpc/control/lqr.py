@@ -14,7 +14,7 @@ from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.tracking import lifted_tracking
 from koopmpc.errors import ShapeError
-from koopmpc.estimate.measured import Measured
+from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 

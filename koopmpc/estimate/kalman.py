@@ -10,9 +10,10 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.filtered import Augmented, FilterModel, Kalman
-from koopmpc.estimate.observer import StateModel, constant_index, places
+from koopmpc.estimate.observer import StateModel, constant_index
+from koopmpc.lifting.base import Lifting, short
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
@@ -155,7 +156,7 @@ class LiftedKalman(Value):
 
     def _matrix(self, predictor: LinearPredictor) -> Float[np.ndarray, "ny nz"]:
         if isinstance(self.outputs, tuple):
-            return np.eye(predictor.nz)[places(predictor.lifting, cast("tuple[str, ...]", self.outputs))]
+            return np.eye(predictor.nz)[_places(predictor.lifting, cast("tuple[str, ...]", self.outputs))]
         H = cast("Float[np.ndarray, 'ny nz']", self.outputs)
         if H.shape[1] != predictor.nz or not len(H):
             raise ShapeError(f"outputs has shape {H.shape}, expected (ny, {predictor.nz}), one column an observable")
@@ -197,3 +198,21 @@ def _stationary(
             "observables"
         ) from error
     return 0.5 * (P + P.T)
+
+
+def _places(lifting: Lifting, names: tuple[str, ...]) -> list[int]:
+    """Return the indices of observables by name, with or without the unit.
+
+    Raises
+    ------
+    ObservableError
+        The lifting lacks one of them.
+    """
+    place = {short(name): i for i, name in enumerate(lifting.names)}
+    place |= {name: i for i, name in enumerate(lifting.names)}
+    for name in names:
+        if name not in place:
+            raise ObservableError(
+                f"the lifting lacks {name!r}; add it to the lifting: it holds {', '.join(lifting.names)}"
+            )
+    return [place[name] for name in names]
