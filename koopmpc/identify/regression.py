@@ -15,8 +15,9 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.solve import RegressionRows, scaled_rank
+from koopmpc.identify.solve import RegressionRows, root, scaled_rank
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.reduced import Projected
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -218,7 +219,16 @@ def linear_predictor(regression: Regression, result: FitResult, *, warn: bool = 
         E=result.B[:, nu:],
         disturbances=regression.disturbances,
         embedding=regression.embedding,
+        scale=scale_of(regression, result.lifting),
     )
+
+
+def scale_of(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz nz"]:
+    """Return the upper triangular R with RᵀR = Σ w z zᵀ / Σ w, z what this lifting makes of the regression's data."""
+    Z = regression.rows.P[:, : regression.lifting.nz]
+    if lifting is not regression.lifting and isinstance(lifting, Projected):
+        Z = Z @ lifting.basis
+    return root(Z, regression.rows.samples)
 
 
 def growth(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:

@@ -83,6 +83,9 @@ class Predictor(Value):
         How it was fitted; None for a model that was not.
     embedding
         Makes ζ of x and its past; then z₀ = ψ(ζ₀).
+    scale
+        (nz, nz) upper triangular R with RᵀR = Σ w z zᵀ / Σ w over the lifted states that the model was fitted to: R⁻ᵀ z
+        has root-mean-square 1 in every direction. None for a model that was given, and in files of before.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -94,6 +97,7 @@ class Predictor(Value):
     inputs: tuple[str, ...]
     report: FitReport | None
     embedding: Delay | None
+    scale: Float[np.ndarray, "nz nz"] | None
 
     @property
     def nx(self) -> int:

@@ -15,7 +15,7 @@ from scipy.linalg.blas import dgemv
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.lifting.state import Constant, State
@@ -30,7 +30,7 @@ class LinearPredictor(Predictor):
 
     Attributes
     ----------
-    A, B, C, lifting, dt, states, inputs, report, embedding
+    A, B, C, lifting, dt, states, inputs, report, embedding, scale
         Those of every `Predictor`: A is (nz, nz), B (nz, nu), C (nx, nz), names have units, dt is in seconds.
     exact_modes
         (nl, nz) exact DMD modes X′ V Σ⁻¹ W in the observables of the unreduced lifting, one a column, where a
@@ -69,8 +69,9 @@ class LinearPredictor(Predictor):
         E: ArrayLike | None = None,
         disturbances: Sequence[str] | None = None,
         embedding: Delay | None = None,
+        scale: ArrayLike | None = None,
     ) -> None:
-        bound, nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding)
+        bound, nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
         modes = exact_modes
         if modes is not None:
             if not isinstance(bound, Projected) or modes.shape != bound.basis.shape:
@@ -163,7 +164,7 @@ class BilinearPredictor(Predictor):
 
     Attributes
     ----------
-    A, B, C, lifting, dt, states, inputs, report, embedding
+    A, B, C, lifting, dt, states, inputs, report, embedding, scale
         Those of every `Predictor`: A is (nz, nz), B (nz, nu), C (nx, nz), names have units, dt is in seconds.
     N
         (nu, nz, nz), one matrix for each input.
@@ -193,8 +194,9 @@ class BilinearPredictor(Predictor):
         inputs: Sequence[str],
         report: FitReport | None = None,
         embedding: Delay | None = None,
+        scale: ArrayLike | None = None,
     ) -> None:
-        nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding)[1]
+        nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)[1]
         object.__setattr__(self, "N", checks.array(N, "N", (len(inputs), nz, nz)))
 
     def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
@@ -246,6 +248,7 @@ def _store(
     inputs: Sequence[str],
     report: FitReport | None,
     embedding: Delay | None,
+    scale: ArrayLike | None,
 ) -> tuple[Lifting, int]:
     """Check the fields that all predictors share and store them; return the bound lifting and nz."""
     embedded = None if embedding is None else embedding.bind(states, inputs)
@@ -267,10 +270,22 @@ def _store(
         "inputs": tuple(inputs),
         "report": report,
         "embedding": embedded,
+        "scale": None if scale is None else _triangular(scale, nz),
     }
     for name, value in fields.items():
         object.__setattr__(predictor, name, value)
     return bound, nz
+
+
+def _triangular(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
+    """Return the scale, checked: upper triangular, with no zero on its diagonal."""
+    R = checks.array(scale, "scale", (nz, nz))
+    if np.tril(R, -1).any() or not R.diagonal().all():
+        raise DataError(
+            "scale is not upper triangular with a diagonal that nowhere is 0; pass the triangular factor of the lifted "
+            "data, np.linalg.qr(Z, mode='r') / sqrt(len(Z)), or leave it out"
+        )
+    return R
 
 
 def _re_lifted(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray) -> StepMap:

@@ -7,7 +7,7 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.identify.solve import RegressionRows, solve
+from koopmpc.identify.solve import RegressionRows, root, solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.monomials import Monomials
@@ -112,7 +112,9 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
             for i, place in enumerate(held):
                 if place >= 0:
                     C[i] = np.eye(nz)[place]
-            self.predictor_ = LinearPredictor(K[:, :nz], K[:, nz:], C, self.lifting_, self.dt, names[:nx], names[nx:])
+            self.predictor_ = LinearPredictor(
+                *(K[:, :nz], K[:, nz:], C, self.lifting_, self.dt, names[:nx], names[nx:]), scale=root(Z, len(Z))
+            )
         return self
 
     def predict(self, X: Any) -> np.ndarray:
