@@ -84,12 +84,12 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.loop.run import Run as Run
     from koopmpc.loop.simulate import simulate as simulate
     from koopmpc.plants.dynamics import Dynamics as Dynamics
+    from koopmpc.plants.dynamics import Plant as Plant
     from koopmpc.plants.integrators import CVODES as CVODES
     from koopmpc.plants.integrators import RK4 as RK4
     from koopmpc.plants.integrators import Collocation as Collocation
     from koopmpc.plants.integrators import Euler as Euler
     from koopmpc.plants.integrators import ImplicitMidpoint as ImplicitMidpoint
-    from koopmpc.plants.simulated import Plant as Plant
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
     from koopmpc.predict import spectrum as spectrum
@@ -151,9 +151,8 @@ else:
             "loop.metrics": "metrics",
             "loop.run": "Run",
             "loop.simulate": "simulate",
-            "plants.dynamics": "Dynamics",
+            "plants.dynamics": "Dynamics Plant",
             "plants.integrators": "CVODES RK4 Collocation Euler ImplicitMidpoint",
-            "plants.simulated": "Plant",
             "plants.step_map": "StepMap discretize",
             "predict.predictors": "BilinearPredictor LinearPredictor load_model",
             "recording.format.reader": "load_run",

@@ -25,9 +25,8 @@ from koopmpc.errors import ProblemError
 from koopmpc.estimate.observer import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.plants.dynamics import Dynamics
-from koopmpc.plants.simulated import Plant, SimulatedPlant
-from koopmpc.plants.step_map import StepMap, discretize
+from koopmpc.plants.dynamics import Dynamics, Plant
+from koopmpc.plants.step_map import SimulatedPlant, StepMap, discretize
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 

@@ -14,9 +14,8 @@ from koopmpc.data.collect import InputFunction, Uniform
 from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.plants.dynamics import Dynamics
+from koopmpc.plants.dynamics import Dynamics, Plant
 from koopmpc.plants.integrators import RK4, Integrator
-from koopmpc.plants.simulated import Plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.scene import Scene
 

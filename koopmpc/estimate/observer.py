@@ -242,10 +242,9 @@ class Measured:
         if self._lift is None:
             self.z = y
             return True
-        (place,), (lifted,), evaluate, _ = self._lift.slot()
-        place[:] = y
-        evaluate()
-        self.z = lifted
+        self._lift.arguments[0][:] = y
+        self._lift.evaluate()
+        self.z = self._lift.results[0]
         return True
 
 

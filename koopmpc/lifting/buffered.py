@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from koopmpc.lifting.base import Lifting
-from koopmpc.plants.buffered import Buffered
+from koopmpc.plants.compiled import Buffered
 
 HUGE = 1e30
 

@@ -16,8 +16,8 @@ from koopmpc.control.move import Controller, Fallible, Move
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.run import Plans, Run, Step, StepRows
-from koopmpc.plants.simulated import Plant, SimulatedPlant, require_plant
-from koopmpc.plants.step_map import StepMap
+from koopmpc.plants.dynamics import Plant, require_plant
+from koopmpc.plants.step_map import SimulatedPlant, StepMap
 
 Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
 StepObserver = Callable[[Step], None]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.plants.simulated import SimulatedPlant as SimulatedPlant
     from koopmpc.plants.step_map import Affine as Affine
+    from koopmpc.plants.step_map import SimulatedPlant as SimulatedPlant
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"simulated": "SimulatedPlant", "step_map": "Affine"})
+    __getattr__, __dir__, __all__ = attach(__name__, {"step_map": "Affine SimulatedPlant"})

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from koopmpc.errors import DataError
 from koopmpc.plants import compiled
-from koopmpc.plants.buffered import Buffered
 from koopmpc.plants.graph import Graph
 
 _WORTH_COMPILING = 20_000  # steps; a compiler takes 0.2 s, in which the interpreter makes about that many
@@ -25,7 +24,7 @@ class Batch:
     expression graph over numpy columns; all others (implicit integrators, matrices) are called step by step.
     """
 
-    def __init__(self, step: Buffered) -> None:
+    def __init__(self, step: compiled.Buffered) -> None:
         self._step = step
 
     def fill(self, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
@@ -66,9 +65,9 @@ class Batch:
             return None
 
 
-def march(step: Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
+def march(step: compiled.Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
     """Write x_1 … x_T after X[0], call by call; NaN from where an implicit method fails."""
-    (x, u), (x_next,), evaluate, _ = step.slot()
+    (x, u), (x_next,), evaluate = step.arguments, step.results, step.evaluate
     x[:] = X[0]
     for k in range(len(U)):
         u[:] = U[k]

@@ -1,10 +1,13 @@
-"""Continuous-time models ẋ = f(x, u), y = h(x), written in CasADi operations."""
+"""Continuous-time models ẋ = f(x, u), y = h(x), written in CasADi operations; the protocol of a plant that runs."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, cast
+from typing import ClassVar, Protocol, cast, runtime_checkable
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.values import Named
 
@@ -25,6 +28,59 @@ class Dynamics(Named, ABC):
     def measure(self, x: ca.SX) -> ca.SX:
         """Return y = h(x): (ny, 1) from x (nx, 1); the whole state unless overridden."""
         return x
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """What `simulate` and `collect` drive: hardware, another simulator, or a step map as a `SimulatedPlant`."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        ...
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of x, with units."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of u, with units."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of y, with units."""
+        ...
+
+    @property
+    def state(self) -> np.ndarray | None:
+        """The true x (nx,), where it can be known."""
+        ...
+
+    def reset(self, x0: ArrayLike, rng: np.random.Generator | int) -> np.ndarray:
+        """Go to x0 (nx,) and return y (ny,)."""
+        ...
+
+    def step(self, u: ArrayLike) -> np.ndarray:
+        """Hold u (nu,) for dt and return the new y (ny,)."""
+        ...
+
+
+def require_plant(plant: object) -> None:
+    """Raise where `plant` cannot be driven, naming what it lacks."""
+    if isinstance(plant, Dynamics):
+        raise DataError(
+            f"the plant is {type(plant).__name__}, ẋ = f(x, u) without a sample time; discretize it first: "
+            "km.discretize(dynamics, dt)"
+        )
+    advice = (
+        "a Plant has dt [s], states, inputs and outputs (names), state (x, or None where it is hidden), "
+        "reset(x0, rng) -> y and step(u) -> y; or pass a StepMap"
+    )
+    needed = ("dt", "states", "inputs", "outputs", "state", "reset", "step")
+    checks.members(plant, "the plant", needed, advice)
 
 
 def right_side(dynamics: Dynamics) -> ca.Function:

@@ -1,4 +1,4 @@
-"""The discrete-time plant x⁺ = F(x, u), y = h(x), immutable."""
+"""The discrete-time plant x⁺ = F(x, u), y = h(x): immutable, and as a plant that remembers its state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -11,9 +11,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.batch import Batch, march, warn_of
-from koopmpc.plants.buffered import Buffered, dense
+from koopmpc.plants.compiled import Buffered, dense
 from koopmpc.plants.dynamics import Dynamics, output, right_side
 from koopmpc.plants.integrators import RK4, Integrator
 from koopmpc.values import Named, Value, freeze
@@ -99,18 +99,22 @@ class StepMap(Named):
         NaN passes through; where an implicit method finds no x⁺ the answer is NaN, with a RuntimeWarning.
         """
         x, u = _vector(x, "x", len(self.states)), _vector(u, "u", len(self.inputs))
-        (x_place, u_place), (x_next,), evaluate, _ = self._step.slot()
+        step = self._step
+        x_place, u_place = step.arguments
         x_place[:], u_place[:] = x, u
         try:
-            evaluate()
+            step.evaluate()
         except RuntimeError as error:
             warn_of(error, x, u)
             return np.full(self.nx, np.nan)
-        return x_next.copy()
+        return step.results[0].copy()
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return y = h(x): (ny,) from x (nx,)."""
-        return self._output(_vector(x, "x", len(self.states)))[0]
+        output = self._output
+        output.arguments[0][:] = _vector(x, "x", len(self.states))
+        output.evaluate()
+        return output.results[0].copy()
 
     def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
         """x_{k+1} = F(x_k, u_k): X (T+1, nx) from x0 (nx,) and U (T, nu); the bits of T single calls."""
@@ -160,6 +164,62 @@ class StepMap(Named):
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+class SimulatedPlant:
+    """x⁺ = F(x, u) + w, y = h(x): a `StepMap` that remembers its state."""
+
+    def __init__(self, step_map: StepMap) -> None:
+        self.step_map = step_map
+        self._x: Float[np.ndarray, " nx"] | None = None
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.step_map.dt
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of x."""
+        return self.step_map.states
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of u."""
+        return self.step_map.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of y."""
+        return self.step_map.outputs
+
+    @property
+    def state(self) -> Float[np.ndarray, " nx"] | None:
+        """A copy of x (nx,); None before the first `reset`."""
+        return None if self._x is None else self._x.copy()
+
+    def reset(self, x0: ArrayLike, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " ny"]:
+        """Go to x0 (nx,) and return y (ny,); nothing here is random, `rng` is the protocol's."""
+        self._x = checks.array(x0, "x0", (self.step_map.nx,))
+        return self.step_map.measure(self._x)
+
+    def step(self, u: ArrayLike, disturbance: ArrayLike | None = None) -> Float[np.ndarray, " ny"]:
+        """Return y (ny,) after x ← F(x, u) + `disturbance` (nx,).
+
+        Raises
+        ------
+        DataError
+            The plant was never reset.
+        ShapeError
+            u or the disturbance has another shape.
+        """
+        if self._x is None:
+            raise DataError("the plant has no state yet; call reset(x0, rng) before step")
+        x_next = self.step_map(self._x, u)
+        if disturbance is not None:
+            x_next += checks.array(disturbance, "disturbance", (self.step_map.nx,))
+        self._x = x_next
+        return self.step_map.measure(x_next)
 
 
 def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008

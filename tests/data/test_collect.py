@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.plants.simulated import SimulatedPlant
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -83,7 +82,7 @@ def test_every_step_is_one_of_the_plant(excitation: Callable[..., object]) -> No
 @given(seed=SEEDS)
 def test_the_batch_and_the_stepwise_way_agree(excitation: Callable[..., object], seed: int) -> None:
     batch = km.collect(PENDULUM, BOX, excitation, episodes=3, steps=20, rng=seed)
-    stepwise = km.collect(SimulatedPlant(PENDULUM), BOX, excitation, episodes=3, steps=20, rng=seed)
+    stepwise = km.collect(km.plants.SimulatedPlant(PENDULUM), BOX, excitation, episodes=3, steps=20, rng=seed)
     assert (batch.dt, batch.states, batch.inputs) == (stepwise.dt, stepwise.states, stepwise.inputs)
     for a, b in zip(batch, stepwise, strict=True):
         np.testing.assert_allclose(a.X, b.X, rtol=0, atol=1e-9)
@@ -127,7 +126,7 @@ def test_the_measured_is_what_is_kept(excitation: km.Noise | km.Feedback) -> Non
     whole = km.discretize(Pendulum(), 0.05)
     partly = km.discretize(SeenAngle(), 0.05)
     seen = km.collect(partly, BOX, excitation, episodes=3, steps=10)
-    driven = km.collect(SimulatedPlant(partly), BOX, excitation, episodes=3, steps=10)
+    driven = km.collect(km.plants.SimulatedPlant(partly), BOX, excitation, episodes=3, steps=10)
     assert seen.states == ("y0", "omega [rad/s]")
     rng = np.random.default_rng(0)
     for start, run, other in zip(BOX.sample(3, rng), seen, driven, strict=True):
@@ -173,7 +172,7 @@ def test_an_autonomous_plant_needs_no_input() -> None:
             "episode 1 is NaN or infinite from step 6 on",
         ),
         (
-            lambda: km.collect(SimulatedPlant(unstable()), [[0.1], [3.0]], km.Feedback([[0.0]]), episodes=2, steps=20),
+            lambda: km.collect(km.plants.SimulatedPlant(unstable()), [[0.1], [3.0]], km.Feedback([[0.0]]), episodes=2, steps=20),
             km.errors.DataError,
             "episode 1 is NaN or infinite from step 6 on",
         ),

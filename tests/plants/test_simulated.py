@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.plants.simulated import SimulatedPlant
 from tests.example_plants import CartPole, Spring
 
 MAP = km.discretize(CartPole(), 0.05)
 
 
 def test_a_simulated_plant_is_a_plant_with_the_maps_names():
-    plant = SimulatedPlant(MAP)
+    plant = km.plants.SimulatedPlant(MAP)
     assert isinstance(plant, km.Plant)
     assert (plant.dt, plant.states, plant.inputs, plant.outputs) == (
         0.05,
@@ -20,20 +19,20 @@ def test_a_simulated_plant_is_a_plant_with_the_maps_names():
 
 
 def test_it_walks_the_rollout():
-    plant, U = SimulatedPlant(MAP), np.random.default_rng(0).normal(size=(30, 1))
+    plant, U = km.plants.SimulatedPlant(MAP), np.random.default_rng(0).normal(size=(30, 1))
     Y = [plant.reset([0, 0.3, 0, 0], 0)] + [plant.step(u) for u in U]
     assert np.array(Y).tobytes() == MAP.rollout([0, 0.3, 0, 0], U).tobytes()
 
 
 def test_a_disturbance_is_added_to_the_next_state():
-    plant, w = SimulatedPlant(MAP), np.array([0.1, -0.2, 0.3, 0.4])
+    plant, w = km.plants.SimulatedPlant(MAP), np.array([0.1, -0.2, 0.3, 0.4])
     plant.reset([0, 0.3, 0, 0], 0)
     assert plant.step([1.0], w).tolist() == (MAP([0, 0.3, 0, 0], [1.0]) + w).tolist()
     assert w.tolist() == [0.1, -0.2, 0.3, 0.4]
 
 
 def test_it_measures_through_h():
-    plant = SimulatedPlant(km.discretize(Spring(), 0.1))
+    plant = km.plants.SimulatedPlant(km.discretize(Spring(), 0.1))
     assert plant.reset([1.0, 2.0], 0).tolist() == [2.0, 5.0]
     y = plant.step([])
     assert plant.state is not None
@@ -41,7 +40,7 @@ def test_it_measures_through_h():
 
 
 def test_nothing_is_shared_with_the_caller():
-    plant, x0 = SimulatedPlant(MAP), np.array([0.0, 0.3, 0.0, 0.0])
+    plant, x0 = km.plants.SimulatedPlant(MAP), np.array([0.0, 0.3, 0.0, 0.0])
     y = plant.reset(x0, 0)
     x0[:], y[:] = 7, 8
     seen = plant.state
@@ -55,7 +54,7 @@ def test_nothing_is_shared_with_the_caller():
 
 
 def test_reset_starts_again():
-    plant = SimulatedPlant(MAP)
+    plant = km.plants.SimulatedPlant(MAP)
     plant.reset([0, 0.3, 0, 0], 0)
     first = plant.step([1.0]).tolist()
     plant.reset([0, 0.3, 0, 0], 0)
@@ -63,7 +62,7 @@ def test_reset_starts_again():
 
 
 def test_mistakes_are_named():
-    plant = SimulatedPlant(MAP)
+    plant = km.plants.SimulatedPlant(MAP)
     assert plant.state is None
     with pytest.raises(km.errors.DataError, match=r"the plant has no state yet; call reset\(x0, rng\) before step"):
         plant.step([0.0])

@@ -18,7 +18,7 @@ from koopmpc.control.target import TOLERANCE, root
 from koopmpc.control.tracking import StateTracking
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
-from koopmpc.plants.buffered import Buffered
+from koopmpc.plants.compiled import Buffered
 
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
 CLOSE = 1e-2  # the same where the next control step goes on: the error left is of the square of this share
@@ -79,7 +79,7 @@ class Equilibria:
         F, of, g = model.F(x, u, theta), o.tracked(x), o.limited(x)
         found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
         local = ca.Function("local", [x, u, theta], [ca.densify(each) for each in found])
-        self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local).slot()
+        self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local)
         least = 1e-8 * max(float(np.trace(o.Q)), 1e-12)
         r, e = ca.MX.sym("r", len(o.Q)), ca.MX.sym("e", model.nx)
         f = ca.mtimes([(of - r).T, ca.DM(o.Q), of - r]) + least * (ca.sumsqr(u) + ca.sumsqr(x))

@@ -14,7 +14,7 @@ from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.tracking import StateTracking
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
-from koopmpc.plants.buffered import Buffered
+from koopmpc.plants.compiled import Buffered
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 

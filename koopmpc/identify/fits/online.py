@@ -193,7 +193,7 @@ class OnlineEDMD:
 
     def _lifted(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
         """Return ψ of both at a microsecond each, in memory of our own; NaN beyond 1e30."""
-        memory = self._psi.slot()
+        memory = self._psi
         for z, point in zip(self._pair, (now, after), strict=True):
             memory.arguments[0][:] = point
             memory.evaluate()
