@@ -14,7 +14,7 @@ from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits, admitted
-from koopmpc.control.move import Fallback, Move, Status, blocked
+from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.tracking import Tracking, checked
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
@@ -179,8 +179,9 @@ class MPCBase:
         self.cost, self.limits = checked(cost, limits)
         if nu == 0:
             raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
-        self._dt, self._nu = dt, nu
+        self.dt, self.nu = dt, nu
         self._N, self._latency = checks.count(horizon, "horizon"), checks.count(latency, "latency", 0)
+        self.horizon = self._N + self._latency  # steps of preview
         self._blocks = blocked(moves, self._N)
         self._time_limit = time_limit
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
@@ -211,21 +212,6 @@ class MPCBase:
         return copy.deepcopy(self)
 
     @property
-    def dt(self) -> float:
-        """Sampling time [s]."""
-        return self._dt
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self._nu
-
-    @property
-    def horizon(self) -> int:
-        """Steps of preview: N of the plan, after those of the latency."""
-        return self._N + self._latency
-
-    @property
     def observer(self) -> StateObserver:
         """The estimate now: its z, and its disturbance d."""
         return self._initial.observer
@@ -235,25 +221,16 @@ class MPCBase:
 
         Rates count from `u_prev`, zero moved inside the limits by default; it is held if the first step fails.
         """
-        zero = np.clip(np.zeros(self._nu), *self._inputs)
+        zero = np.clip(np.zeros(self.nu), *self._inputs)
         self._kept: Float[np.ndarray, " nv"] | None = None
         self._age, self._planned = 0, False
-        self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self._nu,))
+        self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
         self._initial.reset(x0, self._given)
 
     def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
         """Keep a good plan (by reference, for speed): its first entries are the moves."""
         self._kept, self._age, self._planned = plan, 0, True
-        self._given = plan[: self._nu]
-
-    def _known_input(self) -> Float[np.ndarray, " nu"]:
-        """Return the input that rates count from: what was applied, where it can be used."""
-        u_prev = self._initial.u_prev
-        if not u_prev.size:
-            return self._given
-        if not (np.abs(u_prev) < HUGE).all():
-            u_prev[:] = self._given
-        return u_prev
+        self._given = plan[: self.nu]
 
     def _move(
         self, u: Float[np.ndarray, " nu"], status: Status, iterations: int, start: float, slack: float = 0.0
@@ -284,12 +261,12 @@ class MPCBase:
         before = self._given
         if applied is not None:
             got = np.asarray(applied, dtype=np.float64)
-            if got.shape == (self._nu,) and (np.abs(got) < HUGE).all():
+            if got.shape == (self.nu,) and (np.abs(got) < HUGE).all():
                 before = got
         if self._kept is not None and self._age + 1 < self._N:
             self._age += 1
-            first = self._nu * int(self._move_of[self._age])
-            u, fallback = self._kept[first : first + self._nu], Fallback.SHIFTED_PLAN
+            first = self.nu * int(self._move_of[self._age])
+            u, fallback = self._kept[first : first + self.nu], Fallback.SHIFTED_PLAN
         else:
             self._kept = None
             u, fallback = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
@@ -297,3 +274,26 @@ class MPCBase:
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
         return Move(self._given.copy(), status, fallback, taken, iterations)
+
+
+def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:
+    """Return the lengths of the blocks: N ones, M moves of which the last is held, or `moves` itself.
+
+    Raises
+    ------
+    DataError
+        There are more moves than steps, or the lengths do not sum to N.
+    """
+    if moves is None:
+        return (1,) * N
+    if isinstance(moves, Sequence):
+        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
+        if sum(lengths) != N:
+            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
+        return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
+    M = checks.count(moves, "moves")
+    if M > N:
+        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
+    return (1,) * (M - 1) + (N - M + 1,)

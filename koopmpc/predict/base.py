@@ -1,6 +1,6 @@
 """What all lifted predictors share: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, and the report of their fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -86,6 +86,8 @@ class Predictor(Value):
     scale
         (nz, nz) upper triangular R with RᵀR = Σ w z zᵀ / Σ w over the lifted states that the model was fitted to: R⁻ᵀ z
         has root-mean-square 1 in every direction. None for a model that was given, and in files of before.
+    nx, nu, nz
+        How many states, inputs and lifted coordinates there are.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -98,21 +100,9 @@ class Predictor(Value):
     report: FitReport | None
     embedding: Delay | None
     scale: Float[np.ndarray, "nz nz"] | None
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return self.C.shape[0]
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self.B.shape[1]
-
-    @property
-    def nz(self) -> int:
-        """Number of lifted coordinates."""
-        return self.A.shape[0]
+    nx: int = field(init=False)
+    nu: int = field(init=False)
+    nz: int = field(init=False)
 
     @property
     def point_names(self) -> tuple[str, ...]:

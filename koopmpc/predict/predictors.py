@@ -1,7 +1,7 @@
 """The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z; x ≈ C z, z₀ = ψ(x₀)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +22,7 @@ from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import FitReport, Predictor
 from koopmpc.predict.files import load_value
+from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -39,6 +40,8 @@ class LinearPredictor(Predictor):
         (nz, nw); (nz, 0) without measured disturbances.
     disturbances
         Names of w with units; ``w0, w1, …`` by default.
+    nw
+        How many disturbances there are.
 
     Raises
     ------
@@ -54,6 +57,7 @@ class LinearPredictor(Predictor):
     exact_modes: Complex[np.ndarray, "nl nz"] | None
     E: Float[np.ndarray, "nz nw"]
     disturbances: tuple[str, ...]
+    nw: int = field(init=False)
 
     def __init__(
         self,
@@ -84,13 +88,7 @@ class LinearPredictor(Predictor):
         names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
         if len(names) != nw:
             raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
-        for name, value in (("exact_modes", modes), ("E", drift), ("disturbances", names)):
-            object.__setattr__(self, name, value)
-
-    @property
-    def nw(self) -> int:
-        """Number of measured disturbances."""
-        return self.E.shape[1]
+        freeze(self, exact_modes=modes, E=drift, disturbances=names, nw=nw)
 
     def rollout(
         self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
@@ -197,7 +195,7 @@ class BilinearPredictor(Predictor):
         scale: ArrayLike | None = None,
     ) -> None:
         nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)[1]
-        object.__setattr__(self, "N", checks.array(N, "N", (len(inputs), nz, nz)))
+        freeze(self, N=checks.array(N, "N", (len(inputs), nz, nz)))
 
     def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
@@ -272,8 +270,7 @@ def _store(
         "embedding": embedded,
         "scale": None if scale is None else _triangular(scale, nz),
     }
-    for name, value in fields.items():
-        object.__setattr__(predictor, name, value)
+    freeze(predictor, **fields, nx=nx, nu=nu, nz=nz)
     return bound, nz
 
 

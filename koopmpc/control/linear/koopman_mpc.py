@@ -225,7 +225,7 @@ class KoopmanMPC(MPCBase):
         if not self._planned:
             return None
         A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
-        moves = self._plan[: len(self._blocks) * self._nu].reshape(-1, self._nu)
+        moves = self._plan[: len(self._blocks) * self.nu].reshape(-1, self.nu)
         U = moves[self._move_of]
         push = self._initial.W @ E.T
         if self._disturbed:
@@ -275,12 +275,12 @@ class KoopmanMPC(MPCBase):
         found, gave_way = self._qps.solve(v, room, deadline)
         status = Status.FAILED if self.solver_fails else found.status
         if status is not Status.OPTIMAL:
-            return self._fail(v[: self._nu], applied, status, found.iterations, start)
+            return self._fail(v[: self.nu], applied, status, found.iterations, start)
         U, (low, high) = t[: plan.moves], plan.box
         U += plan.deviation.dot(found.v)
         np.maximum(U, low, out=U)
         np.minimum(U, high, out=U)
-        u = U[: self._nu]
+        u = U[: self.nu]
         if self._hard_rates is not None:
             u[:] = admitted(u, inputs, self._hard_rates, u_prev)
         self._take(t)

@@ -146,13 +146,13 @@ class BilinearMPC(StagedMPC):
     ) -> StagePlan:
         iteration = self._iteration
         if self._with_rates:
-            iteration.low[0, : self._nu], iteration.high[0, : self._nu] = first
+            iteration.low[0, : self.nu], iteration.high[0, : self.nu] = first
         status, iterations = Status.FAILED, 0
         if self._warm:
             self._shift(u_prev)
             status, iterations = self._improve(s, u_prev, self._sqp_iterations, deadline)
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
-            u = np.clip(u_prev if self._with_rates else np.zeros(self._nu), *self._outputs.inputs)
+            u = np.clip(u_prev if self._with_rates else np.zeros(self.nu), *self._outputs.inputs)
             # rest at x: the free motion of a learned model may leave its data, and lead to a plan there
             x = s[: self._map.nx]
             self._enter(np.tile(x, (self._N + 1, 1)), np.tile(u, (self._N, 1)), u_prev)

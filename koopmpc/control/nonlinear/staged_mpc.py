@@ -145,6 +145,15 @@ class StagedMPC(MPCBase):
         self._keep(self._U.ravel())
         return self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
 
+    def _known_input(self) -> Float[np.ndarray, " nu"]:
+        """Return the input that rates count from: what was applied, where it can be used."""
+        u_prev = self._initial.u_prev
+        if not u_prev.size:
+            return self._given
+        if not (np.abs(u_prev) < HUGE).all():
+            u_prev[:] = self._given
+        return u_prev
+
     @abstractmethod
     def _solve(
         self,
@@ -239,7 +248,7 @@ class StagedMPC(MPCBase):
             return X, U
         before = np.vstack([u_prev, U[self._problem.held_from]])
         V = np.diff(before, axis=0)
-        late = np.vstack([np.zeros(self._nu), V])[:, self._problem.soft_rates]
+        late = np.vstack([np.zeros(self.nu), V])[:, self._problem.soft_rates]
         return np.hstack([X, before, late]), V
 
     def _trajectory(
@@ -248,7 +257,7 @@ class StagedMPC(MPCBase):
         """Return the states and the inputs of a plan, the inputs inside their limits."""
         nx, (low, high) = self._map.nx, self._outputs.inputs
         if self._with_rates:
-            V = S[0, nx : nx + self._nu] + np.cumsum(V * self._problem.free[:, None], axis=0)
+            V = S[0, nx : nx + self.nu] + np.cumsum(V * self._problem.free[:, None], axis=0)
         return S[:, :nx], np.minimum(np.maximum(V, low), high)
 
     def _lose(
