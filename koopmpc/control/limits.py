@@ -38,6 +38,20 @@ class LimitRows(NamedTuple):
     softness: Softness
 
 
+class SizedLimits(NamedTuple):
+    """Limits in the sizes of a model: of its inputs, of their changes, and of the limited outputs [x; y] in `rows`.
+
+    `rates` is None where nothing limits the changes. `hard_rates` are the rate limits that are hard, with ±inf in place
+    of the others; None where none is.
+    """
+
+    inputs: Interval
+    rates: Interval | None
+    hard_rates: Interval | None
+    rate_softness: Softness
+    rows: LimitRows
+
+
 @dataclass(frozen=True, eq=False)
 class Limits(Value):
     """u_min ≤ u_k ≤ u_max and du_min ≤ u_k − u_{k−1} ≤ du_max, x_min ≤ x_k ≤ x_max and y_min ≤ of(x_k) ≤ y_max.
@@ -117,6 +131,15 @@ class Limits(Value):
     def rate_softness(self, nu: int) -> Softness:
         """Return how soft the rate limits of each input are."""
         return _softness(self.du_slack, "du_slack", nu, "one an input")
+
+    def sized(self, nx: int, ny: int, nu: int) -> SizedLimits:
+        """Return all limits of a model with `nx` states, `ny` observables `of` (0 without one) and `nu` inputs."""
+        rows, rates, rate_softness = self.rows(nx, ny), self.rates(nu), self.rate_softness(nu)
+        hard = np.isinf(rate_softness.linear)
+        hard_rates = None
+        if rates is not None and hard.any():
+            hard_rates = Interval(np.where(hard, rates.low, -np.inf), np.where(hard, rates.high, np.inf))
+        return SizedLimits(self.inputs(nu), rates, hard_rates, rate_softness, rows)
 
     def states(self, nx: int) -> Interval:
         """Return the box of the states."""

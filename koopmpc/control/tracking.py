@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Interval, LimitRows, Limits, Softness
+from koopmpc.control.limits import Interval, Limits, SizedLimits, Softness
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.state import State
@@ -23,7 +23,8 @@ class Tracking(Generic[Read]):
 
     Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
     `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. R_delta and
-    `rates` are None where the change of the inputs is free.
+    `rates` are None where the change of the inputs is free, and `with_rates` says whether it counts. `hard_rates` are
+    those of `SizedLimits`.
     """
 
     tracked: Read
@@ -33,22 +34,11 @@ class Tracking(Generic[Read]):
     R_delta: Float[np.ndarray, "nu nu"] | None
     inputs: Interval
     rates: Interval | None
+    hard_rates: Interval | None
     rate_softness: Softness
     outputs: Interval
     softness: Softness
-
-    @property
-    def with_rates(self) -> bool:
-        """Whether the change of the inputs counts."""
-        return self.R_delta is not None or self.rates is not None
-
-    @property
-    def hard_rates(self) -> Interval | None:
-        """The rate limits that are hard, with ±inf in place of the others; None where none is."""
-        hard = np.isinf(self.rate_softness.linear)
-        if self.rates is None or not hard.any():
-            return None
-        return Interval(np.where(hard, self.rates.low, -np.inf), np.where(hard, self.rates.high, np.inf))
+    with_rates: bool
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
@@ -68,8 +58,8 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> L
     C, G, nx = observed(predictor, cost.of), predictor.C, predictor.nx
     if limits.of is not None:
         G = np.vstack([G, observed(predictor, limits.of)])
-    given = limits.rows(nx, len(G) - nx)
-    return _tracking(C, np.ascontiguousarray(G[given.kept]), cost, limits, given, len(C), predictor.nu)
+    given = limits.sized(nx, len(G) - nx, predictor.nu)
+    return _tracking(C, np.ascontiguousarray(G[given.rows.kept]), cost, len(C), given)
 
 
 def state_tracking(
@@ -84,29 +74,30 @@ def state_tracking(
     x, of = point[:nx], cost.of.bind(states)
     bound = None if limits.of is None else limits.of.bind(states)
     values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    given = limits.rows(nx, 0 if bound is None else bound.nz)
-    kept = np.flatnonzero(given.kept).tolist()
+    given = limits.sized(nx, 0 if bound is None else bound.nz, nu)
+    kept = np.flatnonzero(given.rows.kept).tolist()
     tracked = ca.Function("tracked", [point], [ca.densify(of.symbolic(x))])
     limited = ca.Function("limited", [point], [ca.densify(values[kept, 0])])
-    return _tracking(tracked, limited, cost, limits, given, of.nz, nu)
+    return _tracking(tracked, limited, cost, of.nz, given)
 
 
-def _tracking(
-    tracked: Read, limited: Read, cost: Cost, limits: Limits, given: LimitRows, nr: int, nu: int
-) -> Tracking[Read]:
-    """Return the record of these maps with the weights and limits in the sizes that they have here."""
-    Q, R = cost.matrices(nr, nu)
+def _tracking(tracked: Read, limited: Read, cost: Cost, nr: int, given: SizedLimits) -> Tracking[Read]:
+    """Return the record of these maps with the limits, and the weights of `nr` tracked outputs."""
+    nu = len(given.inputs.low)
+    (Q, R), R_delta = cost.matrices(nr, nu), cost.rate(nu)
     return Tracking(
         tracked,
         limited,
         Q,
         R,
-        cost.rate(nu),
-        limits.inputs(nu),
-        limits.rates(nu),
-        limits.rate_softness(nu),
-        given.box,
-        given.softness,
+        R_delta,
+        given.inputs,
+        given.rates,
+        given.hard_rates,
+        given.rate_softness,
+        given.rows.box,
+        given.rows.softness,
+        with_rates=R_delta is not None or given.rates is not None,
     )
 
 
