@@ -202,7 +202,7 @@ class MPCBase:
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
         self._with_rates = with_rates
         self._move_of = np.arange(self._N) if move_of is None else move_of
-        observer, estimated = (Measured(model), False) if estimator is None else (estimator.start(model), True)
+        observer, estimated = (Measured(model), False) if estimator is None else (estimator.start(model, self._N), True)
         self._initial = InitialCondition(
             state_model(model), observer, self._N, self._latency, with_rates=with_rates, estimated=estimated
         )

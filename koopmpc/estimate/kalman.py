@@ -110,8 +110,8 @@ class LiftedKalman(Value):
         checks.count(self.delay, "delay", 0)
         checks.count(self.patience, "patience", 0)
 
-    def start(self, model: LinearPredictor | StateModel) -> Kalman:
-        """Return the observer of one controller.
+    def start(self, model: LinearPredictor | StateModel, horizon: int) -> Kalman:
+        """Return the observer of one controller with plans of this many steps.
 
         Raises
         ------

@@ -4,6 +4,7 @@ The observers here take the state as it was measured: without a disturbance, or 
 """
 
 from dataclasses import dataclass
+from math import exp
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,7 +15,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.buffered import buffered
+from koopmpc.lifting.buffered import HUGE, buffered
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
@@ -125,7 +126,7 @@ class StateObserver(Protocol):
 class Estimator(Protocol):
     """A rule of estimation: `LiftedDisturbance`, `LiftedKalman`, or a user's own."""
 
-    def start(self, model: Any) -> StateObserver:
+    def start(self, model: Any, horizon: int) -> StateObserver:
         """Return the observer of one controller.
 
         Parameters
@@ -133,6 +134,8 @@ class Estimator(Protocol):
         model
             The LinearPredictor of a KoopmanMPC; of the other controllers, which plan in the state's own coordinates,
             their `StateModel`.
+        horizon
+            Steps of the controller's plan.
         """
         ...
 
@@ -174,36 +177,51 @@ class History:
         return zeta
 
 
+TINY = 1e-300  # a change of a state that never moved
+GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
+
+
 @dataclass(frozen=True, eq=False)
 class LiftedDisturbance(Value):
-    """z = ψ(x) afresh each step; d ← d + gain (ψ(x⁺) − A ψ(x) − B u − E w − d).
+    """z = ψ(x) afresh each step; d follows the misfits e = ψ(x⁺) − A ψ(x) − B u − E w as far as they are constant.
 
     At rest d is exactly what the model lacks at that state and input, in every lifted coordinate, so the equilibria
     z = A z + B u + d of the controller hold the plant's own. A disturbance of fewer coordinates leaves an offset
     when z is lifted afresh from x. The Constant is known: its d is zero. In a controller on x⁺ = F(x, u) + d the
     states have the disturbances.
 
+    A plan holds d over its horizon, but what a model lacks in a transient is not what it lacks where the plan ends.
+    Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the
+    states show it: c = 1 − Σ vᵢ/sᵢ² / Σ max((C m)ᵢ², (C d)ᵢ²)/sᵢ², at least 0. v is the variance of C e about C m,
+    without half the mean square of its successive differences, which is noise, and s the largest change of a state in
+    a step so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0, and d = m = e.
+
     Parameters
     ----------
     gain
-        Share of the newest misfit, in (0, 1]: 1 is deadbeat, and as noisy as two measurements; less filters. Far
-        from rest the misfit of a learned model is no constant, and a large gain makes the plan believe it is.
+        Weight of the newest misfit in all these means, m ← m + gain (e − m), in (0, 1]: 1 makes d the last misfit.
+        By default 1 − exp(−4/N), so that misfits are remembered over a quarter of the horizon, and at least 0.1.
 
     Raises
     ------
     DataError
         The gain is outside (0, 1].
+
+    References
+    ----------
+    von Neumann, "Distribution of the ratio of the mean square successive difference to the variance", Ann. Math.
+    Stat. 12, 1941.
     """
 
-    gain: float = 0.1
+    gain: float | None = None
 
     def __post_init__(self) -> None:
-        if checks.positive(self.gain, "gain") > 1:
+        if self.gain is not None and checks.positive(self.gain, "gain") > 1:
             raise DataError(f"gain is {self.gain:g}; it must be in (0, 1], and 1 is deadbeat")
 
-    def start(self, model: LinearPredictor | StateModel) -> "Filtered":
-        """Return the observer of one controller."""
-        return Filtered(model, self.gain)
+    def start(self, model: LinearPredictor | StateModel, horizon: int) -> "Filtered":
+        """Return the observer of one controller with plans of this many steps."""
+        return Filtered(model, max(1 - exp(-4 / horizon), GAIN) if self.gain is None else self.gain)
 
 
 class Measured:
@@ -249,7 +267,7 @@ class Measured:
 
 
 class Filtered(Measured):
-    """The observer of a `LiftedDisturbance`: d ← d + gain (z⁺ − F(z, u) − E w − d); a missed sample leaves d as it is.
+    """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is.
 
     The disturbances of what is known are zero: of the Constant, and of a state's past.
 
@@ -263,29 +281,71 @@ class Filtered(Measured):
 
     def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
         super().__init__(model)
-        self._gain = np.full(len(self.d), gain)
-        if isinstance(model, LinearPredictor):
-            known = constant_index(model)
-            if known is not None:
-                self._gain[known] = 0.0
-        else:
-            self._gain[self.ny :] = 0.0
+        self._gain = gain
+        self._C = self._state_rows(model)
+        nz, nx = len(self.d), len(self._C)
+        self._still = np.zeros(nz)
+        # [e; f; f²; half the square of its change] of the newest misfit e, f = C e, and the means of all of them
+        self._newest, self._means = np.zeros(nz + 3 * nx), np.zeros(nz + 3 * nx)
+        self._parts = [slice(0, nz), *(slice(nz + i * nx, nz + (i + 1) * nx) for i in range(3))]
+        self._known = self._known_places(model)
+        self._forget()
+
+    def _state_rows(self, model: LinearPredictor | StateModel) -> Float[np.ndarray, "nx nz"]:
+        """Return the matrix that reads the states from z."""
+        return model.C if isinstance(model, LinearPredictor) else np.eye(self.ny, len(self.d))
+
+    def _known_places(self, model: LinearPredictor | StateModel) -> slice:
+        """Return where z is known beforehand."""
+        if not isinstance(model, LinearPredictor):
+            return slice(self.ny, None)
+        known = constant_index(model)
+        return slice(0, 0) if known is None else slice(known, known + 1)
+
+    def _forget(self) -> None:
+        self._means[:] = 0.0
+        self._learned = False
+        self._size = np.full(len(self._C), TINY)
         self._last: Float[np.ndarray, " nz"] | None = None
 
     def reset(self, x0: ArrayLike | None = None) -> None:
-        """Forget the last state, d and the past; x0 will come as the first measurement."""
+        """Forget the last state, all misfits, d and the past; x0 will come as the first measurement."""
         super().reset(x0)
-        self._last = None
+        self._forget()
+
+    def update(self, model: LinearPredictor | StateModel) -> None:
+        """Go on with another model; d takes as long to follow as it took to come."""
+        super().update(model)
+        self._C = self._state_rows(model)
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Take y, and move d towards the misfit of the step that led here."""
+        """Take y, and learn from the misfit of the step that led here."""
         super().observe(y, u, w)
-        if not np.isfinite(self.z).all():
+        z = self.z
+        if not np.abs(z).max() < HUGE:  # False for NaN
             self._last = None
             return False
         if self._last is not None:
-            misfit = self.z - self._model.advance(self._last, u, w, self.d)
-            if np.isfinite(misfit).all():
-                self.d += self._gain * misfit
-        self._last = self.z.copy()
+            self._learn(z - self._model.advance(self._last, u, w, self._still), z - self._last)
+        self._last = z.copy()
         return True
+
+    def _learn(self, misfit: Float[np.ndarray, " nz"], moved: Float[np.ndarray, " nz"]) -> None:
+        """Move d towards the mean of the misfits, by the share of them that was constant."""
+        misfit[self._known] = 0.0
+        if not np.abs(misfit).max() < HUGE:
+            return
+        e, f, square, rough = self._parts
+        newest, means = self._newest, self._means
+        states = self._C @ misfit
+        newest[rough] = 0.5 * (states - newest[f]) ** 2 if self._learned else 0.0
+        self._learned = True
+        newest[e], newest[f], newest[square] = misfit, states, states**2
+        means += self._gain * (newest - means)
+        self._size = np.maximum(self._size, (self._C @ moved) ** 2)
+        mean = means[f]
+        varied = np.maximum(means[square] - mean**2 - means[rough], 0.0)
+        most = float((np.maximum(mean**2, (self._C @ self.d) ** 2) / self._size).sum())
+        share = 1.0 - float((varied / self._size).sum()) / most if most > 0 else 0.0
+        if share > 0:
+            self.d += share * (means[e] - self.d)

@@ -18,7 +18,7 @@ class Told:
     def __init__(self, d):
         self.given = np.asarray(d, dtype=float)
 
-    def start(self, predictor):
+    def start(self, predictor, horizon):
         return Telling(self.given, predictor)
 
 

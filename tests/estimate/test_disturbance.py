@@ -18,28 +18,95 @@ def predictor(rng):
     return km.LinearPredictor(A, rng.normal(size=(4, 1)), np.eye(2, 4), LIFTING, 0.1, ("a [m]", "b [m/s]"), ("u [N]",))
 
 
-@given(st.floats(0.01, 1.0), st.integers(0, 10**6))
-def test_it_is_a_first_order_filter_of_the_misfit(gain, seed):
+@given(st.floats(0.05, 1.0), st.integers(0, 10**6))
+def test_d_moves_to_the_mean_of_the_misfits_by_the_share_that_was_constant(gain, seed):
+    """The formula of the docstring with sums over all misfits in place of recursions."""
     rng = np.random.default_rng(seed)
     model = predictor(rng)
-    observer = km.LiftedDisturbance(gain).start(model)
+    observer = km.LiftedDisturbance(gain).start(model, 20)
     X, U = rng.normal(size=(12, 2)), rng.normal(size=(12, 1))
-    d = np.zeros(4)
+    X[:, 1] = 1e5 + 0.1 * X[:, 1]  # a state whose misfits hardly vary, in a unit of its own
+    d, E = np.zeros(4), []
     for k in range(12):
         assert observer.observe(X[k], U[k - 1], NO_W)
         if k:
-            misfit = model.lift(X[k]) - model.A @ model.lift(X[k - 1]) - model.B @ U[k - 1]
-            d = (1 - gain) * d + gain * misfit
-            d[3] = 0.0
+            E.append(model.lift(X[k]) - model.A @ model.lift(X[k - 1]) - model.B @ U[k - 1])
+            E[-1][3] = 0.0
+            weights = gain * (1 - gain) ** np.arange(k)[::-1]
+            seen = np.array(E) @ model.C.T
+            rough = weights[1:] @ np.diff(seen, axis=0) ** 2 / 2 if k > 1 else 0.0
+            varied = np.maximum(weights @ seen**2 - (weights @ seen) ** 2 - rough, 0)
+            largest = np.maximum((weights @ seen) ** 2, (model.C @ d) ** 2)
+            size = (np.diff(X[: k + 1], axis=0) ** 2).max(axis=0)
+            share = max(1 - (varied / size).sum() / (largest / size).sum(), 0)
+            d = d + share * (weights @ np.array(E) - d)
         np.testing.assert_allclose(observer.z, model.lift(X[k]), atol=1e-14)
-        np.testing.assert_allclose(observer.d, d, atol=1e-12)
+        np.testing.assert_allclose(observer.d, d, rtol=1e-6, atol=1e-9)
+
+
+def after(misfits, gain=None, horizon=20, noise=0.0):
+    """d of x⁺ = x / 2 after these misfits of a plant that moves all the time."""
+    observer = km.LiftedDisturbance(gain).start(linear(np.array([[0.5]]), np.ones((1, 1))), horizon)
+    rng = np.random.default_rng(0)
+    x, found = 0.0, []
+    for misfit in misfits:
+        observer.observe(np.array([x + noise * rng.normal()]), np.zeros(1), NO_W)
+        found.append(observer.d[0])
+        x = 0.5 * x + misfit
+    return np.array(found)
+
+
+def test_what_lasts_is_learned_within_the_horizon_and_forgotten_again():
+    assert abs(after(np.ones(21))[-1] - 1) < 0.03
+    assert abs(after(np.ones(200))[-1] - 1) < 1e-12
+    assert abs(after(np.r_[np.ones(50), np.zeros(300)])[-1]) < 1e-9
+
+
+def test_what_a_transient_shows_is_not_held():
+    """A misfit that dies out within a quarter of the horizon leaves a fifth of what a plain filter makes of it."""
+    misfits, plain, most = 0.7 ** np.arange(40), 0.0, 0.0
+    for misfit in misfits:
+        plain += (1 - np.exp(-0.2)) * (misfit - plain)
+        most = max(most, plain)
+    assert np.abs(after(misfits)).max() < 0.2 * most
+
+
+def test_noise_is_averaged_and_does_not_stop_it():
+    """The noise of y is no transient: an offset of a fifth of it is found, and d varies by less than y."""
+    found = after(np.full(2000, 0.2), noise=1.0)[500:]
+    assert abs(found.mean() - 0.2) < 0.1
+    assert found.std() < 0.5
+
+
+def test_the_gain_follows_the_horizon_and_is_never_below_a_tenth():
+    misfits = np.ones(60)
+    np.testing.assert_array_equal(after(misfits, None, 10), after(misfits, 1 - np.exp(-0.4), 10))
+    np.testing.assert_array_equal(after(misfits, None, 400), after(misfits, 0.1, 400))
+
+
+@given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=3, max_size=3))
+def test_units_do_not_decide(seed, powers):
+    """x′ = S x and u′ = s u give d′ = S d."""
+    rng = np.random.default_rng(seed)
+    A, B, S, s = rng.normal(size=(2, 2)) / 2, rng.normal(size=(2, 1)), np.diag(10.0 ** np.array(powers[:2])), powers[2]
+    X, U, found = np.cumsum(rng.normal(size=(30, 2)), axis=0), rng.normal(size=(30, 1)), []
+    X[15:] = X[15]
+    U[15:] = U[15]
+    back = np.linalg.inv(S)
+    for model, x, u in ((linear(A, B), X, U), (linear(S @ A @ back, S @ B / 10.0**s), X @ S, U * 10.0**s)):
+        observer = km.LiftedDisturbance().start(model, 20)
+        for k in range(30):
+            observer.observe(x[k], u[k - 1], NO_W)
+        found.append(observer.d)
+    assert found[0].any()
+    np.testing.assert_allclose(back @ found[1], found[0], rtol=1e-6, atol=1e-9)
 
 
 @given(st.integers(0, 10**6))
 def test_at_rest_the_plant_is_an_equilibrium_of_the_model(seed):
     rng = np.random.default_rng(seed)
     model = predictor(rng)
-    observer = km.LiftedDisturbance(0.5).start(model)
+    observer = km.LiftedDisturbance(0.5).start(model, 20)
     x, u = rng.normal(size=2), rng.normal(size=1)
     for _ in range(60):
         observer.observe(x, u, NO_W)
@@ -50,7 +117,7 @@ def test_at_rest_the_plant_is_an_equilibrium_of_the_model(seed):
 
 def test_a_true_model_has_no_disturbance_and_a_measured_one_is_no_news():
     A, B, E = np.diag([0.5, 0.9]), np.ones((2, 1)), np.array([[1.0], [2.0]])
-    observer = km.LiftedDisturbance(1.0).start(linear(A, B, [0.1, 0.2], E))
+    observer = km.LiftedDisturbance(1.0).start(linear(A, B, [0.1, 0.2], E), 20)
     rng = np.random.default_rng(0)
     x, u, w = np.zeros(2), np.zeros(1), np.zeros(1)
     for _ in range(10):
@@ -61,10 +128,10 @@ def test_a_true_model_has_no_disturbance_and_a_measured_one_is_no_news():
 
 
 def test_a_missed_sample_leaves_the_disturbance_as_it_is():
-    observer = km.LiftedDisturbance(0.5).start(linear(np.diag([0.5, 0.9]), np.ones((2, 1))))
+    observer = km.LiftedDisturbance(0.5).start(linear(np.diag([0.5, 0.9]), np.ones((2, 1))), 20)
     u = np.zeros(1)
-    for x in ([1.0, 2.0], [2.0, 1.0]):
-        observer.observe(np.array(x), u, NO_W)
+    for _ in range(4):
+        observer.observe(np.array([1.0, 2.0]), u, NO_W)
     before = observer.d.copy()
     assert before.any()
     assert not observer.observe(np.array([np.nan, 1.0]), u, NO_W)

@@ -45,7 +45,7 @@ def test_it_equals_the_textbook_filter(disturbance, affine, seed):
     model = linear(A, B, c if affine else None)
     rule = km.LiftedKalman(("x0", "x1"), disturbance, process=0.1, drift=0.2, noise=0.3)
     try:
-        mine = rule.start(model)
+        mine = rule.start(model, 20)
     except km.errors.DataError:
         return  # a random plant may be undetectable; test_detectable judges that
     book, Bd, Cd = textbook(model, H, disturbance, rule)
@@ -89,7 +89,7 @@ def test_the_constant_is_known_whatever_a_fit_has_made_of_its_row():
     for disturbance in ("input", "output"):
         seen = []
         for one in (model, spoiled):
-            observer = km.LiftedKalman("x0", disturbance).start(one)
+            observer = km.LiftedKalman("x0", disturbance).start(one, 20)
             for k in range(20):
                 observer.observe(np.array([np.sin(k)]), np.array([np.cos(k)]), NO_W)
             seen.append(np.r_[observer.z, observer.d])
@@ -103,7 +103,7 @@ def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
     rng = np.random.default_rng(seed)
     A, B = np.diag(rng.uniform(-0.5, 0.7, 3)), rng.uniform(0.5, 1.5, (3, 1))
     model = linear(A, B, rng.normal(size=3))
-    observer = km.LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model)
+    observer = km.LiftedKalman(("x0", "x1"), disturbance, process=1.0, noise=0.1).start(model, 20)
     y, u = rng.normal(size=2), rng.normal(size=1)
     for _ in range(150):
         observer.observe(y, u, NO_W)
@@ -115,7 +115,7 @@ def test_at_rest_it_explains_the_measurement_exactly(seed, disturbance):
 def test_it_finds_a_load_on_the_input():
     A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
     model = linear(A, B)
-    observer = km.LiftedKalman("x0").start(model)
+    observer = km.LiftedKalman("x0").start(model, 20)
     rng = np.random.default_rng(0)
     x, u = np.array([0.3, 0.0]), np.zeros(1)
     observer.reset(np.zeros(2))
@@ -135,7 +135,7 @@ def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inp
     model = linear(A, B, [0.1, 0.2, 0.3])
     H = np.array([[1.0, 1.0, 1.0, 0.0]])
     rule, late_rule = km.LiftedKalman(H), km.LiftedKalman(H, delay=delay)
-    prompt, late = rule.start(model), late_rule.start(model)
+    prompt, late = rule.start(model, 20), late_rule.start(model, 20)
     x0 = rng.normal(size=3)
     prompt.reset(x0)
     late.reset(x0)
@@ -155,7 +155,7 @@ def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inp
 
 def test_a_measured_disturbance_is_no_news():
     A, B, E = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [1.0]]), np.array([[1.0], [0.5]])
-    observer = km.LiftedKalman("x0").start(linear(A, B, [0.1, 0.0], E))
+    observer = km.LiftedKalman("x0").start(linear(A, B, [0.1, 0.0], E), 20)
     x, u, w = np.zeros(2), np.zeros(1), np.zeros(1)
     rng = np.random.default_rng(1)
     observer.reset(x)
@@ -168,7 +168,7 @@ def test_a_measured_disturbance_is_no_news():
 
 def test_samples_are_bridged_for_a_while_and_reset_repeats_to_the_bit():
     model = linear(np.diag([0.5, 0.9]), np.ones((2, 1)))
-    observer = km.LiftedKalman(("x0", "x1"), patience=3).start(model)
+    observer = km.LiftedKalman(("x0", "x1"), patience=3).start(model, 20)
     rng = np.random.default_rng(0)
     Y = rng.normal(size=(12, 2))
     Y[4:9] = np.nan
@@ -188,7 +188,7 @@ def test_infinities_are_missed_samples():
     model = linear(np.diag([0.5, 0.9]), np.ones((2, 1)))
     seen = []
     for bad in (np.nan, np.inf, -1e200):
-        observer = km.LiftedKalman(("x0", "x1")).start(model)
+        observer = km.LiftedKalman(("x0", "x1")).start(model, 20)
         observer.observe(np.array([1.0, bad]), np.zeros(1), NO_W)
         seen.append(observer.z.copy())
     np.testing.assert_array_equal(seen[0], seen[1])
@@ -238,7 +238,7 @@ INTEGRATOR = linear(np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
 )
 def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words):
     with pytest.raises(error, match=words):
-        rule.start(model)
+        rule.start(model, 20)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_names_with_and_without_units_and_a_matrix_are_the_same():
     model = linear(np.array([[0.9, 0.1], [0.0, 0.8]]), np.ones((2, 1)), [0.1, 0.2])
     seen = []
     for outputs in ("x1", "x1 [m]", ("x1",), ["x1 [m]"], [[0.0, 1.0, 0.0]]):
-        observer = km.LiftedKalman(outputs).start(model)
+        observer = km.LiftedKalman(outputs).start(model, 20)
         for k in range(5):
             observer.observe(np.array([float(k)]), np.ones(1), NO_W)
         seen.append(observer.z.copy())

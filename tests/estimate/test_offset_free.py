@@ -49,13 +49,13 @@ def test_without_an_estimator_there_is_one(plant):
 class InputAlone:
     """What is not offered: z lifted afresh, and a disturbance of the input that explains the angle alone."""
 
-    def start(self, predictor):
-        return Bad(predictor)
+    def start(self, predictor, horizon):
+        return Bad(predictor, horizon)
 
 
 class Bad:
-    def __init__(self, predictor):
-        self.whole = km.LiftedDisturbance().start(predictor)
+    def __init__(self, predictor, horizon):
+        self.whole = km.LiftedDisturbance().start(predictor, horizon)
         self.B = predictor.B[:, 0]
 
     ny = property(lambda self: 2)
@@ -112,7 +112,7 @@ def test_a_setpoint_beyond_the_input_limit_is_held_as_nearly_as_the_plant_can(es
     assert abs(within.X[-1, 0] - (nearest[0] - 0.1)) < 1e-6
 
 
-@pytest.mark.parametrize("estimator", [km.LiftedDisturbance(), km.LiftedKalman("x0", process=0.01)])
+@pytest.mark.parametrize("estimator", [km.LiftedDisturbance(gain=0.5), km.LiftedKalman("x0", process=0.01)])
 def test_a_setpoint_beyond_a_state_limit_is_held_at_the_limit(estimator):
     run = loop(estimator, km.Limits(-5, 5, x_max=[1.0, np.inf]), [1.5])
     assert abs(run.X[-1, 0] - 1.0) < 1e-4
@@ -165,8 +165,8 @@ def test_copies_and_pickles_go_on_as_the_original_and_reset_repeats_to_the_bit(e
 
 def test_a_missing_state_is_a_bad_measurement_and_leaves_the_disturbance():
     mpc = km.KoopmanMPC(KNOWN, POSITION, km.Limits(-1, 1), 15, estimator=km.LiftedDisturbance())
-    for y in ([0.0, 0.0], [0.3, 0.1]):
-        mpc(y, [1.0])
+    for _ in range(6):
+        mpc([0.3, 0.1], [1.0], applied=[0.0])
     before = mpc.observer.d.copy()
     assert before.any()
     assert mpc([np.nan, 0.0], [1.0]).status is km.Status.BAD_MEASUREMENT
