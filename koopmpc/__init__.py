@@ -72,12 +72,12 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.lifting.base import Lifting as Lifting
     from koopmpc.lifting.expressions import Expressions as Expressions
     from koopmpc.lifting.fourier import Fourier as Fourier
-    from koopmpc.lifting.monomials import Monomials as Monomials
+    from koopmpc.lifting.fourier import RandomFourier as RandomFourier
     from koopmpc.lifting.radial import Gaussian as Gaussian
     from koopmpc.lifting.radial import ThinPlate as ThinPlate
-    from koopmpc.lifting.random_fourier import RandomFourier as RandomFourier
     from koopmpc.lifting.standardized import Standardized as Standardized
     from koopmpc.lifting.state import Constant as Constant
+    from koopmpc.lifting.state import Monomials as Monomials
     from koopmpc.lifting.state import State as State
     from koopmpc.loop import faults as faults
     from koopmpc.loop.metrics import metrics as metrics
@@ -142,12 +142,10 @@ else:
             "identify.fits.stable": "stable_edmd",
             "lifting.base": "Lifting",
             "lifting.expressions": "Expressions",
-            "lifting.fourier": "Fourier",
-            "lifting.monomials": "Monomials",
+            "lifting.fourier": "Fourier RandomFourier",
             "lifting.radial": "Gaussian ThinPlate",
-            "lifting.random_fourier": "RandomFourier",
             "lifting.standardized": "Standardized",
-            "lifting.state": "Constant State",
+            "lifting.state": "Constant Monomials State",
             "loop.metrics": "metrics",
             "loop.run": "Run",
             "loop.simulate": "simulate",

@@ -10,6 +10,7 @@ import numpy as np
 from koopmpc import checks
 from koopmpc.figures.style import save
 from koopmpc.recording.views.curves import Curves
+from koopmpc.validate.text import markdown_table
 
 if TYPE_CHECKING:
     from koopmpc.figures.style import Figure
@@ -52,8 +53,7 @@ class Page:
 
     def table(self, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """Add a table; a | inside a cell is escaped."""
-        lines = [headings, ["---"] * len(headings), *rows]
-        self.parts.append("\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines))
+        self.parts.append(markdown_table(headings, rows))
 
     def picture(self, name: str, caption: str, made: "Figure") -> None:
         """Save the figure as <name>.png and add it with its caption.
@@ -73,7 +73,7 @@ class Page:
 
     @property
     def markdown(self) -> str:
-        """The whole report."""
+        """The whole report as Markdown."""
         return "\n\n".join(self.parts) + "\n"
 
     @property
@@ -93,7 +93,3 @@ class Page:
         with checks.writing(path) as stream:
             stream.write(self.markdown.encode())
         return path
-
-
-def _cell(value: object) -> str:
-    return str(value).replace("|", r"\|")

@@ -1,4 +1,4 @@
-"""Excite a plant and keep what it does."""
+"""collect: excite a plant and return the episodes that it gives."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ def collect(
     excitation
         An `Excitation`, or a function ``(k, y, rng) -> u``, called in the order of k.
     episodes, steps
-        How many, and how long: X is (steps+1, ny).
+        Number of episodes, and steps of each: X is (steps+1, ny).
     rng
         Generator or seed; the same seed gives the same data, whichever way the plant is run.
 
@@ -66,7 +66,7 @@ def collect(
     ShapeError
         x0 or the excitation does not fit the plant.
     DataError
-        An episode left the finite numbers; the plant cannot be driven.
+        A state became NaN or infinite, or the plant lacks a method.
     """
     if not isinstance(plant, StepMap):
         require_plant(plant)
@@ -80,7 +80,7 @@ def collect(
             f"the excitation gives {excitation.nu} inputs, the plant takes {nu} ({', '.join(plant.inputs)}); "
             "pass one level for each input"
         )
-    with np.errstate(over="ignore", invalid="ignore"):  # what diverges is reported by `_finite`
+    with np.errstate(over="ignore", invalid="ignore"):  # `_finite` reports a plant that diverges
         if not isinstance(plant, StepMap):
             policies = [_start(excitation, length, plant.dt, nu, own) for own in streams]
             runs = [_drive(plant, *each, length) for each in zip(range(count), starts, policies, streams, strict=True)]
@@ -113,7 +113,7 @@ def _batch(
     steps: int,
     streams: list[np.random.Generator],
 ) -> tuple[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]]:
-    """Run all episodes at once; inputs that look at y are asked step by step."""
+    """Run all episodes at once; an excitation that depends on y is called step by step."""
     if isinstance(excitation, OpenLoop):
         U = np.stack([excitation.sequence(steps, plant.dt, own) for own in streams])
         return plant.rollouts(starts, U), U
@@ -159,7 +159,7 @@ def _starts(x0: Uniform | ArrayLike, nx: int, count: int, rng: np.random.Generat
 
 
 def _finite(Y: Float[np.ndarray, "E rows ny"], episode: int = 0, step: int = 0) -> None:
-    """Raise if a row is not finite; the first is of this episode and this step."""
+    """Raise if a row is not finite; Y[0, 0] belongs to `episode` and `step`."""
     bad = np.argwhere(~np.isfinite(Y).all(axis=2))
     if len(bad):
         raise DataError(

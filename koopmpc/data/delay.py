@@ -18,10 +18,10 @@ from koopmpc.values import Value
 
 @dataclass(frozen=True, eq=False)
 class Delay(Value):
-    """The embedding ζ_k = [x_k, u_{k−1}, x_{k−1}, …, u_{k−d}, x_{k−d}]: what is not measured shows in the past.
+    """The embedding ζ_k = [x_k, u_{k−1}, x_{k−1}, …, u_{k−d}, x_{k−d}]: the past replaces states that are not measured.
 
-    A lifting then acts on ζ. No ζ reaches across episodes: each episode gives d points less. Past values have the
-    names ``"theta[k-1] [rad]"``.
+    A lifting then acts on ζ. No ζ reaches across episodes, so each episode loses d points. Past values have names such
+    as ``"theta[k-1] [rad]"``.
 
     Parameters
     ----------
@@ -71,12 +71,12 @@ class Delay(Value):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of x."""
+        """Names of the states x, without their past."""
         return self._bound[0]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of ζ."""
+        """Names of the entries of ζ."""
         states, inputs = self._bound
         past = (inputs if self.inputs else ()) + states
         return states + tuple(_delayed(name, i) for i in range(1, self.steps + 1) for name in past)
@@ -89,7 +89,7 @@ class Delay(Value):
 
     @property
     def _block(self) -> int:
-        """Values of one past step."""
+        """Number of entries of ζ that hold one past step."""
         states, inputs = self._bound
         return len(states) + len(inputs) * self.inputs
 
@@ -119,7 +119,7 @@ class Delay(Value):
         return Episodes(parts, episodes.dt, sized.names, episodes.inputs, episodes.disturbances)
 
     def source(self, source: Source) -> Source:
-        """Return a source of ζ."""
+        """Return a source whose episodes hold ζ in place of x."""
         sized = self.fitted(source.states, source.inputs)
         return Changed(source, sized, sized.names, source.inputs, source.disturbances, history=self.steps)
 
@@ -162,7 +162,7 @@ class Delay(Value):
         return np.concatenate([x_next, u, kept] if self.inputs else [x_next, kept], axis=-1)
 
     def symbolic(self, zeta: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.SX:
-        """Return ζ⁺ on symbols."""
+        """Return ζ⁺ for symbolic columns ζ, u and x⁺."""
         kept = zeta[: zeta.shape[0] - self._block]
         return ca.vertcat(x_next, u, kept) if self.inputs else ca.vertcat(x_next, kept)
 

@@ -182,7 +182,7 @@ class Episodes(Named, Value):
         )
 
     def driven(self) -> "Episodes":
-        """Return the same with the measured disturbances behind the inputs: both drive the plant."""
+        """Return these episodes with the measured disturbances appended to the inputs: both drive the plant."""
         if not self.nw:
             return self
         joined = [Episode(X=e.X, U=np.hstack([e.U, e.W])) for e in self.episodes]
@@ -225,7 +225,7 @@ class Episodes(Named, Value):
         save_episodes(self, path)
 
     def with_episodes(self, episodes: Sequence[Episode]) -> "Episodes":
-        """Return other episodes of the same plant: dt and all names are those of this set."""
+        """Return a set of other episodes with the sample time and the names of this set."""
         return Episodes(episodes, self.dt, self.states, self.inputs, self.disturbances)
 
 
@@ -249,7 +249,7 @@ _CLOSE = 1e-6  # relative; the clocks that wrote the files round
 
 @dataclass(frozen=True)
 class PlantSignature:
-    """What all sets of episodes of one plant share: sample time [s] and names. `place` says where they are from."""
+    """Sample time [s] and names, which all sets of episodes of one plant share; `place` names their origin."""
 
     dt: float
     states: tuple[str, ...]
@@ -263,7 +263,7 @@ class PlantSignature:
         return cls(episodes.dt, episodes.states, episodes.inputs, episodes.disturbances, place)
 
     def check(self, episodes: Episodes, place: str, tolerance: float = _CLOSE) -> None:
-        """Raise where the episodes at `place` are of another plant.
+        """Check that the episodes at `place` have this sample time and these names.
 
         Raises
         ------
@@ -287,4 +287,5 @@ def joined(sets: Sequence[Episodes]) -> Episodes:
 
 
 def _listed(names: tuple[str, ...]) -> str:
+    """Return the names in quotes, or "none"."""
     return ", ".join(map(repr, names)) or "none"

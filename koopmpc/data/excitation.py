@@ -1,4 +1,4 @@
-"""Inputs that make a plant show what it does: noise, PRBS, sines, a sweep, and feedback with noise."""
+"""Inputs that excite a plant: noise, PRBS, sums of sines, a chirp, and feedback with noise."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -161,7 +161,7 @@ class Multisine(OpenLoop):
         return len(self.amplitude)
 
     def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
-        """Return the periods, all alike, with phases of this episode."""
+        """Return repeated periods with the phases of this episode."""
         samples = round(self.period / dt)
         if samples < 1 or abs(samples * dt - self.period) > 1e-9 * self.period:
             raise DataError(f"period is {self.period:g} s, no multiple of dt {dt:g} s; choose {max(samples, 1) * dt:g}")
@@ -236,7 +236,7 @@ class Feedback(Excitation):
     noise
         Any excitation of nu inputs, or None.
     x_ref, u_ref
-        Where to hold, scalars or (ny,) and (nu,); zero by default.
+        The point to hold the plant at, scalars or (ny,) and (nu,); zero by default.
     u_min, u_max
         Limits on u, scalars or (nu,).
     """

@@ -18,13 +18,13 @@ class Part(ABC):
 
     @abstractmethod
     def load(self) -> Episodes:
-        """Return its episodes; where it pickles, in another process too."""
+        """Return the episodes of the part; a part that pickles can be loaded in another process."""
 
 
 class Source(Named, ABC):
     """Episodes of one plant at one sample time, in an ordered sequence of parts.
 
-    The source alone fixes its parts: whoever reads them, wherever, sees the same episodes in the same order.
+    The parts depend on the source alone: every reader, in any process, sees the same episodes in the same order.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Source(Named, ABC):
     states, inputs, disturbances
         Names with units.
     replayable
-        The parts can be read again.
+        True where the parts can be read more than once.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Source(Named, ABC):
         return len(self.disturbances)
 
     def driven(self) -> "Source":
-        """Return the same with the measured disturbances behind the inputs: both drive the plant."""
+        """Return a source with the measured disturbances appended to the inputs: both drive the plant."""
         if not self.nw:
             return self
         return Changed(self, Episodes.driven, self.states, self.inputs + self.disturbances)
@@ -81,7 +81,7 @@ class Held(Source):
         self.episodes = episodes
 
     def parts(self, history: int = 0) -> list[Part]:
-        """Return the one part."""
+        """Return a list of the one part."""
         return [Loaded(self.episodes, "these data")]
 
 
@@ -91,13 +91,13 @@ class Changed(Source):
     Parameters
     ----------
     source
-        Where the episodes are from.
+        The source of the unchanged episodes.
     change
-        Episodes → Episodes, each episode for itself; it must pickle if other processes are to read the parts.
+        Episodes → Episodes, one episode at a time; it must pickle if other processes read the parts.
     states, inputs, disturbances
-        What the changed episodes name.
+        Names of the changed episodes.
     history
-        The rows that it takes from the start of each episode.
+        Number of rows that `change` uses up at the start of each episode.
     """
 
     def __init__(
@@ -131,13 +131,13 @@ class Loaded(Part):
         return self.place
 
     def load(self) -> Episodes:
-        """Return the episodes."""
+        """Return the episodes, which are in memory."""
         return self.episodes
 
 
 @dataclass(frozen=True, eq=False)
 class ChangedPart(Part):
-    """A part, and what is done to its episodes."""
+    """A part whose episodes go through `change` when it is loaded."""
 
     part: Part
     change: Change
@@ -174,8 +174,8 @@ _PART = 8_000_000  # bytes of small sets that are one part
 class Stream(Source):
     """Episodes from an iterable of sets, in parts of one set, or of several small ones; no part is kept.
 
-    An iterator, or a generator, is read once: a fit of it sums in QR, since it cannot look twice. An iterable
-    that begins anew each time, a list or a reader of one's own, is replayable.
+    An iterator or a generator is read once; a fit of it uses QR sums, which need no second pass. An iterable that
+    begins anew each time, such as a list, is replayable.
 
     Parameters
     ----------
@@ -185,7 +185,8 @@ class Stream(Source):
     Raises
     ------
     DataError
-        There is none; one is no Episodes, or differs from the first; a one-shot stream is read twice.
+        The iterable is empty, gives something other than Episodes, or sets that differ in dt or names; an iterator is
+        read twice.
     """
 
     def __init__(self, sets: Iterable[Episodes]) -> None:
@@ -238,12 +239,12 @@ def _place(start: int, count: int) -> str:
 
 
 class Subset(Source):
-    """The parts of a source that stand at these places, in its order.
+    """The parts of a source at the indices `which`, in the source's order.
 
     Parameters
     ----------
     source
-        One whose parts are a list.
+        A source whose parts can be listed.
     which
         Indices of parts.
     """

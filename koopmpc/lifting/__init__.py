@@ -1,32 +1,12 @@
-"""Observables ψ(x): one family a file.
+"""Observables ψ(x).
 
 All families are imported here: a file or a task that holds a lifting names its class, which must be known by then.
 """
 
-from koopmpc.lifting import (
-    algebra as algebra,
-)
-from koopmpc.lifting import (
-    expressions as expressions,
-)
-from koopmpc.lifting import (
-    fourier as fourier,
-)
-from koopmpc.lifting import (
-    monomials as monomials,
-)
-from koopmpc.lifting import (
-    radial as radial,
-)
-from koopmpc.lifting import (
-    random_fourier as random_fourier,
-)
-from koopmpc.lifting import (
-    reduced as reduced,
-)
-from koopmpc.lifting import (
-    standardized as standardized,
-)
-from koopmpc.lifting import (
-    state as state,
-)
+from koopmpc.lifting import algebra as algebra
+from koopmpc.lifting import expressions as expressions
+from koopmpc.lifting import fourier as fourier
+from koopmpc.lifting import radial as radial
+from koopmpc.lifting import reduced as reduced
+from koopmpc.lifting import standardized as standardized
+from koopmpc.lifting import state as state

@@ -1,4 +1,4 @@
-"""The sum of liftings: one under the other."""
+"""Sums and products of liftings: a + b stacks observables, a * b multiplies them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from koopmpc.lifting.base import CONSTANT, Indices, Lifting, short
 
 @dataclass(frozen=True, eq=False)
 class Sum(Lifting):
-    """ψ(x) = [ψ₁(x); ψ₂(x); …] without what an earlier part names already; written ``a + b``."""
+    """ψ(x) = [ψ₁(x); ψ₂(x); …] without observables that an earlier part holds by name; written ``a + b``."""
 
     parts: tuple[Lifting, ...]
 

@@ -23,7 +23,7 @@ from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
 CONSTANT = "1"  # the name of the observable that is always 1
-_BLOCK = 1024  # rows evaluated at once, about: a block of observables stays in the cache
+_BLOCK = 1024  # about the number of rows evaluated at once, so that their observables stay in the cache
 
 
 def short(state: str) -> str:
@@ -144,6 +144,8 @@ class Lifting(Value, ABC):
         """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
         if Value._kinds.get(type(self).__name__) is type(self):
             return self
+        from koopmpc.lifting.expressions import Traced  # which is a Lifting itself
+
         return Traced(self._graph, self.names, bound=self.bound_states)
 
     def lift_into(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
@@ -181,33 +183,13 @@ class Lifting(Value, ABC):
         return f"x {what}, the lifting was bound to {len(self.bound_states)} ({', '.join(self.bound_states)})"
 
 
-@dataclass(frozen=True, eq=False)
-class Traced(Lifting):
-    """ψ as a list of plain operations: what is left of a user's own function in a file."""
-
-    graph: Graph
-    labels: tuple[str, ...]
-
-    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names given when it was traced."""
-        return self.labels
-
-    def formula(self, x: ca.SX) -> ca.SX:
-        """Return the operations, done on symbols."""
-        return self.graph.symbolic(x)
-
-    @cached_property
-    def _graph(self) -> Graph:
-        return self.graph
-
-
 def lifting_of(given: object) -> Lifting:
     """Return `given` if it is a Lifting.
 
     Raises
     ------
     DataError
-        It is something else, or the class itself.
+        `given` is something else, or a class of liftings.
     """
     if isinstance(given, Lifting):
         return given
@@ -217,7 +199,7 @@ def lifting_of(given: object) -> Lifting:
 
 
 def rows(lifting: Lifting, wanted: Lifting) -> Indices:
-    """Return where the bound `lifting` holds the observables of the bound `wanted`, found by name.
+    """Return the indices in the bound `lifting` of the observables of the bound `wanted`, found by name.
 
     Raises
     ------
@@ -262,7 +244,7 @@ def indices(chosen: Chosen | None, states: Sequence[str], who: str) -> list[int]
 
 
 def frozen(chosen: Chosen | None) -> tuple[int | str, ...] | None:
-    """Return what a frozen dataclass keeps of a choice: a tuple of ints and names, or None for all."""
+    """Return a choice of states as a frozen dataclass holds it: a tuple of ints and names, or None for all."""
     if chosen is None:
         return None
     some = [chosen] if isinstance(chosen, int | str | np.integer) else chosen

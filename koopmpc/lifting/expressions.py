@@ -1,14 +1,35 @@
-"""Observables that the user writes in CasADi operations."""
+"""Observables that the user writes in CasADi operations, and the traced form of any lifting."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 
 from koopmpc.errors import DataError
-from koopmpc.lifting.base import Lifting, Traced
+from koopmpc.lifting.base import Lifting
 from koopmpc.plants.graph import Graph
 from koopmpc.values import Value, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Traced(Lifting):
+    """ψ as a list of plain operations: a file holds a user's own function in this form."""
+
+    graph: Graph
+    labels: tuple[str, ...]
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names given when it was traced."""
+        return self.labels
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the operations, done on symbols."""
+        return self.graph.symbolic(x)
+
+    @cached_property
+    def _graph(self) -> Graph:
+        return self.graph
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -20,7 +41,7 @@ class Expressions(Lifting):
     fn
         Takes the column x and returns a list of expressions: ``lambda x: [x[1] * ca.sin(x[0])]``.
     names
-        One name each; whoever asks for an observable finds it by this name.
+        The name of each expression, by which limits and costs find it.
     """
 
     fn: Callable[[ca.SX], Sequence[ca.SX]]
@@ -52,5 +73,5 @@ class Expressions(Lifting):
         return self.labels
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return what `fn` returns, as a column."""
+        """Return the expressions of `fn` as a column."""
         return ca.SX(ca.vertcat(*self.fn(x)))

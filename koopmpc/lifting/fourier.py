@@ -1,13 +1,16 @@
-"""Harmonics of angles."""
+"""Sines and cosines: harmonics of angles, and random features of the Gaussian kernel."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Chosen, Lifting, frozen, indices, short
 from koopmpc.values import freeze
 
@@ -56,3 +59,104 @@ class Fourier(Lifting):
     @cached_property
     def _chosen(self) -> list[int]:
         return indices(self.states, self.bound_states, "Fourier")
+
+
+_SEEDS = 2**32
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class RandomFourier(Lifting):
+    """ψⱼ(x) = √(2/count) cos(ωⱼ·x + bⱼ), ωⱼ ~ N(0, I / width²), bⱼ ~ U[0, 2π), j = 1 … count.
+
+    ψ(x)·ψ(y) is exp(−‖x − y‖² / (2 width²)) up to an error of order 1/√count: a Gaussian at every point, for
+    the price of `count` cosines. Bound copies hold the drawn numbers, so a file does not depend on the generator.
+
+    Parameters
+    ----------
+    count
+        Number of features.
+    width
+        Standard deviation of the kernel, in the unit of the states; standardize states that differ much.
+    rng
+        A seed, or a Generator that one is drawn from.
+
+    References
+    ----------
+    Rahimi & Recht, "Random features for large-scale kernel machines", NIPS 2007.
+    """
+
+    count: int
+    width: float
+    rng: int
+    frequencies: Float[np.ndarray, "count nx"] | None
+    phases: Float[np.ndarray, " count"] | None
+
+    def __init__(
+        self,
+        count: int,
+        width: float,
+        rng: np.random.Generator | int = 0,
+        *,
+        frequencies: ArrayLike | None = None,
+        phases: ArrayLike | None = None,
+        bound: tuple[str, ...] | None = None,
+    ) -> None:
+        """Check the arguments; a bound copy passes the `frequencies` and `phases` that it has drawn."""
+        n = checks.count(count, "count")
+        source = checks.generator(rng)
+        seed = int(source.integers(_SEEDS)) if isinstance(rng, np.random.Generator) else int(rng)
+        drawn = None if frequencies is None else checks.array(frequencies, "frequencies", (n, None))
+        turned = None if phases is None else checks.array(phases, "phases", (n,))
+        if (drawn is None) != (turned is None):
+            raise DataError("frequencies and phases belong together; pass both or none")
+        if drawn is not None and bound is not None and drawn.shape[1] != len(bound):
+            raise ShapeError(f"frequencies has {drawn.shape[1]} columns and there are {len(bound)} states")
+        freeze(
+            self,
+            count=n,
+            width=checks.positive(width, "width"),
+            rng=seed,
+            frequencies=drawn,
+            phases=turned,
+            bound=bound,
+        )
+
+    def bind(self, states: Sequence[str]) -> "RandomFourier":
+        """Return the copy with its frequencies and phases: the same seed draws the same ones."""
+        frequencies, phases = self.frequencies, self.phases
+        if frequencies is None or frequencies.shape[1] != len(states):
+            source = checks.generator(self.rng)
+            phases = source.uniform(0.0, 2 * np.pi, self.count)
+            frequencies = source.standard_normal((self.count, len(states))) / self.width
+        bound = RandomFourier(
+            self.count, self.width, self.rng, frequencies=frequencies, phases=phases, bound=tuple(states)
+        )
+        _ = bound.names
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``."""
+        return tuple(f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng})" for j in range(self.count))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return √(2/count) cos(ωⱼ·x + bⱼ) for each j."""
+        frequencies, phases = self._drawn
+        return self._amplitude * ca.cos(ca.DM(frequencies) @ x + ca.DM(phases))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        frequencies, phases = self._drawn
+        Z[:] = phases
+        for values, coordinates in zip(x, frequencies.T, strict=True):  # in one order for one row and for many
+            Z += values[:, None] * coordinates
+        np.cos(Z, out=Z)
+        Z *= self._amplitude
+
+    @property
+    def _amplitude(self) -> float:
+        return float(np.sqrt(2.0 / self.count))
+
+    @property
+    def _drawn(self) -> tuple[Float[np.ndarray, "count nx"], Float[np.ndarray, " count"]]:
+        if self.frequencies is None or self.phases is None:
+            raise DataError("RandomFourier has drawn nothing yet; call .bind(states) or pass it to edmd")
+        return self.frequencies, self.phases

@@ -1,4 +1,4 @@
-"""What the radial families share: centres, distances to them, names."""
+"""Gaussian and ThinPlate: functions of the distance to given centres."""
 
 from dataclasses import dataclass
 
@@ -91,7 +91,7 @@ class Gaussian(Lifting):
         return center_names("gaussian", self.centers, states, f"; {self.width!r}")
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return the bells."""
+        """Return exp(−‖x − c‖² / (2 width²)) for each centre."""
         return ca.vertcat(*(ca.exp(self._rate * r2) for r2 in symbolic_squared_distances(x, self.centers)))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:

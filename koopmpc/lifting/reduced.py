@@ -1,4 +1,4 @@
-"""A lifting seen through a few directions of its own space."""
+"""Reduced liftings: a projection on a few directions, and a choice of observables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class Projected(Lifting):
         return tuple(f"z{j}" for j in range(self.basis.shape[1]))
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return basisᵀ ψ(x)."""
+        """Return the r coordinates basisᵀ ψ(x)."""
         return ca.DM(np.ascontiguousarray(self.basis.T)) @ self.lifting.formula(x)
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M r"]) -> None:
@@ -67,14 +67,14 @@ class Picked(Lifting):
     Parameters
     ----------
     lifting
-        Where they are picked from.
+        The lifting that holds the observables.
     which
-        Their indices.
+        Indices of the observables to keep.
 
     Raises
     ------
     DataError
-        An index is none of the lifting's.
+        An index is not below the number of observables.
     """
 
     lifting: Lifting
@@ -92,10 +92,10 @@ class Picked(Lifting):
         return bound
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names of the chosen ones."""
+        """Return the names of the chosen observables."""
         return tuple(self.lifting.names[i] for i in self.which)
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return the chosen ones."""
+        """Return the chosen observables."""
         z = self.lifting.formula(x)
         return ca.vertcat(*(z[i] for i in self.which))

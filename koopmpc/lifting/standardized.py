@@ -1,4 +1,4 @@
-"""Another lifting on states that are centred and scaled."""
+"""Standardized: a lifting of states that are centred and scaled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ from koopmpc.values import freeze
 class Standardized(Lifting):
     """ψ(x) = inner((x − mean) / scale): the inner lifting sees states of mean 0 and spread 1.
 
-    What has a width or a distance in it (Gaussian, ThinPlate, RandomFourier) then weighs every state alike, whatever
-    its unit, and centres and widths are in standard deviations. `Standardized.of(episodes, lifting)` takes both
-    from data.
+    A lifting with a width or a distance (Gaussian, ThinPlate, RandomFourier) then weighs every state alike, whatever
+    its unit, and its centres and widths are in standard deviations. `Standardized.of(episodes, lifting)` computes mean
+    and scale from data.
 
     Parameters
     ----------
     lifting
-        The inner one.
+        The inner lifting.
     mean, scale
         (nx,) in the states' units; scale above zero.
 
@@ -57,8 +57,8 @@ class Standardized(Lifting):
     def of(cls, episodes: Episodes | Source, lifting: Lifting) -> "Standardized":
         """Return the lifting standardized by the mean and the standard deviation of the states in these data.
 
-        The states are those that a fit takes steps from, x_0 … x_{T−1} of each episode, read part by part. One
-        that does not move keeps its unit: its scale is 1.
+        The states are x_0 … x_{T−1} of each episode, read part by part. A state that does not move keeps its unit:
+        its scale is 1.
 
         Raises
         ------

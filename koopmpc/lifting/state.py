@@ -1,13 +1,16 @@
-"""The state itself, or some of it."""
+"""The state and its powers: State of degree 1, Constant of degree 0, Monomials of all degrees from 2 on."""
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, frozen, indices
+from koopmpc import checks
+from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, frozen, indices, short
 from koopmpc.values import freeze
 
 
@@ -35,7 +38,7 @@ class State(Lifting):
         return x if self.whole else x[self.chosen]
 
     def lift_into(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
-        """Write the chosen states of the rows of X; rows need not be turned into columns for it."""
+        """Write the chosen states of the rows of X, without the detour over columns."""
         Z[:] = X if self.whole else X[:, self.chosen]
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
@@ -43,7 +46,7 @@ class State(Lifting):
 
     @property
     def whole(self) -> bool:
-        """Whether it is all of the state, in its order."""
+        """True where all states are chosen, in their order."""
         return self.states is None
 
     @cached_property
@@ -57,12 +60,55 @@ class Constant(Lifting):
     """ψ(x) = 1; the observable is named ``"1"``."""
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the one name."""
+        """Return the name ``"1"``."""
         return (CONSTANT,)
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return 1."""
+        """Return the number 1 as a symbol."""
         return ca.SX(1)
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         Z[:] = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Monomials(Lifting):
+    """ψ(x) = all x₁^a₁ … xₙ^aₙ of total degree a₁ + … + aₙ from 2 to `degree`, in graded order.
+
+    Degree 1 is `State`, degree 0 is `Constant`; add them where they are wanted.
+    """
+
+    degree: int
+
+    def __post_init__(self) -> None:
+        freeze(self, degree=checks.count(self.degree, "degree", 2))
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"theta^2*omega"``."""
+        names = [short(state) for state in states]
+        powers = (Counter(factors) for factors in _factors(len(states), self.degree))
+        return tuple("*".join(names[i] + (f"^{p}" if p > 1 else "") for i, p in each.items()) for each in powers)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return each monomial as one of a degree less times a state."""
+        known: dict[tuple[int, ...], ca.SX] = {(i,): x[i] for i in range(x.shape[0])}
+        for factors in self._all:
+            known[factors] = known[factors[:-1]] * x[factors[-1]]
+        return ca.vertcat(*(known[factors] for factors in self._all))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        known: dict[tuple[int, ...], np.ndarray] = {(i,): column for i, column in enumerate(x)}
+        for j, factors in enumerate(self._all):
+            product = known[factors[:-1]] * x[factors[-1]]
+            if len(factors) < self.degree:
+                known[factors] = product
+            Z[:, j] = product
+
+    @cached_property
+    def _all(self) -> list[tuple[int, ...]]:
+        return _factors(len(self.bound_states), self.degree)
+
+
+def _factors(nx: int, degree: int) -> list[tuple[int, ...]]:
+    """Return the monomials of degree 2 … `degree` as ascending lists of state indices."""
+    return [c for d in range(2, degree + 1) for c in combinations_with_replacement(range(nx), d)]

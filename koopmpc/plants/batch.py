@@ -11,7 +11,7 @@ from koopmpc.errors import DataError
 from koopmpc.plants import compiled
 from koopmpc.plants.graph import Graph
 
-_WORTH_COMPILING = 20_000  # steps; a compiler takes 0.2 s, in which the interpreter makes about that many
+_WORTH_COMPILING = 20_000  # steps that the interpreter makes in 0.2 s, the time of a compiler
 _LONGEST = 5_000  # operations of F; the compiler's time grows faster than its code
 _WIDE = 64  # episodes from which numpy columns beat one call a step
 _CHUNK = 4096  # episodes at a time, so that the columns stay in the cache
@@ -20,8 +20,8 @@ _CHUNK = 4096  # episodes at a time, so that the columns stay in the cache
 class Batch:
     """Fills X (E, T+1, nx) from X[:, 0] and U (E, T, nu).
 
-    F made of SX operations runs as generated C where there is a compiler and enough to do, else as its
-    expression graph over numpy columns; all others (implicit integrators, matrices) are called step by step.
+    F made of SX operations runs as generated C where there is a compiler and the batch is large enough, else as its
+    expression graph over numpy columns. Any other F (implicit integrators, matrices) is called step by step.
     """
 
     def __init__(self, step: compiled.Buffered) -> None:
@@ -97,7 +97,7 @@ def vectorised(graph: Graph, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndar
 
 
 def warn_of(error: RuntimeError, x: np.ndarray, u: np.ndarray) -> None:
-    """Warn that an implicit step from (x, u) has no answer; a numerical outcome, so nothing is raised."""
+    """Warn that an implicit step from (x, u) has no solution; a numerical outcome raises nothing."""
     reason = str(error).strip().splitlines()[-1]
     warnings.warn(
         f"the integrator found no x⁺ from x={x}, u={u}; x⁺ is NaN, try a smaller dt ({reason})",

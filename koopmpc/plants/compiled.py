@@ -154,7 +154,7 @@ def private_cache() -> Path | None:
 
 
 def _private(folder: Path) -> bool:
-    """Return whether nobody but this user (and root) can change what `folder` holds or where its path leads."""
+    """Return True where only this user and root can write into `folder` or change its path."""
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
         return False
@@ -166,7 +166,7 @@ def _private(folder: Path) -> bool:
 
 
 def _compile(text: str, command: list[str], path: Path) -> Path:
-    """Compile into a folder of our own beside `path`, then move there in one stroke."""
+    """Compile in a temporary folder beside `path`, then move the file to `path` in one step."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         code, library = Path(folder) / "step.c", Path(folder) / "step.so"
         code.write_text(text)
@@ -212,7 +212,7 @@ int koopmpc_call(const double** arg, double** res, casadi_int* iw, double* w) {
 class Routine:
     """`function` that reads `arguments` and writes `results`, float64 arrays that hold matrices column by column.
 
-    Both routes give the same numbers. What the interpreter alone can do (implicit integrators), it does.
+    Machine code and the interpreter give the same numbers. Implicit integrators run in the interpreter.
     """
 
     def __init__(self, function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
@@ -222,7 +222,7 @@ class Routine:
             assert array.dtype == np.float64, "machine code reads float64"
             assert array.flags.c_contiguous, "machine code reads contiguous arrays"
             assert array.size == size, f"an array has {array.size} entries, the function {size}"
-        self._kept: list[Any] = [*arguments, *results]  # neither route holds the arrays that it points to
+        self._kept: list[Any] = [*arguments, *results]  # both routes hold pointers, and no reference to the arrays
         call = _machine(function, arguments, results, self._kept)
         self.compiled = call is not None
         if call is None:
@@ -258,7 +258,7 @@ def _machine(
 def _interpreter(
     function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
 ) -> tuple[Callable[[], None], Any]:
-    """Return what evaluates `function` on these arrays, and the buffer to keep: CasADi holds neither it nor them."""
+    """Return the call that evaluates `function` on these arrays, and its buffer: CasADi keeps no reference to them."""
     buffer, evaluate = cast("tuple[Any, Callable[[], None]]", function.buffer())
     for i, array in enumerate(arguments):
         if array.size:

@@ -32,7 +32,7 @@ class Dynamics(Named, ABC):
 
 @runtime_checkable
 class Plant(Protocol):
-    """What `simulate` and `collect` drive: hardware, another simulator, or a step map as a `SimulatedPlant`."""
+    """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`."""
 
     @property
     def dt(self) -> float:
@@ -69,7 +69,7 @@ class Plant(Protocol):
 
 
 def require_plant(plant: object) -> None:
-    """Raise where `plant` cannot be driven, naming what it lacks."""
+    """Raise a DataError that names the missing member where `plant` is no Plant."""
     if isinstance(plant, Dynamics):
         raise DataError(
             f"the plant is {type(plant).__name__}, ẋ = f(x, u) without a sample time; discretize it first: "
@@ -112,6 +112,7 @@ def output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
 
 
 def _expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
+    """Return the value as a dense column; raise where it is none, or holds symbols other than `known`."""
     if not isinstance(value, ca.SX | ca.DM):
         raise DataError(f"{name} returned a {type(value).__name__}; return one column, ca.vertcat(...)")
     column = ca.SX(value)
@@ -125,6 +126,7 @@ def _expression(value: object, name: str, known: ca.SX, rows: int | None = None)
 
 
 def _check_names(dynamics: Dynamics) -> None:
+    """Check that states and inputs are tuples of names, and that there is a state."""
     for field in ("states", "inputs"):
         names = cast("object", getattr(dynamics, field, None))
         if not isinstance(names, tuple) or not all(isinstance(n, str) for n in cast("tuple[object]", names)):

@@ -144,7 +144,7 @@ class Graph(Value):
                     raise DataError(f"a graph has no operation {step!r}; it has {', '.join(OPERATIONS)}")
                 known = registers.issuperset((first, second)[: OPERATIONS[step].operands])
             if not known or not 0 <= target < len(self.steps):
-                raise DataError(f"step {step!r} at {(target, first, second)} uses what is not there")
+                raise DataError(f"step {step!r} at {(target, first, second)} uses a missing register")
             if step != "output":
                 registers.add(target)
         if len(outputs) != self.m:
@@ -246,7 +246,7 @@ class Graph(Value):
 
 
 def _scalar(function: ca.Function) -> ca.Function:
-    """Return `function` as one of dense SX scalars."""
+    """Return `function` as an SX function of dense scalars."""
     if function.n_out() != 1:
         raise ShapeError(f"{function.name()} has {function.n_out()} results, expected one")
     if function.is_a("SXFunction"):
@@ -259,4 +259,5 @@ def _scalar(function: ca.Function) -> ca.Function:
 
 
 def _refused(code: int) -> str:
+    """Return CasADi's name of an operation."""
     return next(name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == code)[3:].lower()

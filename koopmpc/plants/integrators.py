@@ -1,4 +1,4 @@
-"""From ẋ = f(x, u) to x⁺ = F(x, u) over one sample dt, u held."""
+"""Integrators: from ẋ = f(x, u) to x⁺ = F(x, u) over one sample dt, u held."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from koopmpc.errors import DataError
 
 
 class Integrator(ABC):
-    """A one-step method."""
+    """A one-step method that turns ẋ = f(x, u) into x⁺ = F(x, u), with u held."""
 
     @abstractmethod
     def step(self, f: ca.Function, dt: float) -> ca.Function:

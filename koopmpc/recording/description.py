@@ -1,4 +1,4 @@
-"""Description: what does not change from step to step of a run, as exact JSON and as a page to read."""
+"""Description of a run, the data that do not change from step to step: as exact JSON and as a page to read."""
 
 import dataclasses
 import json
@@ -17,18 +17,19 @@ from koopmpc.errors import LogError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
 from koopmpc.loop.run import About
+from koopmpc.validate.text import markdown_table
 from koopmpc.values import from_data, to_data
 
 _FORMAT = "koopmpc-log-1"
 
 
 def application_of(about: About) -> str:
-    """Return one application a problem: Rerun keeps the layouts that people make by it."""
+    """Return the Rerun application of the problem; Rerun stores the layouts of its users by application."""
     return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]", "_", str(about.metadata.get("problem", "run")))
 
 
 def title_of(about: About) -> str:
-    """Return problem, case, controller and fault, as far as they are known."""
+    """Return problem, case, controller and fault in one line, without those that are unknown."""
     parts = [about.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
     return " · ".join(str(p) for p in parts if p is not None) or "run"
 
@@ -40,7 +41,7 @@ def to_json(about: About, steps: int | None) -> str:
 
 
 def from_json(text: str) -> tuple[About, int | None]:
-    """Return what `to_json` wrote.
+    """Return the description and the number of steps that `to_json` wrote.
 
     Raises
     ------
@@ -55,37 +56,41 @@ def from_json(text: str) -> tuple[About, int | None]:
     except (ValueError, KeyError, TypeError) as error:
         raise LogError(f"the description is damaged: {error}") from error
     if not isinstance(about, About):
-        raise LogError(f"the description holds a {type(about).__name__}, not what a run is about")
+        raise LogError(f"the description holds a {type(about).__name__} in place of the description of a run")
     return about, steps
 
 
 def to_markdown(about: About) -> str:
-    """Return a page that says what ran, under which cost and limits, with which seeds and versions."""
+    """Return a page with the problem, the cost, the limits, the seeds and the versions of a run."""
     lines = [f"# {title_of(about)}", ""]
     if "title" in about.metadata:
         lines += [str(about.metadata["title"]), ""]
     lines += [f"**States** {', '.join(about.states)}  ", f"**Inputs** {', '.join(about.inputs)}  "]
     lines += [f"**Sampling time** {about.dt:g} s", ""]
     if about.cost is not None:
-        lines += ["| cost | value |", "|---|---|", *_table(about.cost, about), ""]
+        lines += [_table("cost", _fields(about.cost, about)), ""]
     if about.limits is not None:
-        lines += ["| limits | value |", "|---|---|", *_table(about.limits, about), ""]
-    rows = [(key, value) for key, value in about.metadata.items() if key != "title"]
-    rows.append(("written with", _versions()))
-    lines += ["| run | value |", "|---|---|", *(f"| {key} | {_short(value)} |" for key, value in rows), ""]
+        lines += [_table("limits", _fields(about.limits, about)), ""]
+    run = {key: value for key, value in about.metadata.items() if key != "title"}
+    lines += [_table("run", run | {"written with": _versions()}), ""]
     return "\n".join(lines)
 
 
 def metrics_to_markdown(metrics: Metrics, tracked: tuple[str, ...]) -> str:
     """Return the metrics as a table."""
-    rows = [f"| {name} | {_short(value)} |" for name, value in metrics.figures(tracked).items()]
-    return "\n".join(["| metric | value |", "|---|---|", *rows])
+    return _table("metric", metrics.figures(tracked))
 
 
-def _table(value: Cost | Limits, about: About) -> list[str]:
-    pairs = [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)]
-    pairs = [(n, ", ".join(v.bind(about.states).names) if isinstance(v, Lifting) else v) for n, v in pairs]
-    return [f"| {name} | {_short(v)} |" for name, v in pairs if v is not None]
+def _table(heading: str, values: Mapping[str, Any]) -> str:
+    """Return a table of two columns: names and values."""
+    return markdown_table((heading, "value"), [(name, _short(value)) for name, value in values.items()])
+
+
+def _fields(value: Cost | Limits, about: About) -> dict[str, Any]:
+    """Return the fields of a cost or of limits that are given, a lifting by the names of its observables."""
+    fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    fields = {n: ", ".join(v.bind(about.states).names) if isinstance(v, Lifting) else v for n, v in fields.items()}
+    return {name: v for name, v in fields.items() if v is not None}
 
 
 def _short(value: Any) -> str:
@@ -98,22 +103,23 @@ def _short(value: Any) -> str:
         text = np.array2string(cast("np.ndarray", value), precision=4, threshold=16, separator=", ")
     else:
         text = str(value)
-    text = " ".join(text.split()).replace("|", "\\|")
+    text = " ".join(text.split())
     return text if len(text) <= 200 else text[:199] + "…"
 
 
 @cache
 def _versions() -> dict[str, str]:
-    found: dict[str, str] = {}
+    """Return the versions of the packages that a run depends on."""
+    versions: dict[str, str] = {}
     for package in ("koopmpc", "numpy", "casadi", "osqp", "rerun-sdk"):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "unknown"
-    return found
+            versions[package] = "unknown"
+    return versions
 
 
-# The viewer draws in Inter. It holds these, first to last; a few rare signs that it has too are not listed.
+# Ranges of the signs in Inter, the font of the viewer; a few rare signs of the font are left out.
 _RANGES = (
     (0x0020, 0x007E), (0x00A0, 0x0148), (0x014A, 0x01C3), (0x01C5, 0x031E), (0x0384, 0x038A), (0x038E, 0x03A1),
     (0x03A3, 0x03E1), (0x03F0, 0x049D), (0x04A0, 0x04FF), (0x1E00, 0x1F15), (0x2010, 0x2027), (0x202F, 0x205F),
@@ -126,7 +132,7 @@ _UNKNOWN = "?"
 
 
 def drawable(text: str) -> str:
-    """Return `text` with each sign that the viewer's font lacks spelled otherwise: 𝜓 is ψ, Uᵀ is U^T, the rest "?"."""
+    """Return `text` with other spellings of signs that the viewer's font lacks: 𝜓 is ψ, Uᵀ is U^T, the rest "?"."""
     return "".join(sign if sign in _HELD else _spelled(sign) for sign in text)
 
 

@@ -22,11 +22,12 @@ from koopmpc.scene import Color
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.report import TrustReport
 from koopmpc.validate.scoring import AnyPredictor, Score, score
+from koopmpc.validate.text import markdown_table
 
 _TRUTH: Color = (225, 228, 232)
 _PREDICTED = color(0)
 _BAND: Color = (70, 125, 185)
-_ESCAPED, _BEFORE = re.compile(r"([|*_`])"), r"\\\1"  # what Markdown would not take as it stands
+_ESCAPED, _BEFORE = re.compile(r"([*_`])"), r"\\\1"  # signs that Markdown would read as style
 _SHOWN = 6  # plots of states in one column
 _EIGENFUNCTIONS = 2  # drawn unless told
 
@@ -59,7 +60,7 @@ def record_model(
     path
         The .rrd to write; its folders are made.
     report
-        Of `trust`: its residuals, errors and bands are shown, and its text.
+        The report of `trust`, whose residuals, errors, bands and text are shown.
     horizon
         Steps ahead; the report's by default, else as long as the shortest episode.
     rollouts
@@ -70,7 +71,7 @@ def record_model(
     plane
         Two states, by index or name; the ranges are those of the episodes.
     at
-        (nx,) what the other states are held at; the median of the episodes by default.
+        (nx,) values of the other states; the median of the episodes by default.
 
     Raises
     ------
@@ -153,7 +154,7 @@ def _pictures(
     plane: Axes,
     at: ArrayLike | None,
 ) -> tuple[list[Picture], Plane | None, str]:
-    """Return the eigenfunctions, their plane, and why there are none, where none were asked for."""
+    """Return pictures of eigenfunctions, their plane, and the reason where there are none."""
     if not isinstance(predictor, LinearPredictor) or (predictor.nx < 2 and which is None):
         why = "has no eigenfunctions" if predictor.nx > 1 else "has one state: there is no plane to draw them on"
         if which is not None:
@@ -181,12 +182,12 @@ def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int
 
 
 def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str:
+    """Return the page beside the plots: the report of `trust`, a note on pictures, and a table of the model."""
     lines = [f"# Model of {', '.join(predictor.states)}", ""]
     if report is not None:
         lines += ["```", str(report), "```", ""]
     if note:
         lines += [note, ""]
-    lines += ["| model | |", "|---|---|"]
     rows = {
         "kind": type(predictor).__name__,
         "inputs": ", ".join(predictor.inputs) or "none",
@@ -203,8 +204,8 @@ def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str
             "condition": f"{fit.condition:.3g}",
         }
         rows |= {f"doubt {i + 1}": doubt for i, doubt in enumerate(fit.warnings)}
-    lines += [f"| {key} | {_ESCAPED.sub(_BEFORE, value)} |" for key, value in rows.items()]
-    return "\n".join(lines)
+    table = markdown_table(("model", ""), [(key, _ESCAPED.sub(_BEFORE, value)) for key, value in rows.items()])
+    return "\n".join([*lines, table])
 
 
 def _blueprint(

@@ -48,10 +48,10 @@ class BackgroundWriter:
     def _work(self, writer: Writer) -> None:
         """Write batches until the end; after a failure nothing more is written, and `close` returns the failure."""
         written: list[StepRows] = []  # for the metrics at the end
-        last: list[Step] = []  # held back: if it is the last one, the state that it led to is written with it
+        last: list[Step] = []  # held back, because the state after the last step is written with that step
         closing = False
         while not closing:
-            closing = self._closing.wait(_BATCH)  # a step never wakes the thread
+            closing = self._closing.wait(_BATCH)  # the thread looks at the queue five times a second
             steps = last + self._drained()
             if self._failure is not None:
                 continue
@@ -70,7 +70,7 @@ class BackgroundWriter:
                 self._failure = error
 
     def _drained(self) -> list[Step]:
-        """Return all that is in the queue now."""
+        """Return the steps that are in the queue now."""
         steps: list[Step] = []
         while True:
             try:
@@ -122,7 +122,7 @@ class Recorder:
     path
         The .rrd to write; None for a viewer alone.
     live
-        BackgroundWriter to a viewer.
+        Write to a viewer too.
     dt, states, inputs, outputs, cost, limits, angles, metadata
         As in a Run; outputs are the states by default.
     scene, model
@@ -187,7 +187,7 @@ class Recorder:
         return self
 
     def __call__(self, step: Step) -> None:
-        """Queue one step."""
+        """Queue a copy of one step for each writer; this returns within microseconds."""
         if not self._open:
             raise DataError("the Recorder is not open; call it inside `with Recorder(...) as recorder:`")
         own = _copied(step)

@@ -25,7 +25,7 @@ def find_viewer(port: int = PORT) -> str | None:
 
 
 def why_none(port: int = PORT) -> str:
-    """Return in words why `find_viewer` found none."""
+    """Return the reason in words why `find_viewer` found no viewer."""
     listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and"
     if not has_display():
         return f"{listens} there is no display to open one on"
@@ -33,7 +33,7 @@ def why_none(port: int = PORT) -> str:
 
 
 def is_up(port: int) -> bool:
-    """Return whether something listens at `port` of this machine."""
+    """Return True where a program listens at `port` of this machine."""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=0.2):
             return True
@@ -42,7 +42,7 @@ def is_up(port: int) -> bool:
 
 
 def has_display() -> bool:
-    """Return whether a window can be opened."""
+    """Return True where a window can be opened."""
     if sys.platform.startswith("linux"):
         return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     return True
@@ -79,7 +79,7 @@ def start_viewer(*arguments: str, port: int) -> "subprocess.Popen[bytes] | None"
 
 
 def program() -> Path:
-    """Return the viewer itself, not the script that starts it: that one would leave it behind when it ends."""
+    """Return the viewer's own program; the script that starts it would leave the viewer running when it ends."""
     import rerun_cli
 
     folder = Path(rerun_cli.__file__).parent
@@ -97,7 +97,7 @@ def view(logs: str | Path | Sequence[str | Path]) -> None:
     Raises
     ------
     LogError
-        A log does not exist, or is none; there is no display; the viewer does not start.
+        A log does not exist or is no .rrd file, there is no display, or the viewer does not start.
     """
     paths = _existing(logs)
     if not has_display():
@@ -115,7 +115,7 @@ def screenshot(log: str | Path, picture: str | Path, *, time: float, size: tuple
     Raises
     ------
     LogError
-        The log does not exist or is none, or there is no Vulkan driver (Debian's is mesa-vulkan-drivers).
+        The log does not exist or is no .rrd file, or there is no Vulkan driver (Debian: mesa-vulkan-drivers).
     """
     from rerun.experimental import ViewerClient
 

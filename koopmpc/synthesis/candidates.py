@@ -13,12 +13,10 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.algebra import Sum
 from koopmpc.lifting.base import Lifting, lifting_of, short
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
+from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
-from koopmpc.lifting.random_fourier import RandomFourier
 from koopmpc.lifting.standardized import Standardized
-from koopmpc.lifting.state import Constant, State
+from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.values import Arrays, Value, from_data, to_data
 
 MOST = 120  # observables of a lifting that is tried unasked

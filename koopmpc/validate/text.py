@@ -1,4 +1,4 @@
-"""How reports are written: tables, labelled lines and paragraphs in 100 columns, laid out by rich."""
+"""Text of reports: tables, labelled lines and paragraphs in 100 columns by rich; tables in Markdown."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -37,6 +37,12 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1)
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table in Markdown; a | inside a cell is escaped."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(str(cell).replace("|", r"\|") for cell in line) + " |" for line in lines)
 
 
 def labelled(pairs: Iterable[tuple[str, str]], indent: int = 0) -> Table:

@@ -106,7 +106,7 @@ def test_a_file_of_koopmpc_is_told_nothing(tmp_path: Path) -> None:
     for name in ("data.npz", "data.parquet"):
         random_episodes([2], 1, 1, 0).save(tmp_path / name)
         with pytest.raises(
-            km.errors.DataError, match=rf"{name} says itself what it holds; leave out dt, states and inputs"
+            km.errors.DataError, match=rf"{name} holds its own names and dt; leave out dt, states and inputs"
         ):
             km.load_episodes(tmp_path / name, dt=0.1)
 

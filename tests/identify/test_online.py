@@ -272,7 +272,7 @@ def test_a_controller_that_learns_tracks_a_changed_plant_better() -> None:
 
 def test_few_pairs_are_told_in_the_report_and_do_not_warn() -> None:
     online = km.OnlineEDMD(LIFTING, dt=0.1, states=("a", "b"), inputs=("u",))
-    with pytest.raises(km.errors.DataError, match="nothing was learned yet"):
+    with pytest.raises(km.errors.DataError, match="no pair was learned yet"):
         online.predictor()
     online.learn([1, 2], [3], [4, 5])
     model = online.predictor()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.lifting.base import Traced
+from koopmpc.lifting.expressions import Traced
 from koopmpc.values import from_data, to_data
 from tests.bare import shown
 from tests.lifting.families import NAMES

@@ -115,14 +115,14 @@ def test_shapes_are_named():
     ("change", "message"),
     [
         ({"steps": ["input", "system", "output"]}, "a graph has no operation 'system'"),
-        ({"places": [[0, 0, 0], [0, 7, 0], [0, 0, 0]]}, r"step 'sin' at \(0, 7, 0\) uses what is not there"),
+        ({"places": [[0, 0, 0], [0, 7, 0], [0, 0, 0]]}, r"step 'sin' at \(0, 7, 0\) uses a missing register"),
         (
             {"places": [[0, 1, 0], [0, 0, 0], [0, 0, 0]]},
-            r"step 'input' at \(0, 1, 0\) uses what is not there",
+            r"step 'input' at \(0, 1, 0\) uses a missing register",
         ),
         (
             {"places": [[-1, 0, 0], [0, 0, 0], [0, 0, 0]]},
-            r"step 'input' at \(-1, 0, 0\) uses what is not there",
+            r"step 'input' at \(-1, 0, 0\) uses a missing register",
         ),
         ({"m": 2}, "1 of 2 results are written"),
         ({"steps": ["input", "sin"]}, "places has 3 rows, expected 2, one a step"),

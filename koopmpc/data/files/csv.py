@@ -19,7 +19,7 @@ _TEXT = ("utf-8-sig", "latin-1")
 
 
 def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str) -> None:
-    """Write the stacked rows under a line that says what they are; the inputs of an episode's last row stay empty."""
+    """Write the stacked rows below a line of metadata; the inputs of an episode's last row stay empty."""
     episode, step = positions(steps)
     last = step == steps[episode]
     lines = [",".join(_quoted(name) for name in ("episode", "step", *names))]
@@ -33,7 +33,7 @@ def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names
 
 
 def described(path: Path) -> str | None:
-    """Return what the first line says of the table where `write` wrote it, else None."""
+    """Return the metadata in the first line of a table that `write` wrote; None for any other table."""
     with path.open("rb") as file:
         line = file.readline(1_000_000)
     text = line.decode(_TEXT[0], errors="replace")
@@ -115,6 +115,7 @@ def read(path: Path, about: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, st
 
 
 def _values(column) -> np.ndarray:
+    """Return an Arrow column as an array: time stamps in seconds, an empty column as NaN."""
     import pyarrow as pa
 
     kind = column.type
@@ -138,20 +139,20 @@ def _quoted(name: str) -> str:
 
 
 def numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
-    """Return a column of objects as floats, None as NaN; a column of text as it is, if it is no spoilt one.
+    """Return a column of objects as floats, None as NaN; return a column of text unchanged.
 
     Parameters
     ----------
     column
         (rows,) of any kind.
     name, where
-        For messages: the column, and its file.
+        The column and its file, for messages.
 
     Raises
     ------
     DataError
-        Half of the cells or more are numbers, written with a decimal comma or as complex ones perhaps, and
-        another is none: the column would be lost for one cell.
+        At least half of the cells look like numbers, but one is no real number: a decimal comma, a complex number or
+        a word. The whole column would be lost for that cell.
     """
     if column.dtype.kind != "O":
         return column

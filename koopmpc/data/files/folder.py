@@ -23,25 +23,25 @@ class Files(Source):
     """The episodes of a folder's .npz, .parquet, .csv and .rrd files, in the order of their names.
 
     A part is a file, or several small neighbours, or a group of rows of a large .parquet file that `Episodes.save`
-    wrote; it is read when its turn comes, and not kept. All other files are read whole: a .npz of 10 GB needs 10 GB
-    of memory and more, the same episodes as .parquet some 10 MB. The first file tells dt and names, and each other
-    must agree.
+    wrote; it is read when its turn comes, and not kept. All other files are read whole: a .npz of 10 GB needs more
+    than 10 GB of memory, the same episodes as .parquet some 10 MB at a time. The first file defines dt and the names,
+    and every other file must have the same.
 
     Parameters
     ----------
     paths
         A folder, or files in the order in which they count.
     reader
-        Path → Episodes; `load_episodes` by default. For other processes it stands at the top of a module.
+        Path → Episodes; `load_episodes` by default. With workers it must be defined at the top of a module.
     reading
-        What `load_episodes` is to be told of plain tables: ``dt=``, ``states=``, ``inputs=``, ….
+        Keywords of `load_episodes` for plain tables: ``dt=``, ``states=``, ``inputs=``, ….
 
     Raises
     ------
     LogError
         A file is missing or cannot be read, or the folder holds none.
     DataError
-        The first file is not of the kind that was told.
+        The first file does not fit the keywords, or a reader is given together with keywords.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Files(Source):
 
 @dataclass(frozen=True, eq=False)
 class FilePart(Part):
-    """Files that are read as one part."""
+    """Several files that are read together as one part."""
 
     files: tuple[Path, ...]
     reader: Reader
@@ -110,6 +110,7 @@ class FilePart(Part):
 
 
 def _read(file: Path, reader: Reader) -> Episodes:
+    """Return the episodes of the file; an error of the reader names the file."""
     try:
         return reader(file)
     except KoopmpcError as error:

@@ -14,7 +14,7 @@ def read_arrays(file: Path, needed: tuple[str, ...]) -> Arrays:
     Raises
     ------
     ValueError
-        It cannot be read, or lacks an array; the text is the cause, in words for people.
+        The file cannot be read, or lacks an array; the message says why.
     """
     if not is_zipfile(file):
         raise ValueError("it is no .npz file, or was cut")

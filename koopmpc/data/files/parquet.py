@@ -21,12 +21,12 @@ ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
 
 def check_names(names: tuple[str, ...], suffix: str) -> None:
-    """Raise where a state or an input is named like one of the table's own columns.
+    """Check that no state or input has the name of one of the table's own columns.
 
     Raises
     ------
     DataError
-        One is.
+        One is named "episode" or "step".
     """
     for name in ("episode", "step"):
         if name in names:
@@ -50,7 +50,7 @@ def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names
 
 
 def described(path: Path) -> bool:
-    """Return whether the table says what it holds: whether `write` wrote it.
+    """Return True where `write` wrote the table, so that it holds its own metadata.
 
     Raises
     ------
@@ -105,11 +105,11 @@ class RowGroup(Part):
     Attributes
     ----------
     file
-        What `Episodes.save` wrote.
+        A file that `Episodes.save` wrote.
     stretches
         (first row, steps) of each.
     plant
-        What the file must agree with; None for the file that tells it.
+        The sample time and names that the file must have; None for the first file, which defines them.
     """
 
     file: Path

@@ -1,4 +1,4 @@
-"""Rows of a table as uniformly sampled episodes: where sampling breaks, values are missing, or time is unequal."""
+"""Rows of a table as uniformly sampled episodes, cut at gaps in time and at missing values."""
 
 import warnings
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, FitWarning
 
 _JITTER = 0.02  # share of dt by which a step may differ
-_GAP = 1.5  # steps longer than this times dt are gaps
+_GAP = 1.5  # a step longer than 1.5 dt is a gap
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """Rows of one episode: time [s] or None, states, inputs, disturbances; `rows` says where in the file they stand."""
+    """Rows of one episode: time [s] or None, states, inputs, disturbances; `rows` are their numbers in the file."""
 
     time: Float[np.ndarray, " M"] | None
     X: Float[np.ndarray, "M nx"]
@@ -47,7 +47,7 @@ def sample_time(times: list[np.ndarray], where: str) -> float:
 
 
 def restarts(signals: Signals) -> list[Signals]:
-    """Return the parts between which time goes back: a recorder that was started anew."""
+    """Return the parts between steps back in time, where a recorder was started anew."""
     if signals.time is None:
         return [signals]
     at = _edges(np.diff(signals.time) < 0)
@@ -57,8 +57,8 @@ def restarts(signals: Signals) -> list[Signals]:
 def resampled(signals: Signals, dt: float) -> list[Signals]:
     """Return the rows at t₀, t₀ + dt, …: states between two rows interpolated, inputs and disturbances held.
 
-    Rows with a value missing are left out first. A step of more than 1.5 times both dt and the median step is a gap,
-    and cuts.
+    Rows with a missing value are left out first. A step of more than 1.5 times both dt and the median step is a gap,
+    where the signals are cut.
     """
     assert signals.time is not None, "only a table with a time column is resampled"
     whole = np.isfinite(signals.X).all(axis=1) & np.isfinite(signals.time)
@@ -91,7 +91,7 @@ def _on_grid(part: Signals, dt: float) -> Signals:
 
 
 def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:
-    """Return the episodes between gaps; a warning counts what was cut and lost.
+    """Return the episodes between gaps; a warning counts the gaps and the lost rows.
 
     A gap is a missing value, a step of time of more than 1.5 dt, or a row without a neighbour.
 
@@ -130,7 +130,7 @@ def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:
 
 
 def _runs(part: Signals, dt: float, where: str, gaps: list[int]) -> list[tuple[int, int]]:
-    """Return [first, last) of what is sampled without a gap, and note the file's rows before the gaps."""
+    """Return [first, last) of each stretch without a gap; append the file's rows before the gaps to `gaps`."""
     known = np.asarray(np.isfinite(part.X).all(axis=1), dtype=np.bool_)
     driven = np.asarray(np.isfinite(np.hstack([part.U, part.W])).all(axis=1), dtype=np.bool_)
     joined = known[:-1] & known[1:] & driven[:-1]  # row k leads to row k + 1

@@ -1,4 +1,4 @@
-"""Episodes in files, to the bit: .npz, .parquet and .csv; and plain tables, as users have them."""
+"""Episodes in .npz, .parquet and .csv files, exact to the bit, and in plain tables of users."""
 
 import json
 from collections.abc import Sequence
@@ -52,12 +52,12 @@ def load_episodes(
 ) -> Episodes:
     """Read the episodes of one file, or of several as one set.
 
-    Files that `Episodes.save` wrote, and logs of runs, say themselves what they hold. Any other .csv or .parquet is
-    a table with a row a time step and a column each state and input. A column ``t``, ``time [s]``, ``time [ms]`` or
-    ``timestamp`` tells the sample time; where it goes back an episode ends. ``episode``, ``run`` or ``trial`` tells
-    episodes apart, by numbers or names; ``step`` puts rows in order where there is no time. Columns named ``u``,
-    ``u0``, ``u_left``, ``force``, ``torque``, ``cmd``, ``input`` and the like are inputs, ``w`` and ``disturbance``
-    measured disturbances, all others of numbers states; what is told counts before what is guessed. The inputs of
+    Files that `Episodes.save` wrote, and logs of runs, hold their own names and dt. Any other .csv or .parquet is a
+    table with a row for each time step and a column for each state and input. A column ``t``, ``time [s]``,
+    ``time [ms]`` or ``timestamp`` tells the sample time; where it goes back an episode ends. ``episode``, ``run`` or
+    ``trial`` tells episodes apart, by numbers or names; ``step`` orders rows without time. Columns named ``u``, ``u0``,
+    ``u_left``, ``force``, ``torque``, ``cmd``, ``input`` and the like are inputs, ``w`` and ``disturbance``
+    measured disturbances, all other columns of numbers are states; arguments count before such guesses. The inputs of
     an episode's last row are not read. Missing values and gaps in time cut episodes, and a warning counts them.
 
     Parameters
@@ -82,7 +82,7 @@ def load_episodes(
     Warns
     -----
     FitWarning
-        Gaps, columns that are constant or repeat another, or no column that is named as an input.
+        There are gaps, columns that are constant or repeat another, or no column with the name of an input.
     """
     told = Told(dt, states, inputs, disturbances, resample)
     files = [Path(file) for file in (path, *more)]
@@ -105,7 +105,7 @@ def _read(file: Path, told: Told) -> Episodes:
         distinct = [name for name in names if names.count(name) == 1]
         return read_table(file, names, parquet.columns(file, distinct), told)
     if not told.nothing:
-        raise DataError(f"{file} says itself what it holds; leave out dt, states and inputs")
+        raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
     if suffix in _READERS:
         module, reader = _READERS[suffix]
         return cast("Episodes", getattr(import_module(module), reader)(file))

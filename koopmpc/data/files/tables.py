@@ -27,7 +27,7 @@ _PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min":
 
 @dataclass(frozen=True)
 class Roles:
-    """The columns of a table by what they are; `scale` is the time's unit in seconds."""
+    """The role of each column of a table; `scale` is the unit of the time column in seconds."""
 
     states: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -53,12 +53,13 @@ def roles(
     disturbances: Sequence[str] | None,
     numeric: Sequence[str],
 ) -> Roles:
-    """Return what each column is.
+    """Return the role of each column.
 
-    What is not told is read from the names: ``t``, ``time [s]`` and ``timestamp`` are time; ``episode``, ``run``,
-    ``trial`` and ``trajectory`` number the episodes; ``u``, ``u0``, ``u_left``, and what begins with input, control,
-    command, cmd, action, force, torque, thrust, voltage, steering, throttle or duty, are inputs; ``w``, ``w0`` and
-    ``disturbance`` are measured disturbances; every other column of numbers is a state.
+    Roles that the caller does not give are read from the names: ``t``, ``time [s]`` and ``timestamp`` are time;
+    ``episode``, ``run``, ``trial`` and ``trajectory`` number the episodes; ``u``, ``u0``, ``u_left``, and names
+    that begin with input, control, command, cmd, action, force, torque, thrust, voltage, steering, throttle or
+    duty, are inputs; ``w``, ``w0`` and ``disturbance`` are measured disturbances; every other column of numbers is
+    a state.
 
     Parameters
     ----------
@@ -67,12 +68,12 @@ def roles(
     where
         The file, for messages.
     states, inputs, disturbances
-        What is told.
+        Names that the caller gives; None leaves the role to the names.
 
     Raises
     ------
     DataError
-        A told column is missing or there twice, or no column is left for a state.
+        A given column is missing or stands twice, or no column is left for a state.
     """
     for what, given in (("states", states), ("inputs", inputs), ("disturbances", disturbances)):
         if isinstance(given, str):
@@ -118,7 +119,7 @@ def roles(
 
 
 def label(name: str) -> bool:
-    """Return whether a column of this name tells rows or episodes apart, and so need not hold numbers."""
+    """Return True for the name of a time or episode column, which need not hold numbers."""
     return _TIME.fullmatch(_stem(name)) is not None or _EPISODE.fullmatch(_stem(name)) is not None
 
 
@@ -134,7 +135,7 @@ def _unit(name: str) -> str:
 
 @dataclass(frozen=True)
 class Told:
-    """What the caller says of a table; None is found out."""
+    """The caller's knowledge of a table; None is inferred from the table."""
 
     dt: float | None = None
     states: Sequence[str] | None = None
@@ -144,7 +145,7 @@ class Told:
 
     @property
     def nothing(self) -> bool:
-        """Whether all is to be found out."""
+        """True where the caller gives nothing."""
         return all(value is None for value in vars(self).values())
 
 
@@ -154,19 +155,19 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
     Parameters
     ----------
     file
-        For messages.
+        The table's file, for messages.
     names
-        All columns, in their order.
+        Names of all columns, in their order.
     columns
-        Those whose names are there once.
+        The columns whose names stand once.
     told
-        What need not be found out.
+        The caller's knowledge, which need not be inferred.
 
     Raises
     ------
     DataError
-        Something is not told and cannot be found out, a column is missing or holds a cell that is no number, or its
-        rows are no whole episodes.
+        A role or the sample time is neither given nor inferable, a column is missing or holds a cell that is no
+        number, or the rows are no whole episodes.
     """
     where = str(file)
     rows = len(next(iter(columns.values()))) if columns else 0
@@ -230,7 +231,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
 
 
 def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
-    """Warn of what a guess may have taken for something else, and of columns that say nothing."""
+    """Warn of roles that may be guessed wrongly, and of columns that are constant or repeat another."""
     if alone:
         warnings.warn(
             f"{where}: no column is named as an input, so the plant is taken to run by itself; its states are "
@@ -257,6 +258,7 @@ def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: boo
 
 
 def _time(column: np.ndarray, found: Roles) -> Float[np.ndarray, " M"]:
+    """Return the time of each row [s]."""
     return checks.array(column, str(found.time), (None,), finite=False) * found.scale
 
 

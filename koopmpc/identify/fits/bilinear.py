@@ -34,12 +34,12 @@ def bilinear_edmd(
 ) -> BilinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
 
-    Nothing is added to the lifting. Where it holds a Constant, its columns of Nᵢ are zero: uᵢ · 1 is what B is for.
+    The lifting is used as given. Where it holds a Constant, the columns of Nᵢ for it are zero: B multiplies uᵢ · 1.
 
     Parameters
     ----------
     episodes
-        With inputs, or a Source of such; no pair spans two of them.
+        Episodes with inputs, or a Source of them; no pair spans two episodes.
     lifting
         ψ: R^nx → R^nz. C picks the states where it holds them, by name, else it is fitted.
     embedding
@@ -53,11 +53,11 @@ def bilinear_edmd(
         Names of the observables that inputs multiply, for an input-affine model ψ(x⁺) = A ψ(x) + G(x) u whose G
         is spanned by 1 and these; all by default.
     difference
-        Regress ψ(x⁺) − ψ(x), and A = I + what is found. Without a ridge and on independent columns it is the same
-        model; a ridge, or a cut, then draws z⁺ towards z ("nothing changes") instead of towards zero, which is
-        nearer the truth for a short dt.
+        Regress ψ(x⁺) − ψ(x) and add I to A. Without a ridge and on independent columns the model is the same. A
+        ridge, or a cut of singular values, then draws z⁺ towards z instead of towards zero, which is nearer the truth
+        for a short dt.
     **options
-        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
+        ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def bilinear_edmd(
         state_residual = np.hypot(state_residual, lost(given.P[:, :nz], basis, regression.C, given.samples))
         which = np.arange(len(basis.T))
     r = len(basis.T)
-    start = np.eye(P.shape[1], r) @ basis.T * difference  # what stands in K before anything is learned
+    start = np.eye(P.shape[1], r) @ basis.T * difference  # K of the model z⁺ = z, or zero
     change = RegressionRows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples)
     solution = solve(change, ridge=ridge)
     K = (solution.K + start) @ basis
@@ -139,7 +139,7 @@ def bilinear_edmd(
 
 
 def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
-    """Return where the observables of these names are; a Constant is left out, for u times it is u."""
+    """Return the indices of the observables with these names, without a Constant, whose product with u is u itself."""
     place = {name: i for i, name in enumerate(total.lifting.names)}
     for name in products:
         if name not in place:
@@ -150,7 +150,7 @@ def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
 
 
 def _with_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
-    """Return the rows with u⊗ψ(x) of these observables only."""
+    """Return the rows with the products u⊗ψ(x) of the observables `which` alone."""
     first = total.nz + len(total.inputs)
     block = np.flatnonzero(np.isin(total.products, which))
     columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
@@ -160,7 +160,7 @@ def _with_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, 
 def _projected(
     P: Float[np.ndarray, "m n"], basis: Float[np.ndarray, "nz r"], nu: int, which: Int[np.ndarray, " np"]
 ) -> Float[np.ndarray, "m _"]:
-    """Return [z u u⊗z], z = basisᵀ ψ, from [ψ u u⊗ψ] without u times a Constant, which is u."""
+    """Return [z u u⊗z], z = basisᵀ ψ, from [ψ u u⊗ψ], whose products leave out a Constant: u · 1 is u."""
     nz = len(basis)
     U = P[:, nz : nz + nu]
     constant = np.delete(basis, which, axis=0).sum(axis=0)

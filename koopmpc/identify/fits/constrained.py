@@ -1,153 +1,22 @@
-# pyright: basic
 """EDMD under priors: known entries by plain linear algebra, bounds and couplings by a convex program."""
 
-import warnings
 from typing import Unpack
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import DataError
-from koopmpc.identify.fits.prior import Combination, Dissipation, Entries, Prior, entries_of
+from koopmpc.identify.fits.convex import optimum, violation
+from koopmpc.identify.fits.prior import Entries, Prior, entries_of
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
-
-def optimum(
-    rows: RegressionRows, entries: Entries, which: Int[np.ndarray, " r"], ridge: float, prior: Prior | None
-) -> tuple[Float[np.ndarray, "n r"], str]:
-    """Return K = argmin Σᵢ ‖tᵢ − P kᵢ‖² / ‖tᵢ‖² (+ ridge) over the targets `which`, and the solver's status.
-
-    Columns of P and targets have unit norm in the program, so units of the data mean nothing. `prior` brings what
-    couples the rows of [A B]; the targets are then all observables.
-
-    Raises
-    ------
-    DataError
-        No A and B meet the priors, or the solver gives up.
-    """
-    import cvxpy as cp
-    from scipy.sparse import csc_array
-
-    n, nz = rows.P.shape[1], len(which)
-    size = _ones(norms(rows.P))
-    energy = np.sum(rows.T[:, which] ** 2, axis=0) + rows.rest[which]
-    unit = _ones(np.sqrt(energy))
-    scale = unit / size[:, None]  # K = X · scale
-    known = entries.known[which].T
-    free = np.isnan(known)
-    count = int(free.sum())
-    x = cp.Variable(count)
-    place = np.flatnonzero(free.ravel(order="F"))
-    select = csc_array((np.ones(count), (place, np.arange(count))), shape=(n * nz, count))
-    fixed = np.where(free, 0.0, known / scale).ravel(order="F")
-    X = cp.reshape(select @ x + fixed, (n, nz), order="F")
-    misfit = cp.sum_squares((rows.P / size) @ X - rows.T[:, which] / unit)
-    bounds = []
-    for limit, sign in ((entries.low, -1.0), (entries.high, 1.0)):
-        values = (limit[which].T / scale).ravel(order="F")[place]
-        held = np.flatnonzero(np.isfinite(values))
-        if held.size:
-            bounds.append(sign * x[held] <= sign * values[held])
-    if prior is not None:
-        bounds += _coupling(cp, prior, X, scale, size / np.sqrt(rows.samples))
-    problem = cp.Problem(cp.Minimize(misfit + ridge * cp.sum_squares(X)), bounds)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is said in the report
-        try:
-            problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11, max_iter=200)
-        except cp.SolverError as error:
-            raise DataError(f"the priors could not be met: Clarabel says {error}; loosen them") from error
-    status = str(problem.status)
-    if status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE):
-        raise DataError(f"no A and B meet all priors: Clarabel says {status!r}; loosen or drop one of them")
-    if X.value is None:
-        raise DataError(f"the fit under priors stopped: Clarabel says {status!r}; loosen the priors")
-    return np.asarray(X.value) * scale, status
-
-
-def violation(
-    prior: Prior, A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"], size: Float[np.ndarray, " n"]
-) -> float:
-    """Return by how much the coupling priors are missed, in units of the regressors' sizes; 0 if they hold."""
-    nz = len(A)
-    worst = 0.0
-    if prior.symmetric:
-        worst = float(np.abs(A - A.T).max()) / max(float(np.abs(A).max()), 1e-300)
-    for each in prior.combinations:
-        value = sum(
-            float(np.sum(w * m)) for w, m in ((each.A, A), (each.B, B)) if w is not None
-        )  # the sum of weighted entries
-        worst = max(worst, each.low - value, value - each.high)
-    if prior.dissipation is not None:
-        M = _dissipation(prior.dissipation, A, B, size[:nz], size[nz:], np.block)
-        worst = max(worst, -float(np.linalg.eigvalsh(M)[0]))
-    return worst
-
-
-def _coupling(cp, prior: Prior, X, scale, size) -> list:
-    nz = scale.shape[1]
-    K = cp.multiply(scale, X)
-    A, B = K[:nz].T, K[nz:].T
-    found = []
-    if prior.symmetric:
-        W = scale[:nz].T
-        balance = np.sqrt(W / W.T)
-        S = cp.multiply(balance, X[:nz].T)
-        found.append(cp.upper_tri(S) == cp.upper_tri(S.T))
-    for each in prior.combinations:
-        found += _limits(cp, each, A, B)
-    if prior.dissipation is not None:
-        M = _dissipation(prior.dissipation, A, B, size[:nz], size[nz:], cp.bmat)
-        found.append(0.5 * (M + M.T) >> 0)
-    return found
-
-
-def _limits(cp, each: Combination, A, B) -> list:
-    total = 0
-    for weights, matrix in ((each.A, A), (each.B, B)):
-        if weights is not None and weights.size:
-            total = total + cp.sum(cp.multiply(weights, matrix))
-    if each.low == each.high:
-        return [total == each.low]
-    ends = []
-    if np.isfinite(each.low):
-        ends.append(total >= each.low)
-    if np.isfinite(each.high):
-        ends.append(total <= each.high)
-    return ends
-
-
-def _dissipation(dissipation: Dissipation, A, B, size, force, block):
-    """Return M ⪰ 0 ⇔ V(A z + B u) ≤ decay² V(z) + uᵀ(C z + D u): a Schur complement, P = LᵀL.
-
-    z and u are taken in units of their sizes, V in units of its largest diagonal entry there.
-    """
-    values, vectors = np.linalg.eigh(dissipation.P)
-    held = values > 1e-12 * max(values[-1], 0.0)
-    L = np.sqrt(values[held])[:, None] * vectors[:, held].T
-    unit = max(float((dissipation.P.diagonal() * size**2).max()), 1e-300) ** -0.5
-    z, u = np.diag(size * unit), np.diag(force * unit)
-    P = dissipation.decay**2 * z @ dissipation.P @ z
-    LA = (L @ A) @ z
-    if dissipation.C is None:
-        return block([[P, LA.T], [LA, np.eye(len(L))]])
-    D = np.zeros((len(force), len(force))) if dissipation.D is None else dissipation.D
-    C, LB = u @ dissipation.C @ z, (L @ B) @ u
-    return block([[P, C.T, LA.T], [C, u @ (D + D.T) @ u, LB.T], [LA, LB, np.eye(len(L))]])
-
-
-def _ones(size: np.ndarray) -> np.ndarray:
-    return np.where(size > 0, size, 1.0)
-
-
-_MET = 1e-10  # priors missed by less than this, in units of the data, are met
+_MET = 1e-10  # violation of a prior that counts as none, in units of the data
 
 
 def constrained_edmd(
@@ -159,12 +28,12 @@ def constrained_edmd(
     ridge: Ridge = 0.0,
     **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
-    """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares among the A, B, E that agree with what is known of them.
+    """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares among those A, B, E that meet the prior.
 
     The misfit is Σᵢ ‖ψᵢ(x⁺) − …‖² / ‖ψᵢ(x⁺)‖², each observable in units of its own size; this matters only where
     the prior couples the rows of A. Known entries and rows are solved by linear algebra, bounds by one QP a row,
-    symmetry, combinations and dissipation by one program of all rows. A prior that the plain fit agrees with changes
-    nothing.
+    symmetry, combinations and dissipation by one program of all rows. A prior that the plain fit meets already does
+    not change the fit.
 
     Parameters
     ----------
@@ -175,11 +44,11 @@ def constrained_edmd(
     embedding
         ψ acts on the state and its past, ``Delay(2)`` say.
     prior
-        What is known; its shapes and names are those of the lifting's observables and of the inputs.
+        The known entries, bounds and couplings of A and B, in the order of the lifting's observables and the inputs.
     ridge
-        Tikhonov weight on unit-norm columns of what is free; "gcv" chooses it for the fit without the prior.
+        Tikhonov weight on unit-norm columns of the free entries; "gcv" chooses it for the fit without the prior.
     **options
-        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
+        ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
     Raises
     ------
@@ -225,7 +94,7 @@ _COUPLINGS = {
 def _doubts(
     rows: RegressionRows, entries: Entries, names: tuple[str, ...], inputs: tuple[str, ...], *, regular: bool
 ) -> list[str]:
-    """Return doubts about the columns that are free in some row."""
+    """Return doubts about the columns that are free in at least one row of [A B]."""
     free, nz = np.isnan(entries.known).any(axis=0), len(names)
     which = np.flatnonzero(free)
     part = RegressionRows(rows.P[:, which], rows.T, rows.rest, rows.samples)
@@ -235,7 +104,7 @@ def _doubts(
 
 
 def linear(rows: RegressionRows, entries: Entries, ridge: float) -> Float[np.ndarray, "n nz"]:
-    """Return the least squares over the free entries; rows of [A B] with the same ones are solved together."""
+    """Return K of least squares over the free entries; rows of [A B] with the same free entries are solved together."""
     known = entries.known
     K = np.where(np.isnan(known), 0.0, known).T
     patterns: dict[bytes, list[int]] = {}

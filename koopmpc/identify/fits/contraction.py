@@ -6,13 +6,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_discrete_lyapunov
 
-_MARGINS = (
-    1e-3,
-    1e-2,
-    1e-1,
-)  # of the radius, for the metric of a start; a small one is closer, a large one rounder
-_TRIAL, _STEPS = 60, 600  # descent steps of each start, and of the best one
-_STALL, _GAIN = 30, 1e-3  # stop where this many steps gain less than this share
+# Margins of the metric of a start, as shares of the radius: a small one is closer to the start, a large one gives a
+# better conditioned metric.
+_MARGINS = (1e-3, 1e-2, 1e-1)
+_TRIAL, _STEPS = 60, 600  # descent steps from each start, and then from the best of them
+_STALL, _GAIN = 30, 1e-3  # the descent stops where 30 steps reduce the misfit by less than this share
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +21,7 @@ class Misfit:
     G: Float[np.ndarray, "n n"]
 
     def __call__(self, A: Float[np.ndarray, "n n"]) -> float:
-        """Return f(A)."""
+        """Return the misfit f(A) of A, (n, n)."""
         error = A - self.A0
         return float(np.sum((error @ self.G) * error))
 
@@ -34,7 +32,7 @@ def radius_of(A: Float[np.ndarray, "n n"]) -> float:
 
 
 def clipped(A: Float[np.ndarray, "n n"], radius: float) -> Float[np.ndarray, "n n"]:
-    """Return A with eigenvalues beyond the circle moved back to it; A ρ / |λ|max where A is nearly defective."""
+    """Return A with its eigenvalues outside the circle moved onto it; A ρ / |λ|max where A is nearly defective."""
     result = np.linalg.eig(A)
     values, V = np.asarray(result.eigenvalues), np.asarray(result.eigenvectors)
     size = np.abs(values)
@@ -73,7 +71,7 @@ def nearest(misfit: Misfit, radius: float, starts: list[Float[np.ndarray, "n n"]
 
 
 def inside(A: Float[np.ndarray, "n n"], radius: float) -> Float[np.ndarray, "n n"]:
-    """Return A, scaled so that rounding leaves no eigenvalue beyond the circle."""
+    """Return A, scaled down until no eigenvalue lies outside the circle, not even by rounding."""
     for _ in range(5):
         size = radius_of(A)
         if size <= radius:
@@ -83,7 +81,7 @@ def inside(A: Float[np.ndarray, "n n"], radius: float) -> Float[np.ndarray, "n n
 
 
 class _Descent:
-    """Projected gradient with momentum on (S, X); `value` never rises."""
+    """Projected gradient descent with momentum on (S, X); the misfit `value` never rises."""
 
     def __init__(self, misfit: Misfit, radius: float, S: Float[np.ndarray, "n n"], X: Float[np.ndarray, "n n"]) -> None:
         self._misfit, self._radius = misfit, radius
@@ -96,7 +94,7 @@ class _Descent:
         self._step = 0.5 / max(largest * float(np.linalg.cond(S)) ** 2, 1e-300)
 
     def go(self, steps: int) -> None:
-        """Take at most this many steps."""
+        """Take at most `steps` steps; stop earlier where the misfit stalls."""
         history = [self.value]
         for _ in range(steps):
             if not self._advance():
@@ -120,7 +118,7 @@ class _Descent:
         return False
 
     def _try(self, S: Float[np.ndarray, "n n"], X: Float[np.ndarray, "n n"]) -> bool:
-        """Step from (S, X) and keep the result where f falls."""
+        """Take a step from (S, X); keep it and return True where f falls, else return False."""
         inverse = np.linalg.inv(S)
         A = inverse @ X @ S
         slope = inverse.T @ (2 * (A - self._misfit.A0) @ self._misfit.G)

@@ -41,17 +41,17 @@ def dmd(
         squares, takes x and x⁺ as noisy alike; "fb" fits forward and backward, A = (A_f A_b⁻¹)^½, which needs
         no noise of one size, but a motion that can be run backward.
     **options
-        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
+        ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
     Raises
     ------
     DataError
-        rank is above nx, too few pairs for "tls", or a motion that "fb" cannot run backward.
+        rank is above nx, there are too few pairs for "tls", or the motion cannot be run backward for "fb".
 
     Warns
     -----
     FitWarning
-        Rank-deficient or ill-conditioned data.
+        The data are rank-deficient or ill-conditioned.
 
     References
     ----------
@@ -89,12 +89,12 @@ def dmdc(
     Raises
     ------
     DataError
-        The data have no inputs, or as in `dmd`.
+        The data have no inputs, or one of the errors of `dmd`.
 
     Warns
     -----
     FitWarning
-        Rank-deficient data, or a feedback u = −K x that makes A and B inseparable.
+        The data are rank-deficient, or a feedback u = −K x makes A and B inseparable.
 
     References
     ----------

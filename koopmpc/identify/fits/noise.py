@@ -1,4 +1,4 @@
-"""Total least squares: noise is taken out of ψ(x) and ψ(x⁺) together, before they are regressed."""
+"""Fits of noisy states: total least squares, and the mean of the forward and the backward fit."""
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -15,9 +15,9 @@ def denoised(
     """Return the rows projected on the leading directions that [ψ(x) ψ(x⁺)] span together.
 
     Least squares on the result is the total least squares solution: with D = [ψ(x) ψ(x⁺)] freed of the exact
-    columns E, D ≈ L Σ Rᵀ and `directions` singular vectors L_r, the rows become [E, L_r]ᵀ of themselves. It is
-    right where the noise is white and equally large in all columns but E; with `scaled` relative to each
-    observable's size, else in the data's own units.
+    columns E, D ≈ L Σ Rᵀ and `directions` singular vectors L_r, the rows are multiplied by [E, L_r]ᵀ. This assumes
+    noise that is white and equally large in all columns but E: relative to each observable's size where `scaled`,
+    else in the data's own units.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def denoised(
     nz
         Number of observables.
     directions
-        How many the signal spans, the Constant not counted.
+        Number of directions that the signal spans, the Constant not counted.
 
     References
     ----------
@@ -59,7 +59,7 @@ def _basis(P: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m r"]:
     return U[:, s > np.finfo(float).eps * len(P) * s.max(initial=0.0)]
 
 
-_DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is as near as any
+_DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is taken
 _REAL = 1e-6  # share of the size of A below which an imaginary part is rounding
 
 

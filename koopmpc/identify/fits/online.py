@@ -1,4 +1,4 @@
-"""EDMD that goes on learning while the plant runs."""
+"""OnlineEDMD: recursive EDMD that learns while the plant runs."""
 
 from collections.abc import Sequence
 
@@ -26,9 +26,9 @@ class OnlineEDMD:
 
     It keeps the triangular factor of the rows [ψ(x) u w ψ(x⁺)], never a covariance: updates are orthogonal
     transformations, so errors do not grow with their number. With a window it is the fit of the last `window` pairs.
-    Without either it is the batch fit.
+    With neither forgetting nor a window it is the batch fit.
 
-    It takes no embedding, for it remembers no steps. A model with delays learns from points ζ, as its states:
+    It takes no embedding, because it keeps no past steps. A model with delays learns from points ζ as states:
     ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.
 
     Parameters
@@ -46,8 +46,9 @@ class OnlineEDMD:
     ridge
         Tikhonov weight on unit-norm columns; "gcv" chooses it anew for each predictor.
     keep
-        In (0, 1): no direction's information is forgotten below this share of the most it ever was, so that a plant
-        at rest does not unlearn. Lower it where the later signals are more than 1/√keep times smaller than the first.
+        In (0, 1): the information along each direction is not forgotten below this share of its maximum so far, so that
+        a plant at rest does not lose its model. Lower `keep` where later signals are more than 1/√keep times smaller
+        than the first.
 
     Raises
     ------
@@ -108,7 +109,7 @@ class OnlineEDMD:
         ridge: Ridge = 0.0,
         keep: float = 1e-6,
     ) -> "OnlineEDMD":
-        """Return one that has learned from these episodes, in their order, and has their names and dt."""
+        """Return an OnlineEDMD with the names and dt of these episodes that has learned from them in their order."""
         episodes = episodes_of(episodes)
         online = cls(
             lifting,
@@ -140,7 +141,7 @@ class OnlineEDMD:
         Raises
         ------
         ShapeError, DataError
-            The parts do not fit together, or one holds NaN or inf: leave such a sample out.
+            The shapes do not fit together, or an array holds NaN or inf: leave such a sample out.
         """
         nx, nu, nw = len(self._full.bound_states), len(self._inputs), len(self._disturbances)
         now = checks.array(x, "x")
@@ -155,8 +156,8 @@ class OnlineEDMD:
         pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw)) if nw else None
         count = 1 if single else len(now)
         Z = self._lifted(now, after) if single else None
-        if Z is None or not np.isfinite(Z).all():  # rows, or what the quick way cannot do
-            with np.errstate(all="ignore"):  # what is not finite is named below
+        if Z is None or not np.isfinite(Z).all():  # many rows, or one that the fast path cannot lift
+            with np.errstate(all="ignore"):  # an observable that is not finite is named below
                 Z = self._full(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
             if not np.isfinite(Z).all():
                 bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
@@ -172,7 +173,7 @@ class OnlineEDMD:
         self.pairs += count
 
     def predictor(self) -> LinearPredictor:
-        """Return the fit of all that counts now; it warns of nothing, its report does.
+        """Return the fit of all pairs that count now. Doubts stand in its report; no warning is raised.
 
         Raises
         ------
@@ -180,7 +181,7 @@ class OnlineEDMD:
             Nothing was learned yet.
         """
         if self.pairs == 0:
-            raise DataError("nothing was learned yet; call learn first")
+            raise DataError("no pair was learned yet; call learn first")
         R, weight = self._memory.factor(self._rows[: self._waiting])
         regression = regression_of(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
         rows = regression.rows.leading(self._lifting.nz)
@@ -192,7 +193,7 @@ class OnlineEDMD:
         return linear_predictor(regression, result, warn=False)
 
     def _lifted(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
-        """Return ψ of both at a microsecond each, in memory of our own; NaN beyond 1e30."""
+        """Return ψ of both states, in memory that the next call overwrites; NaN for a state beyond 1e30."""
         memory = self._psi
         for z, point in zip(self._pair, (now, after), strict=True):
             memory.arguments[0][:] = point

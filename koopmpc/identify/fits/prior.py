@@ -1,4 +1,4 @@
-"""What an engineer knows of A and B before the data: entries, rows, zeros, bounds, sums, symmetry, stored energy."""
+"""Prior: known entries, rows, zeros, bounds, sums, symmetry and stored energy of A and B, given before the data."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import short
-from koopmpc.values import Value
+from koopmpc.values import Value, freeze
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -20,7 +20,7 @@ class Combination(Value):
     Parameters
     ----------
     low, high
-        Numbers, or ∓inf.
+        Limits of the sum; −inf and inf where there is none.
     A, B
         The weights F (nz, nz) and G (nz, nu); zero by default.
     """
@@ -35,13 +35,13 @@ class Combination(Value):
             raise DataError("a Combination has no weights; pass A, B or both")
         ends = checks.array([low, high], "low, high", (2,), infinite=True)
         checks.crossed(ends[:1], ends[1:], "Combination")
-        for name, value in {
-            "low": float(ends[0]),
-            "high": float(ends[1]),
-            "A": None if A is None else checks.array(A, "Combination.A", (None, None)),
-            "B": None if B is None else checks.array(B, "Combination.B", (None, None)),
-        }.items():
-            object.__setattr__(self, name, value)
+        freeze(
+            self,
+            low=float(ends[0]),
+            high=float(ends[1]),
+            A=None if A is None else checks.array(A, "Combination.A", (None, None)),
+            B=None if B is None else checks.array(B, "Combination.B", (None, None)),
+        )
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -58,7 +58,7 @@ class Dissipation(Value):
     decay
         Above 0.
     C
-        (nu, nz) output that belongs to the inputs.
+        (nu, nz) of the output y = C z + D u, one output for each input.
     D
         (nu, nu); zero by default. A sampled system whose B is not zero needs D + Dᵀ ≻ 0 to be passive.
 
@@ -78,18 +78,18 @@ class Dissipation(Value):
     ) -> None:
         if C is None and D is not None:
             raise DataError("Dissipation has D but no C; pass the output C that D belongs to")
-        for name, value in {
-            "P": checks.weight(P, "Dissipation.P"),
-            "decay": checks.positive(decay, "decay"),
-            "C": None if C is None else checks.array(C, "Dissipation.C", (None, None)),
-            "D": None if D is None else checks.array(D, "Dissipation.D", (None, None)),
-        }.items():
-            object.__setattr__(self, name, value)
+        freeze(
+            self,
+            P=checks.weight(P, "Dissipation.P"),
+            decay=checks.positive(decay, "decay"),
+            C=None if C is None else checks.array(C, "Dissipation.C", (None, None)),
+            D=None if D is None else checks.array(D, "Dissipation.D", (None, None)),
+        )
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Prior(Value):
-    """What is known of z⁺ = A z + B u; `constrained_edmd` finds the rest.
+    """Prior knowledge of A and B in z⁺ = A z + B u; `constrained_edmd` fits all that it leaves free.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Prior(Value):
     combinations
         Weighted sums of entries between limits.
     dissipation
-        Passivity or contraction.
+        A `Dissipation`: passivity or contraction.
 
     Raises
     ------
@@ -149,31 +149,31 @@ class Prior(Value):
             name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
             for name, row in (rows or {}).items()
         }
-        for name, value in {
-            "A": None if A is None else checks.array(A, "Prior.A", (None, None), finite=False),
-            "B": None if B is None else checks.array(B, "Prior.B", (None, None), finite=False),
-            "rows": known,
-            "mask_A": None if mask_A is None else checks.array(mask_A, "mask_A", (None, None)) != 0,
-            "mask_B": None if mask_B is None else checks.array(mask_B, "mask_B", (None, None)) != 0,
-            "lower_A": checks.array(lower_A, "lower_A", infinite=True),
-            "upper_A": checks.array(upper_A, "upper_A", infinite=True),
-            "lower_B": checks.array(lower_B, "lower_B", infinite=True),
-            "upper_B": checks.array(upper_B, "upper_B", infinite=True),
-            "symmetric": bool(symmetric),
-            "combinations": tuple(combinations),
-            "dissipation": dissipation,
-        }.items():
-            object.__setattr__(self, name, value)
+        freeze(
+            self,
+            A=None if A is None else checks.array(A, "Prior.A", (None, None), finite=False),
+            B=None if B is None else checks.array(B, "Prior.B", (None, None), finite=False),
+            rows=known,
+            mask_A=None if mask_A is None else checks.array(mask_A, "mask_A", (None, None)) != 0,
+            mask_B=None if mask_B is None else checks.array(mask_B, "mask_B", (None, None)) != 0,
+            lower_A=checks.array(lower_A, "lower_A", infinite=True),
+            upper_A=checks.array(upper_A, "upper_A", infinite=True),
+            lower_B=checks.array(lower_B, "lower_B", infinite=True),
+            upper_B=checks.array(upper_B, "upper_B", infinite=True),
+            symmetric=bool(symmetric),
+            combinations=tuple(combinations),
+            dissipation=dissipation,
+        )
 
     @property
     def coupled(self) -> bool:
-        """Whether rows of [A B] depend on each other."""
+        """True where the prior couples rows of [A B]: symmetry, combinations or dissipation."""
         return self.symmetric or bool(self.combinations) or self.dissipation is not None
 
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """Known entries of [A B], NaN where free, and bounds."""
+    """Known entries of [A B], NaN where an entry is free, and the bounds of all entries."""
 
     known: Float[np.ndarray, "nz n"]
     low: Float[np.ndarray, "nz n"]
@@ -181,13 +181,13 @@ class Entries:
 
     @property
     def bounded(self) -> Bool[np.ndarray, " nz"]:
-        """RegressionRows with a bound on a free entry."""
+        """True for each row of [A B] that has a bound on a free entry."""
         limited = np.isfinite(self.low) | np.isfinite(self.high)
         return np.asarray((limited & np.isnan(self.known)).any(axis=1))
 
 
 def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) -> Entries:
-    """Return what is known of each entry of [A B] on these observables and inputs.
+    """Return the known value and the bounds of each entry of [A B], for these observables and inputs.
 
     Raises
     ------
@@ -250,7 +250,7 @@ def _sized(value: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def _put(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name: str) -> None:
-    """Write what is known; raise where something else is known already."""
+    """Write the known values; raise where another value is known already."""
     clash = np.argwhere(np.isfinite(values) & np.isfinite(into) & (values != into))
     if len(clash):
         i, j = map(int, clash[0])
@@ -263,7 +263,7 @@ def _put(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name:
 
 
 def _place(name: str, names: Sequence[str]) -> int:
-    found = [i for i, other in enumerate(names) if name in (other, short(other))]
-    if len(found) == 1:
-        return found[0]
+    places = [i for i, other in enumerate(names) if name in (other, short(other))]
+    if len(places) == 1:
+        return places[0]
     raise DataError(f"rows names {name!r}; it can name {', '.join(names)}")

@@ -10,8 +10,7 @@ from koopmpc.errors import DataError
 from koopmpc.identify.solve import RegressionRows, root, solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import Constant, State
+from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.predictors import LinearPredictor
 
 try:
@@ -26,9 +25,9 @@ except ImportError as error:
 class KoopmanRegressor(RegressorMixin, BaseEstimator):
     """y = W [ψ(x) u] by ridge regression, rows of X being [x u]; with y = x⁺ it is the next state of z⁺ = A z + B u.
 
-    `fit` takes pairs, so that what scikit-learn does to rows is right: y are the next states, one row below in the same
-    episode. Cross-validate over episodes with ``GroupKFold`` and the number of its episode for each row. The score is
-    that of one step; `koopmpc.select` chooses by many.
+    `fit` takes pairs of a row and its target, so that scikit-learn may shuffle rows; for a dynamic model y holds the
+    next states. Cross-validate over episodes with ``GroupKFold`` and the episode's number of each row. The score is
+    that of one step; `koopmpc.select` scores forecasts of many steps.
 
     Parameters
     ----------
@@ -37,9 +36,9 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
     harmonics
         Sines and cosines of the states up to this multiple; 0 for none.
     lifting
-        ψ in their place.
+        ψ, in place of degree and harmonics.
     alpha
-        Ridge weight on columns of unit norm; 0 cuts what is rounding.
+        Ridge weight on columns of unit norm; 0 cuts singular values below rounding.
     n_inputs
         How many of the last columns of X are inputs.
     dt
@@ -64,7 +63,7 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
 
     def __init__(
         self,
-        degree: Any = 2,  # what is no number is told by fit, as scikit-learn wants it
+        degree: Any = 2,  # fit checks all parameters, as scikit-learn demands
         harmonics: Any = 0,
         lifting: Any = None,
         alpha: Any = 0.0,
@@ -118,7 +117,7 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
         return self
 
     def predict(self, X: Any) -> np.ndarray:
-        """Return W [ψ(x) u] for rows [x u]: one step."""
+        """Return W [ψ(x) u] for rows [x u], (M, n_targets) or (M,): one step ahead."""
         check_is_fitted(self)
         rows: Any = validate_data(self, X, reset=False, dtype=np.float64)
         nx = rows.shape[1] - self.n_inputs
@@ -126,7 +125,7 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
         return found[:, 0] if self._flat else found
 
     def __sklearn_tags__(self) -> Any:
-        """Return that y may have several columns."""
+        """Tell scikit-learn that y may have several columns."""
         tags = super().__sklearn_tags__()
         tags.target_tags.multi_output = True
         return tags

@@ -18,15 +18,14 @@ from koopmpc.identify.regression import growth, linear_predictor, read, unreduce
 from koopmpc.identify.solve import RegressionRows, doubts, norms, onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Picked
-from koopmpc.lifting.state import Constant
 from koopmpc.predict.predictors import LinearPredictor
 
-_STEPS = 20_000
+_STEPS = 20_000  # of the proximal gradient method, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
-    """K (n, nt), and by how much it misses the optimality conditions."""
+    """A minimiser K, (n, nt), and the largest violation `missed` of its optimality conditions."""
 
     K: Float[np.ndarray, "n nt"]
     missed: float
@@ -40,7 +39,7 @@ def lasso(
     grouped: bool,
     tolerance: float = 1e-10,
 ) -> Sparse:
-    """Return the minimiser by accelerated proximal gradient, restarted where it turns back.
+    """Return argmin ½ tr KᵀGK − tr KᵀH + the penalty of K, by accelerated proximal gradient with restarts.
 
     Parameters
     ----------
@@ -51,9 +50,9 @@ def lasso(
     weights
         Penalties ≥ 0 of the entries; `grouped` takes the first column, one penalty a row of K.
     grouped
-        Penalise rows by their Euclidean norm, so that whole rows vanish.
+        Penalise each row of K by its Euclidean norm, so that whole rows become zero.
     tolerance
-        On the optimality conditions, relative to the largest entry of H.
+        Largest violation of the optimality conditions, relative to the largest entry of H.
 
     References
     ----------
@@ -96,13 +95,13 @@ def sparse_edmd(
     adaptive: bool = True,
     **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
-    """Fit z⁺ = A z + B u + E w on those observables z of ψ that predict the states, and each other.
+    """Fit z⁺ = A z + B u + E w on those observables z of ψ that predict the states and each other.
 
-    The states and a Constant stay. The set S of kept observables grows from them: what minimises
-    ½ ‖T_S − P K‖² + penalty Σⱼ wⱼ ‖kⱼ‖₂ over the coefficients K of ψ(x⁺)_S, on unit-norm columns and targets, joins
-    it, kⱼ the coefficients of an observable outside S; S is done when nothing joins. A and B are then the plain least
-    squares on S: no shrinkage is left in them. With over="entries" each entry has its own penalty, S grows by what
-    has an entry that is not zero, and the least squares is over these entries.
+    The set S of kept observables starts with the states and a Constant. Minimise
+    ½ ‖T_S − P K‖² + penalty Σⱼ wⱼ ‖kⱼ‖₂ over the coefficients K of ψ(x⁺)_S, on unit-norm columns and targets, where kⱼ
+    are the coefficients of observable j outside S. Observables with kⱼ ≠ 0 join S, until none does. A and B are then
+    the plain least squares on S: no shrinkage is left in them. With over="entries" each entry has its own penalty, an
+    observable joins S by any entry that is not zero, and the least squares is over these entries alone.
 
     Parameters
     ----------
@@ -118,10 +117,10 @@ def sparse_edmd(
     over
         "observables" (group LASSO: few columns of A) or "entries" (LASSO: few numbers in A and B).
     adaptive
-        Weights 1 / |coefficient of a ridge fit| (by generalised cross-validation), which spare large ones and find
-        the true set from enough data; else 1.
+        Weigh each coefficient by 1 / |its value in a ridge fit|, the ridge by generalised cross-validation. Large
+        coefficients are then hardly shrunk, and with enough data the true set is found. False: all weights are 1.
     **options
-        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
+        ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
     Raises
     ------
@@ -147,8 +146,9 @@ def sparse_edmd(
     if missing:
         raise DataError(f"the lifting lacks the state {missing[0]!r}; add State() to it")
     rows = regression.rows.leading(nz)
-    one = Constant().bind(regression.states).names[0]
-    kept = np.array([name in regression.states or name == one for name in names])
+    kept = np.array([name in regression.states for name in names])
+    if regression.lifting.constant_index is not None:
+        kept[regression.lifting.constant_index] = True
     used, missed = _closed(rows, kept, penalty, over == "entries", adaptive)
     stay = np.flatnonzero(kept)
     columns = np.concatenate([stay, np.arange(nz, len(used))])
@@ -180,14 +180,14 @@ def sparse_edmd(
 def _closed(
     rows: RegressionRows, kept: Bool[np.ndarray, " nz"], penalty: float, entries: bool, adaptive: bool
 ) -> tuple[Bool[np.ndarray, "n nz"], float]:
-    """Grow `kept`, in place, until it predicts itself; return which coefficients are not zero, and the worst miss."""
+    """Grow `kept` in place until no observable joins; return the nonzero coefficients' mask and the worst violation."""
     nz, worst = len(kept), 0.0
     size, unit = norms(rows.P), np.sqrt(np.sum(rows.T**2, axis=0) + rows.rest)
     P, T = rows.P / np.where(size > 0, size, 1.0), rows.T / np.where(unit > 0, unit, 1.0)
     rest = rows.rest / np.where(unit > 0, unit, 1.0) ** 2
     while True:
         targets = np.flatnonzero(kept)
-        rated = np.ones(P.shape[1], dtype=bool)  # the columns that pay
+        rated = np.ones(P.shape[1], dtype=bool)  # the columns with a penalty
         if not entries:
             rated[nz:] = False
             rated[targets] = False
@@ -211,6 +211,7 @@ def _closed(
 
 
 def _spread(K: Float[np.ndarray, "c k"], columns: np.ndarray, n: int) -> Float[np.ndarray, "n k"]:
+    """Return the rows of K at `columns` of n rows, all others zero."""
     whole = np.zeros((n, len(K.T)))
     whole[columns] = K
     return whole

@@ -17,8 +17,7 @@ from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import Constant, State
+from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.loop.run import Run
 from koopmpc.papers.contest import ORACLE, Contest, Prediction, centred, costs, prediction
 from koopmpc.papers.reconstruction import Setting, percent, unwarned

@@ -8,8 +8,7 @@ import numpy as np
 from koopmpc.control.cost import Cost
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.monomials import Monomials
-from koopmpc.lifting.state import Constant, State
+from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.papers.plants import CartPole, Pendulum, gain, printed_gain
 from koopmpc.papers.reconstruction import Setting
 from koopmpc.plants.dynamics import Dynamics

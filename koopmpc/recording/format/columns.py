@@ -1,5 +1,5 @@
 # pyright: basic
-"""LogColumns: what an .rrd file holds, by entity and component; a torn end is cut off, changed columns are found."""
+"""LogColumns: the columns of an .rrd file by entity and component; a torn end is cut off, changed columns are found."""
 
 import json
 import struct
@@ -31,7 +31,7 @@ class LogColumns:
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
         for chunk in chunks:
             if not chunk.is_static and "step" not in chunk.timeline_names:
-                continue  # something else than koopmpc wrote it
+                continue  # not written by koopmpc
             batch = chunk.to_record_batch()
             k = None if chunk.is_static else batch.column("step").to_numpy(zero_copy_only=False).astype(np.int64)
             for name in batch.schema.names:
@@ -81,12 +81,12 @@ class LogColumns:
         return values[: _whole(k)].reshape(-1)
 
     def changed(self) -> list[str]:
-        """Return the columns that are no longer what was written: the end of the log holds a checksum of each."""
+        """Return the columns that differ from the checksums at the end of the log."""
         sums: dict[str, int] = json.loads(self.static("/metrics", "sums"))
         return [key for key, total in sums.items() if (data := self._data(key)) is not None and crc32(data) != total]
 
     def _data(self, key: str) -> Any:
-        """Return the bytes that a checksum is made of; None for what is not read."""
+        """Return the bytes of a column for its checksum; None for an entity that is not read."""
         import pyarrow as pa
 
         entity, component = key.split(":")
@@ -99,7 +99,7 @@ class LogColumns:
 
 
 def _whole(k: np.ndarray) -> int:
-    """Return how many of 0, 1, 2, … stand at the head of `k`."""
+    """Return the number of rows before the first gap in 0, 1, 2, …."""
     gaps = np.flatnonzero(k != np.arange(len(k)))
     return int(gaps[0]) if len(gaps) else len(k)
 
@@ -117,17 +117,17 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
     check_log(path)
     try:
         with _whole_messages(path) as (whole, torn), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Rerun's word on a missing footer: load_run has its own
+            warnings.simplefilter("ignore")  # load_run itself warns of a missing end
             chunks = RrdReader(whole).stream().filter(content=list(entities)).to_chunks()
             return LogColumns(chunks, entities, torn)
     except LogError:
         raise
-    except Exception as error:  # the reader of Rerun raises whatever its own parts raise
+    except Exception as error:  # Rerun's reader raises exceptions of many kinds
         raise LogError(f"{path} is no log, or is damaged: {error}") from error
 
 
 def check_log(path: Path) -> None:
-    """Raise where `path` is no file, or none that starts as a recording does; it is not read further.
+    """Check that `path` is a file that starts as an .rrd does; the rest of the file is not read.
 
     Raises
     ------

@@ -91,7 +91,7 @@ def _about(log: LogColumns, path: Path) -> tuple[About, int | None]:
 
 
 def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
-    """Return the measurements: the states, but for the rows that were written apart."""
+    """Return the measurements: the states, except in the rows that were written separately."""
     k, values = log.matrix("/measurement")
     if not len(k):
         return X.copy()
@@ -104,7 +104,7 @@ def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
 
 
 def _sparse(log: LogColumns, entity: str, steps: int, width: int) -> np.ndarray:
-    """Return the rows of an entity: zero, but for those that were written."""
+    """Return the rows of an entity, zero where no row was written."""
     k, values = log.matrix(entity)
     held, inside = np.zeros((steps, width)), k < steps
     if len(k):
@@ -113,7 +113,7 @@ def _sparse(log: LogColumns, entity: str, steps: int, width: int) -> np.ndarray:
 
 
 def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
-    """Return what each step ended with: the last change at or before it."""
+    """Return status and fallback of each step: the last change at or before it."""
     k, _, words = log.rows("/solver/status", "state")
     if not len(k) or k[0] != 0:
         raise LogError(f"{path} lacks the status of its first step; it was not written by koopmpc")
@@ -148,7 +148,7 @@ def _plans(log: LogColumns, steps: int) -> Plans | None:
 def run_episodes(path: Path) -> Episodes:
     """Return the inputs and states of a run's log, or its measurements where the plant hides them all, as episodes.
 
-    A row with a value missing cuts.
+    A row with a missing value ends an episode.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # pyright: basic
-"""Writer: how the rows of a run become a Rerun recording, in one way for logs at once and logs of running loops."""
+"""Writer: the rows of a run as a Rerun recording, the same for a finished run and for a running loop."""
 
 import json
 import uuid
@@ -59,7 +59,7 @@ def times(k: np.ndarray, dt: float) -> list[Any]:
 
 
 def _require_writable(path: str | Path) -> None:
-    """Make the folders of `path` and open it once: Rerun does not, and says nothing of what it cannot write."""
+    """Make the folders of `path` and open it once, because Rerun reports no path that it cannot write."""
     with checks.writing(path, "ab"):
         pass
 
@@ -67,8 +67,8 @@ def _require_writable(path: str | Path) -> None:
 class Writer:
     """One recording: the description first, then blocks of rows in order, then the metrics, which mark a complete log.
 
-    The states are the last column of each block to be written. Where a state can be read, all else of its row can be
-    read too. So a file that was cut is read up to its last whole block, and long runs are written as several blocks.
+    The states are written last in each block, so a row whose state can be read is whole. A file that was cut is read
+    up to its last whole block; long runs are written as several blocks.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Writer:
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._path, self._viewer = path, viewer
         self._rec = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
-        self._opened, self._ahead = False, False  # ahead: whether a plan was ever drawn
+        self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
         self._extent, self._shown = Extent(), Extent().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
@@ -101,9 +101,7 @@ class Writer:
     def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""
         parts = blocks(rows)
-        drawings = [
-            self._drawings(part) for part in parts
-        ]  # all before the first is written: the layout is as wide as they are
+        drawings = [self._drawings(part) for part in parts]  # all, because the layout is as wide as the widest
         if not self._opened:
             self._open()
         for part, drawn in zip(parts, drawings, strict=True):
@@ -144,7 +142,7 @@ class Writer:
             self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
             self._rec.send_columns("solver/time_ms", times(k[:m], self._about.dt), [*scalars, *exact])
             self._statuses(rows)
-        self.flush()  # what was logged waits to be sent; columns do not
+        self.flush()  # static archetypes reach the file before the states do
         self._vectors("state", k, rows.X)
 
     def flush(self) -> None:
@@ -215,7 +213,7 @@ class Writer:
         self._sums[column] = zlib.crc32(data, self._sums.get(column, 0))
 
     def _style(self, entity: str, style: Any) -> None:
-        """Log what holds for the whole run, once."""
+        """Log a static archetype of the entity, once."""
         if entity not in self._styled:
             self._styled.add(entity)
             self._rec.log(entity, style, static=True)
@@ -275,4 +273,5 @@ def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
 
 
 def _word(status: Status, fallback: Fallback) -> str:
+    """Return "STATUS" or "STATUS → FALLBACK"."""
     return status.name if fallback is Fallback.NONE else f"{status.name} → {fallback.name}"

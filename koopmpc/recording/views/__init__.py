@@ -1,1 +1,1 @@
-"""What the viewer shows."""
+"""Views of the Rerun viewer: blueprint, scenes, curves, eigenvalues."""

@@ -24,13 +24,13 @@ class Curves:
     Attributes
     ----------
     title
-        Of the tab; no two alike.
+        Title of the tab; each title occurs once.
     dt
         Sample time [s].
     columns
         Names with units: one plot each.
     values
-        By name, (T, columns) each; what is not finite is left out.
+        By name, (T, columns) each; values that are not finite are left out.
     """
 
     title: str
@@ -78,7 +78,7 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
             for i, (name, X) in enumerate(curves.items()):
                 k = np.flatnonzero(np.isfinite(X[:, j]))
                 if not len(k):
-                    continue  # a timeline without a row ends the viewer
+                    continue  # the viewer crashes on a timeline without rows
                 entity = f"{slug}/{_slug(column)}/{i}_{_slug(name)}"  # drawn in this order: the truth below
                 rec.log(entity, rr.SeriesLines(names=drawable(name), colors=color(i), widths=2.0), static=True)
                 rec.send_columns(entity, times(k, tab.dt), rr.Scalars.columns(scalars=X[k, j]))

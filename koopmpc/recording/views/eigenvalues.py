@@ -1,5 +1,5 @@
 # pyright: basic
-"""The eigenvalues of A over the unit circle, and how far each can be trusted."""
+"""The eigenvalues of A over the unit circle, with their residuals, and the eigenfunctions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from koopmpc.recording.description import drawable
 from koopmpc.recording.views.scenes import BACKGROUND
 from koopmpc.validate.residuals import ResidualDMD
 
-# Anchors of equal steps: lightness grows evenly along the first, and the second closes.
+# Anchors at equal steps. Lightness grows evenly along the first scale; the second ends with its first colour.
 _SEQUENCE = np.array(
     [[68, 1, 84], [71, 45, 123], [59, 82, 139], [44, 114, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
      [170, 220, 50], [253, 231, 37]], dtype=np.float64,
@@ -41,10 +41,10 @@ def _between(anchors: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "..."]
     return np.stack(bands, axis=-1).round().astype(np.uint8)
 
 
-_WIDEST = 3.0  # beyond it an eigenvalue is not in the picture
+_WIDEST = 3.0  # largest half width of the picture
 _CROWDED = 0.35  # share of the picture below which the eigenvalues get one of their own
-_BELOW, _ABOVE = 1e-2, 1e1  # shares of the tolerance that the shades go from and to
-_LIGHT = 0.85  # of the shades: the rest is too light for points
+_BELOW, _ABOVE = 1e-2, 1e1  # residuals of the darkest and the lightest shade, over the tolerance
+_LIGHT = 0.85  # share of the colour scale in use; the rest is too light for points
 
 
 def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> 
 
 
 def reach(model: Predictor) -> float:
-    """Return how far the picture goes: over the unit circle, and over eigenvalues not far outside."""
+    """Return the half width of the picture, which holds the unit circle and the eigenvalues up to |λ| = 2.6."""
     values = np.asarray(model.eigenvalues)
     return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)
 
@@ -145,7 +145,7 @@ def draw_eigenfunctions(
 
 
 def plane_view(entity: str, title: str, plane: Plane) -> Any:
-    """Return the view of one picture, with room for what is written around it."""
+    """Return the view of one picture, with room for the words around it."""
     import rerun.blueprint as rrb
 
     n, m = len(plane.across), len(plane.up)

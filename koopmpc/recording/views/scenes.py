@@ -12,13 +12,13 @@ from koopmpc.errors import DataError
 from koopmpc.scene import Box, Color, Disk, Line, Shape
 
 BACKGROUND: Color = (247, 248, 250)
-_FAR = 0.25  # how far beyond what was drawn a prediction is shown, as a share of it: some predictions diverge
+_FAR = 0.25  # margin for predictions, which may diverge, as a share of the size of the drawn shapes
 _STAGES = 4  # how many future stages of a plan are drawn
-_STROKES = np.linspace(-1.0, 1.0, 5)  # a box is filled by a line to and fro: where its strokes lie
+_STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
 
 
 class Drawing(NamedTuple):
-    """One entity of a scene: a static archetype that says what lies above what, and columns over time."""
+    """One entity of a scene: a static archetype with the drawing order, and columns over time."""
 
     style: Any
     columns: Any
@@ -41,7 +41,7 @@ class Box2D:
 
 @dataclass
 class Extent:
-    """What the animation shows: all that was drawn, and what was predicted as far as that is not far off."""
+    """The box that the animation shows: all drawn shapes, and predicted shapes that are not far from them."""
 
     drawn: Box2D = field(default_factory=Box2D)
     predicted: Box2D = field(default_factory=Box2D)
