@@ -10,3 +10,4 @@ from koopmpc.lifting import radial as radial
 from koopmpc.lifting import reduced as reduced
 from koopmpc.lifting import standardized as standardized
 from koopmpc.lifting import state as state
+from koopmpc.lifting.reduced import Projected as Projected

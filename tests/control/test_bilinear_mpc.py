@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.move import Controller, Fallback
 from koopmpc.plants import compiled
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
@@ -57,7 +56,7 @@ def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: km.Limits) -> None
     model, cost = linear(nu), km.Cost(Q=[1, 2, 1], R=0.3)
     ours = km.BilinearMPC(model, cost, limits, 15)
     theirs = km.KoopmanMPC(model, cost, limits, 15, settings=PRECISE)
-    assert isinstance(ours, Controller)
+    assert isinstance(ours, km.control.Controller)
     x = np.array([0.5, -0.4, 0.3])
     for k in range(12):
         ahead = np.tile([0.1 if k > 5 else 0.0, 0, 0], (16, 1))
@@ -131,7 +130,7 @@ def test_whatever_it_measures_its_input_is_inside_the_limits(states: list, fresh
         move = SHARED(x, [0, 1, 0])
         assert (move.u >= -0.8).all()
         assert (move.u <= 0.5).all()
-        assert (move.status in GOOD) == (move.fallback is Fallback.NONE)
+        assert (move.status in GOOD) == (move.fallback is km.control.Fallback.NONE)
         bad = not np.abs(x).max() < 1e30
         assert (move.status is km.Status.BAD_MEASUREMENT) == bad
         assert (SHARED.plan() is None) == (move.status not in GOOD)
@@ -142,7 +141,7 @@ def test_hard_limits_that_nothing_meets_are_found() -> None:
     mpc = km.BilinearMPC(pendulum(), km.Cost(1, 0.1), limits, 10)
     plan = [mpc([0.4, -0.1], [0, 0]), mpc.plan().U][1]
     move = mpc([0.45, 3.0], [0, 0])
-    assert (move.status, move.fallback) == (km.Status.INFEASIBLE, Fallback.SHIFTED_PLAN)
+    assert (move.status, move.fallback) == (km.Status.INFEASIBLE, km.control.Fallback.SHIFTED_PLAN)
     assert np.array_equal(move.u, plan[1])
     assert mpc.plan() is None
     assert mpc([0.4, -0.1], [0, 0]).status in GOOD
@@ -194,7 +193,7 @@ def test_a_solver_that_is_made_to_fail_leaves_the_last_plan() -> None:
     plan = mpc.plan().U
     mpc.solver_fails = True
     move = mpc([1.0, 0.2], [0, 1, 0])
-    assert (move.status, move.fallback) == (km.Status.FAILED, Fallback.SHIFTED_PLAN)
+    assert (move.status, move.fallback) == (km.Status.FAILED, km.control.Fallback.SHIFTED_PLAN)
     assert np.array_equal(move.u, plan[1])
     mpc.solver_fails = False
     assert mpc([1.0, 0.2], [0, 1, 0]).status in GOOD
@@ -234,11 +233,11 @@ def test_a_step_that_fails_without_a_plan_takes_the_clipped_optimum() -> None:
         )
         state = np.array([0.5, 0.0])
         first = mpc(state, [0, 0])
-        assert (first.status, first.fallback) == (km.Status.INFEASIBLE, Fallback.CLIPPED_LQR)
+        assert (first.status, first.fallback) == (km.Status.INFEASIBLE, km.control.Fallback.CLIPPED_LQR)
         assert -9 <= first.u[0] < -1
         assert rate is None or first.u[0] == -rate
         for _ in range(60):
             move = mpc(state, [0, 0])
             state = plant(state, move.u)
-        assert move.fallback is Fallback.NONE
+        assert move.fallback is km.control.Fallback.NONE
         assert np.abs(state).max() < 0.01

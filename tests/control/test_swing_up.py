@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared
 
 NAMES = ["cart_pole_swing", "pendulum_swing"]
 SECONDS, HELD = 10.0, 2.0
@@ -32,7 +31,7 @@ class Learned:
 
     def __init__(self, name: str) -> None:
         self.problem = km.load_problem(name)
-        self.parts = Prepared(self.problem)
+        self.parts = km.bench.Prepared(self.problem)
         self.model = km.bilinear_edmd(self.parts.data, self.problem.lifting, difference=True)
         self.reference = next(iter(self.problem.cases.values())).reference
 

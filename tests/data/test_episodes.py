@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.values import from_data, to_data
 from tests.bare import shown
+from tests.roundtrip import returned
 
 LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=8)
 
@@ -99,7 +99,7 @@ def test_episodes_own_their_arrays_and_are_values() -> None:
     data = km.Episodes([km.Episode(X=X, U=U)], dt=0.1)
     X[:] = 7
     assert data[0].X[0, 0] == 0
-    assert from_data(to_data(data)) == data
+    assert returned(data) == data
 
 
 def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> km.Episode:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.data.excitation import ORDERS, Excitation, maximal_length
-from koopmpc.values import from_data, to_data
+from tests.roundtrip import returned
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -111,7 +111,7 @@ def test_feedback_is_its_formula(seed: int) -> None:
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_excitations_are_values_and_follow_the_seed(excitation: Excitation) -> None:
-    assert from_data(to_data(excitation)) == excitation
+    assert returned(excitation) == excitation
     y = np.zeros(2)
     first, again = (excitation.start(30, 0.05, generator(3)) for _ in range(2))
     U = np.array([first(k, y) for k in range(30)])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.data.source import Changed, Source, source_of
+from koopmpc.data.source import Changed, source_of
 from tests.bare import shown
 from tests.example_plants import random_episodes
 
@@ -23,7 +23,7 @@ def folder_of(path: Path, given: list[km.Episodes], suffix: str = ".npz") -> Pat
     return path
 
 
-def read(source: Source) -> list[km.Episode]:
+def read(source: km.data.Source) -> list[km.Episode]:
     return [episode for part in source.parts() for episode in part.load()]
 
 

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.figures.style import save
-from koopmpc.validate.bands import forecast
 from tests.figures.models import DT, INPUTS, STATES, curve, episodes, turning
 from tests.recording.runs import make_run
 
@@ -62,14 +60,14 @@ def test_a_prediction_that_runs_away_leaves_the_picture_and_not_the_truth(tmp_pa
     low, high = made.axes[0].get_ylim()
     assert low < episode.X[:, 0].min() < episode.X[:, 0].max() < high
     assert high - low < 4 * np.ptp(episode.X[:, 0])
-    assert np.isnan(forecast(turning(1e12), episode, 30).predicted).any()
-    save(made, tmp_path / "a.png")
+    assert np.isnan(km.validate.forecast(turning(1e12), episode, 30).predicted).any()
+    km.figures.save(made, tmp_path / "a.png")
 
 
 def test_relifted_forecasts_and_parts_of_the_state() -> None:
     episode, model = episodes(1)[0], turning(0.9)
-    ahead = forecast(model, episode, relift=True)
-    assert ahead.predicted == pytest.approx(forecast(model, episode).predicted)  # ψ(x) = x
+    ahead = km.validate.forecast(model, episode, relift=True)
+    assert ahead.predicted == pytest.approx(km.validate.forecast(model, episode).predicted)  # ψ(x) = x
     made = km.plot.rollout(model, episode, states="rate", width="two columns")
     assert [axes.get_ylabel() for axes in made.axes] == [STATES[1], *INPUTS]
 
@@ -104,8 +102,8 @@ def test_a_run_is_drawn_whole(tmp_path) -> None:
     shown = [label.get_text() for label in made.axes[-1].get_yticklabels()]
     assert {name.upper().replace(" ", "_") for name in shown} == {status.name for status in run.status}
     assert sum(len(one.get_xdata()) for one in made.axes[-1].get_lines()) == run.steps
-    save(made, tmp_path / "run.svg")
-    save(km.plot.run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
+    km.figures.save(made, tmp_path / "run.svg")
+    km.figures.save(km.plot.run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
 
 
 def test_messages() -> None:

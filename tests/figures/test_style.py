@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import koopmpc as km
-from koopmpc.figures.style import WIDTHS, band, figure, line, save, styled
+from koopmpc.figures.style import WIDTHS, band, figure, line, styled
 
 
 @styled
@@ -25,15 +25,15 @@ def _drawn():
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_the_same_figure_is_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     first, second = tmp_path / "a" / "b" / f"one{suffix}", tmp_path / f"two{suffix}"
-    save(_drawn(), first)
-    save(_drawn(), second)
+    km.figures.save(_drawn(), first)
+    km.figures.save(_drawn(), second)
     assert first.read_bytes() == second.read_bytes()
     assert len(first.read_bytes()) > 1000
 
 
 def test_pictures_of_lines_are_small_and_look_the_same(tmp_path: Path) -> None:
     made = _drawn()
-    save(made, tmp_path / "a.png")
+    km.figures.save(made, tmp_path / "a.png")
     styled(lambda: made.savefig(tmp_path / "full.png"))()
     small, full = Image.open(tmp_path / "a.png"), Image.open(tmp_path / "full.png")
     assert (tmp_path / "a.png").stat().st_size < 0.6 * (tmp_path / "full.png").stat().st_size
@@ -44,9 +44,9 @@ def test_pictures_of_lines_are_small_and_look_the_same(tmp_path: Path) -> None:
 
 
 def test_a_users_settings_change_nothing_and_come_back(tmp_path: Path) -> None:
-    save(_drawn(), tmp_path / "a.png")
+    km.figures.save(_drawn(), tmp_path / "a.png")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 30.0}):
-        save(_drawn(), tmp_path / "b.png")
+        km.figures.save(_drawn(), tmp_path / "b.png")
         assert mpl.rcParams["lines.linewidth"] == 9.0
         assert styled(lambda: mpl.rcParams["font.size"])() == 8.0
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
@@ -80,9 +80,9 @@ assert "matplotlib.pyplot" not in sys.modules
 
 def test_messages(tmp_path: Path) -> None:
     with pytest.raises(km.errors.DataError, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
-        save(_drawn(), tmp_path / "a.gif")
+        km.figures.save(_drawn(), tmp_path / "a.gif")
     (tmp_path / "file").write_text("")
     with pytest.raises(km.errors.LogError, match=r"cannot be written: .*; pass another path"):
-        save(_drawn(), tmp_path / "file" / "a.png")
+        km.figures.save(_drawn(), tmp_path / "file" / "a.png")
     with pytest.raises(km.errors.DataError, match="height is -1 in; it must be above zero"):
         figure(height=-1.0)

@@ -17,7 +17,6 @@ from koopmpc.cli.app import app
 from koopmpc.fitting.fit import fit_data
 from koopmpc.fitting.hold_out import divided
 from koopmpc.fitting.repair import needed, shortened
-from koopmpc.synthesis.candidates import Candidate
 from tests.bench.tiny import write
 
 
@@ -54,8 +53,11 @@ def few(monkeypatch):
 
     def usual(episodes, _, bilinear, *__):
         base = km.State() + km.Constant()
-        tried = [Candidate("x, 1", base), Candidate("squares", base + km.State() * km.State())]
-        tried += [Candidate("squares", tried[1].lifting, bilinear=True)] * bilinear
+        tried = [
+            km.synthesis.Candidate("x, 1", base),
+            km.synthesis.Candidate("squares", base + km.State() * km.State()),
+        ]
+        tried += [km.synthesis.Candidate("squares", tried[1].lifting, bilinear=True)] * bilinear
         return [one.bind(episodes.states, episodes.inputs) for one in tried]
 
     monkeypatch.setattr("koopmpc.synthesis.select.usual", usual)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared
 from tests.bench.tiny import write
 
 
@@ -36,21 +35,21 @@ def test_they_hold_each_reference_row_on_the_truth(tank):
 
     rows = np.repeat([[0.2], [1.0], [0.2]], [10, 10, 11], axis=0)
     problem = replace(tank, plant=Heavy(), cases={"steps": km.Case([0.0], rows, 30)})
-    parts = Prepared(problem)
+    parts = km.bench.Prepared(problem)
     for row, u in zip(rows, parts.u_reference("steps"), strict=False):
         np.testing.assert_allclose(parts.truth(row, u), row, atol=1e-6)
     plant = km.plants.SimulatedPlant(parts.truth)
-    held = Prepared(replace(problem, plant=plant)).u_reference("steps")
+    held = km.bench.Prepared(replace(problem, plant=plant)).u_reference("steps")
     np.testing.assert_array_equal(held, parts.u_reference("steps"))
     assert parts.u_reference("steps") is parts.u_reference("steps")
 
 
 def test_they_stay_inside_the_limits_of_the_case(tank):
     case = km.Case([0.0], [1.9], 5, limits=km.Limits(-0.3, 0.3))
-    held = Prepared(replace(tank, cases={"much": case})).u_reference("much")
+    held = km.bench.Prepared(replace(tank, cases={"much": case})).u_reference("much")
     np.testing.assert_allclose(held, 0.3, atol=1e-6)
 
 
 def test_they_are_zero_where_the_cost_says_so(tank):
     zero = replace(tank, cost=km.Cost(Q=1.0, R=0.1, u_target="zero"))
-    np.testing.assert_array_equal(Prepared(zero).u_reference("fill"), np.zeros((30, 1)))
+    np.testing.assert_array_equal(km.bench.Prepared(zero).u_reference("fill"), np.zeros((30, 1)))

@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.prior import Combination, Dissipation
-from koopmpc.values import from_data, to_data
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
+from tests.roundtrip import returned
 
 LIFTING = km.State() + km.Constant()
 NAN = np.nan
@@ -63,11 +62,11 @@ CASES = {
     ),
     "symmetric": (km.Prior(symmetric=True), lambda A, B: [A == A.T]),
     "combinations": (
-        km.Prior(combinations=[Combination(1, 1, A=np.ones((3, 3))), Combination(0.2, np.inf, B=np.ones((3, 1)))]),
+        km.Prior(combinations=[km.identify.Combination(1, 1, A=np.ones((3, 3))), km.identify.Combination(0.2, np.inf, B=np.ones((3, 1)))]),
         lambda A, B: [cp.sum(A) == 1, cp.sum(B) >= 0.2],
     ),
     "contraction": (
-        km.Prior(dissipation=Dissipation(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
+        km.Prior(dissipation=km.identify.Dissipation(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
         lambda A, B: [
             A[:2, 2] == 0,
             cp.bmat([[0.25 * STORE[:2, :2], (np.sqrt(STORE[:2]) @ A[:, :2]).T],
@@ -85,13 +84,13 @@ def test_equals_brute_force_on_all_rows(name: str, ridge: float) -> None:
     model = km.constrained_edmd(data, LIFTING, prior=prior, ridge=ridge)
     assert np.allclose(found(model), oracle(data, LIFTING, ridge, constrain), rtol=0, atol=2e-6)
     assert model.report.changes
-    assert from_data(to_data(prior)) == prior
+    assert returned(prior) == prior
 
 
 def test_passivity_holds_and_equals_the_program_in_raw_units() -> None:
     data = random_episodes(5, [60], 2, 1)
     P, C, D = np.diag([1.0, 2.0]), np.array([[0.3, 0.1]]), np.array([[0.2]])
-    model = km.constrained_edmd(data, km.State(), prior=km.Prior(dissipation=Dissipation(P, C=C, D=D)))
+    model = km.constrained_edmd(data, km.State(), prior=km.Prior(dissipation=km.identify.Dissipation(P, C=C, D=D)))
 
     def passive(A, B):  # in z, u directly: P⁻¹ instead of a factor
         return [cp.bmat([[P, C.T, A.T], [C, D + D.T, B.T], [A, B, np.linalg.inv(P)]]) >> 0]
@@ -131,8 +130,8 @@ TRUTHS = [
     km.Prior(mask_A=A_TRUE != 0, mask_B=B_TRUE != 0),
     km.Prior(lower_A=-1e-9, lower_B=-1e-9, upper_A=1.0),
     km.Prior(symmetric=True),
-    km.Prior(combinations=[Combination(2.1, 2.1, A=np.eye(3))]),
-    km.Prior(dissipation=Dissipation([1, 1, 1])),
+    km.Prior(combinations=[km.identify.Combination(2.1, 2.1, A=np.eye(3))]),
+    km.Prior(dissipation=km.identify.Dissipation([1, 1, 1])),
 ]
 
 
@@ -179,10 +178,10 @@ REFUSED = [
     ({"rows": {"x0": {"x0": 1.0}}, "A": [[2, NAN, NAN], [NAN] * 3, [NAN] * 3]}, km.errors.DataError, "another prior says 2"),
     ({"A": np.full((3, 3), 2.0), "upper_A": 1.0}, km.errors.DataError, "contradict each other at 'x0'"),
     ({"lower_B": 1.0, "upper_B": 0.0}, km.errors.DataError, "contradict each other"),
-    ({"combinations": [Combination(0, 1, A=np.eye(2))]}, km.errors.ShapeError, "Combination.A has shape"),
-    ({"dissipation": Dissipation([1, 1])}, km.errors.ShapeError, "Dissipation.P has shape"),
+    ({"combinations": [km.identify.Combination(0, 1, A=np.eye(2))]}, km.errors.ShapeError, "Combination.A has shape"),
+    ({"dissipation": km.identify.Dissipation([1, 1])}, km.errors.ShapeError, "Dissipation.P has shape"),
     (
-        {"combinations": [Combination(5, 6, A=np.eye(3))], "upper_A": 1.0},
+        {"combinations": [km.identify.Combination(5, 6, A=np.eye(3))], "upper_A": 1.0},
         km.errors.DataError,
         "no A and B meet all priors: Clarabel says 'infeasible",
     ),
@@ -198,12 +197,12 @@ def test_what_cannot_be_is_refused(parts: dict, kind: type[Exception], text: str
 
 def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
     with pytest.raises(km.errors.DataError, match="no weights"):
-        Combination(0, 1)
+        km.identify.Combination(0, 1)
     with pytest.raises(km.errors.DataError, match="limits cross"):
-        Combination(1, 0, A=np.eye(2))
+        km.identify.Combination(1, 0, A=np.eye(2))
     with pytest.raises(km.errors.DataError, match="has D but no C"):
-        Dissipation([1.0], D=[[1.0]])
+        km.identify.Dissipation([1.0], D=[[1.0]])
     with pytest.raises(km.errors.DataError, match="decay is 0"):
-        Dissipation([1.0], decay=0)
+        km.identify.Dissipation([1.0], decay=0)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
         km.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.Prior(), ridge=-1)

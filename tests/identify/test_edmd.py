@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.lifting.reduced import Projected
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 
 LIFTING = km.Constant() + km.State() + km.Monomials(2)
@@ -128,7 +127,7 @@ def test_a_truncated_fit_is_the_regression_on_the_leading_directions(rank: int, 
     s = data.snapshots()
     Z, Z_next = lifting(s.X), lifting(s.X_next)
     U_r = np.linalg.svd(Z.T, full_matrices=False)[0][:, :rank]
-    assert isinstance(model.lifting, Projected)
+    assert isinstance(model.lifting, km.lifting.Projected)
     assert model.A.shape == (rank, rank)
     assert model.lifting.nz == rank
     projector = model.lifting.basis @ model.lifting.basis.T

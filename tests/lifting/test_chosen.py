@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.values import from_data, to_data
 from tests.lifting.families import NAMES
+from tests.roundtrip import returned
 
 
 @pytest.mark.parametrize("given", ["omega", "omega [rad/s]", 1, -2, [1], ["omega"]])
@@ -15,7 +15,7 @@ def test_one_state_by_name_or_index(given) -> None:
     assert lifting.names == ("omega [rad/s]",)
     assert np.array_equal(lifting(X), X[:, [1]])
     assert km.Fourier(1, given).bind(NAMES).names == ("sin(omega)", "cos(omega)")
-    assert from_data(to_data(lifting)) == lifting
+    assert returned(lifting) == lifting
 
 
 def test_a_part_of_the_state_joins_the_whole() -> None:

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 import koopmpc as km
 from koopmpc.lifting.algebra import Product
 from koopmpc.lifting.base import rows
-from koopmpc.lifting.buffered import buffered
-from koopmpc.values import from_data, to_data
-from tests.lifting.families import NAMES, Case, cases, made
+from tests.lifting.families import NAMES, Case, buffered, cases, made
+from tests.roundtrip import returned
 
 SWING = km.Fourier(2, "theta") * km.State("omega")
 
@@ -68,9 +67,9 @@ def test_one_is_neutral_and_sums_distribute() -> None:
 
 def test_saved_bound_or_not_and_with_a_traced_factor() -> None:
     X = np.array([[0.3, -2.0]])
-    assert from_data(to_data(SWING)) == SWING
+    assert returned(SWING) == SWING
     lifting = (km.Expressions(lambda x: [ca.fabs(x[0])], ["size"]) * km.State()).bind(NAMES[:2])
-    again = from_data(to_data(lifting))
+    again = returned(lifting)
     assert again.names == lifting.names == ("theta*size", "omega*size")
     assert np.array_equal(again(X), lifting(X))
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.lifting.buffered import buffered
-from koopmpc.values import from_data, to_data
-from tests.lifting.families import NAMES
+from tests.lifting.families import NAMES, buffered
+from tests.roundtrip import returned
 
 
 def _error(count: int, seed: int) -> float:
@@ -47,8 +46,7 @@ def test_a_bound_copy_keeps_what_it_drew_in_a_file_too() -> None:
     assert lifting.bind(("a", "b")).frequencies is not None
     assert np.array_equal(lifting.bind(("a", "b")).frequencies, lifting.frequencies)
     assert lifting.bind(NAMES) == km.RandomFourier(4, 0.5, 7).bind(NAMES)
-    arrays: dict[str, np.ndarray] = {}
-    again = from_data(to_data(lifting, arrays), arrays)
+    again = returned(lifting)
     assert again == lifting
     x = np.array([0.2, -1.0])
     assert np.array_equal(again(x), lifting(x))

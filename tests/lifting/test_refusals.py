@@ -9,9 +9,9 @@ import pytest
 
 import koopmpc as km
 from koopmpc.lifting.expressions import Traced
-from koopmpc.values import from_data, to_data
 from tests.bare import shown
 from tests.lifting.families import NAMES
+from tests.roundtrip import from_data, returned, to_data
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,17 +44,17 @@ def test_a_family_of_ones_own_needs_two_methods_and_is_saved_traced() -> None:
     lifting = (km.State() + Drag()).bind(NAMES[:2])
     drag = np.abs(X[:, 1]) * X[:, 1]
     np.testing.assert_allclose(lifting(X), np.column_stack([X, drag, 2 * drag]), rtol=1e-15)
-    again = from_data(to_data(lifting))
+    again = returned(lifting)
     assert isinstance(again.parts[1], Traced)
     assert again.names == lifting.names
     assert np.array_equal(again(X), lifting(X))
-    assert from_data(to_data(again)) == again
+    assert returned(again) == again
 
 
 def test_unbound_liftings_are_saved_too() -> None:
     lifting = km.State() + km.Constant() + km.Monomials(3) + km.Fourier(2, [0, "omega"]) + km.ThinPlate([[0, 1]])
     lifting += km.Gaussian([[0, 1]], 0.5)
-    again = from_data(to_data(lifting))
+    again = returned(lifting)
     assert again == lifting
     assert again.bind(NAMES[:2]) == lifting.bind(NAMES[:2])
 
@@ -70,7 +70,7 @@ def test_expressions_keep_no_python_function_once_bound() -> None:
     lifting([[1, 2, 3], [2, 2, 3]])
     lifting.symbolic(ca.SX.sym("x", 3))
     assert len(calls) == 1
-    assert from_data(to_data(lifting)) == lifting
+    assert returned(lifting) == lifting
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.lifting.buffered import buffered
-from koopmpc.values import from_data, to_data
-from tests.lifting.families import NAMES
+from tests.lifting.families import NAMES, buffered
+from tests.roundtrip import returned
 
 CENTERS = np.random.default_rng(3).normal(size=(6, 2))
 FAMILIES = [km.Gaussian(CENTERS, 1.0), km.ThinPlate(CENTERS), km.RandomFourier(8, 1.5, 4), km.Monomials(3)]
@@ -63,10 +62,9 @@ def test_other_numbers_are_other_observables_and_one_stays_one() -> None:
 
 def test_saved_bound_or_not() -> None:
     lifting = km.Standardized(km.RandomFourier(3, 1.0, 2) + km.State(), [1 / 3, -1], [0.1, 7])
-    assert from_data(to_data(lifting)) == lifting
+    assert returned(lifting) == lifting
     bound = lifting.bind(NAMES[:2])
-    arrays: dict[str, np.ndarray] = {}
-    assert from_data(to_data(bound, arrays), arrays) == bound
+    assert returned(bound) == bound
 
 
 def test_a_state_that_stands_still_keeps_its_unit() -> None:

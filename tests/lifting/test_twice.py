@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.lifting.radial import squared_distances
-from koopmpc.values import from_data, to_data
 from tests.lifting.families import NAMES, Case, cases, made, swing
+from tests.roundtrip import returned
 
 
 def symbolically(lifting: km.Lifting, X: np.ndarray) -> np.ndarray:
@@ -48,10 +48,9 @@ def test_long_tables_are_cut_into_blocks_without_a_seam(case: Case, seed: int) -
 @given(cases())
 def test_saved_as_data_and_back(case: Case) -> None:
     lifting, X = made(case)
-    arrays: dict[str, np.ndarray] = {}
-    for again in (from_data(to_data(lifting)), from_data(to_data(lifting, arrays), arrays)):
-        assert again == lifting
-        assert np.array_equal(again(X), lifting(X))
+    again = returned(lifting)
+    assert again == lifting
+    assert np.array_equal(again(X), lifting(X))
 
 
 @pytest.mark.parametrize(

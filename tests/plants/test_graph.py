@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.plants.graph import OPERATIONS, Graph
-from koopmpc.values import from_data, to_data
 from tests.example_plants import CartPole
+from tests.roundtrip import from_data, to_data
 
 F = km.discretize(CartPole(), 0.05).F
 GRAPH = Graph.trace(F)

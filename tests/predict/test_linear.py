@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.lifting.reduced import Projected
 from tests.example_plants import random_predictor
 
 LIFTING = km.State() + km.Constant() + km.Fourier(1)
@@ -112,7 +111,7 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         km.LinearPredictor(
             np.eye(2), np.ones((2, 1)), np.eye(2), km.State(), **names, exact_modes=np.eye(2).astype(complex)
         )
-    projected = Projected(km.State(), np.ones((2, 1)))
+    projected = km.lifting.Projected(km.State(), np.ones((2, 1)))
     with pytest.raises(km.errors.ShapeError, match="exact_modes has shape"):
         km.LinearPredictor([[1]], [[1]], [[1], [1]], projected, **names, exact_modes=np.ones((3, 1), dtype=complex))
 

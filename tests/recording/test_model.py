@@ -10,7 +10,6 @@ from koopmpc.figures.plane import eigenfunctions_on, plane_through
 from koopmpc.recording.format.columns import LogColumns, read_columns
 from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from koopmpc.recording.views.eigenvalues import circle, sequence
-from koopmpc.validate.bands import forecast
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 
 DATA = episodes(24, noise=0.05)
@@ -38,7 +37,7 @@ def _read(path: Path, *entities: str) -> LogColumns:
 
 def test_forecasts_are_read_back_to_the_bit(log: Path, report: km.validate.TrustReport) -> None:
     for r in range(2):
-        ahead = forecast(turning(0.9), DATA[r], 12, bands=report.band)
+        ahead = km.validate.forecast(turning(0.9), DATA[r], 12, bands=report.band)
         found = _read(log, f"/rollout/{r}/**")
         for i in range(2):
             curves = found.vectors(f"/rollout/{r}/state/{i}")
@@ -100,7 +99,7 @@ def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None
     data = episodes(3, noise=0.05)
     km.recording.record_model(turning(), data, tmp_path / "a.rrd")
     errors = km.score(turning(), data, 30)
-    ahead = forecast(turning(), data[2], 30, bands=errors)
+    ahead = km.validate.forecast(turning(), data[2], 30, bands=errors)
     curves = _read(tmp_path / "a.rrd", "/rollout/2/**").vectors("/rollout/2/state/1")
     assert np.array_equal(curves[:, 2], ahead.low[:, 1])
     assert len(_points(tmp_path / "a.rrd", "/model/eigenvalues")) == 2
@@ -152,7 +151,7 @@ def test_a_model_that_runs_away_is_recorded_too(tmp_path: Path) -> None:
     wild = turning(1e12)
     km.recording.record_model(wild, data, tmp_path / "a.rrd", rollouts=1)
     curves = _read(tmp_path / "a.rrd", "/rollout/0/**").vectors("/rollout/0/state/0")
-    assert np.array_equal(curves[:, :2], _two(forecast(wild, data[0], 30)), equal_nan=True)
+    assert np.array_equal(curves[:, :2], _two(km.validate.forecast(wild, data[0], 30)), equal_nan=True)
     assert np.isnan(curves[-1, 1])
 
 

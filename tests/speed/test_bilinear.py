@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared
 
 pytestmark = pytest.mark.speed
 N = 50
@@ -16,7 +15,7 @@ N = 50
 @pytest.fixture(scope="module")
 def parts():
     problem = km.load_problem("cart_pole_swing")
-    prepared = Prepared(problem)
+    prepared = km.bench.Prepared(problem)
     return prepared, km.bilinear_edmd(prepared.data, problem.lifting, difference=True)
 
 

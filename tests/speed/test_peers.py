@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared
 
 pytestmark = pytest.mark.speed
 
@@ -83,7 +82,7 @@ class InCVXPY:
 @pytest.fixture(scope="module")
 def pendulum():
     problem = km.load_problem("pendulum")
-    parts = Prepared(problem)
+    parts = km.bench.Prepared(problem)
     near = parts.step_map.linearize(*problem.equilibrium)
     Q, R = problem.cost.matrices(2, 1)
     cost = km.Cost(Q=Q, R=R, Q_N=km.dlqr(near.A, near.B, Q, R).P, u_target="zero")
@@ -177,7 +176,7 @@ def test_against_do_mpc(benchmark, name):
     """
     pytest.importorskip("do_mpc", reason="do-mpc is not installed: pip install koopmpc[peers]")
     problem = km.load_problem(name)
-    parts, case = Prepared(problem), problem.cases[name.split(":")[1]]
+    parts, case = km.bench.Prepared(problem), problem.cases[name.split(":")[1]]
     limits, plant = problem.limits, parts.step_map
     near = plant.linearize(*problem.equilibrium)
     P = km.dlqr(near.A, near.B, *problem.cost.matrices(plant.nx, plant.nu)).P

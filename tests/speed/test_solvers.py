@@ -10,9 +10,7 @@ import pytest
 import scipy.linalg
 
 import koopmpc as km
-from koopmpc.control.linear.koopman_mpc import SOLVERS
-from koopmpc.control.solvers.base import QP
-from koopmpc.control.solvers.osqp import DEFAULTS
+from tests.control.solvers.random_qps import DEFAULTS, QP, SOLVERS
 
 pytestmark = pytest.mark.speed
 

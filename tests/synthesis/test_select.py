@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.synthesis.candidates import Candidate, angles
+from koopmpc.synthesis.candidates import angles
 from koopmpc.synthesis.cross_validation import Trial, tried
 from koopmpc.synthesis.folds import folded, sampled, usual_horizon
 from koopmpc.synthesis.selection import choice
-from koopmpc.values import from_data, to_data
+from tests.roundtrip import returned
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])
 
@@ -88,7 +88,7 @@ def test_a_score_is_the_relative_error_of_fits_that_never_saw_the_fold():
     data = noisy(episodes_of(quadratic, count=6, steps=14), 0.02)
     fold, horizon, ridge = (0, 1, 2, 0, 1, 2), 5, 1e-3
     lifting = SQUARES.bind(data.states)
-    result = tried(Trial(Candidate("", lifting), data, fold, horizon, 2, (ridge,)))
+    result = tried(Trial(km.synthesis.Candidate("", lifting), data, fold, horizon, 2, (ridge,)))
     spread = np.concatenate([e.X for e in data]).std(axis=0)
     for f in range(3):
         train = km.Episodes([e for e, g in zip(data, fold, strict=True) if g != f], data.dt)
@@ -279,8 +279,7 @@ def test_a_mistake_is_told(change, words):
 
 def test_a_selection_is_data():
     found = km.select(episodes_of(linear, count=6), candidates=[PLAIN], horizon=5, folds=2)
-    arrays = {}
-    assert from_data(to_data(found, arrays), arrays) == found
+    assert returned(found) == found
 
 
 def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():

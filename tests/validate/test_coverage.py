@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.validate.regions import empty_regions
-from koopmpc.values import from_data, to_data
 from tests.example_plants import random_episodes
+from tests.roundtrip import returned
 
 NAMES = ("theta [rad]", "omega [rad/s]")
 
@@ -104,7 +104,7 @@ def test_many_coordinates_are_looked_at_one_by_one() -> None:
 def test_it_is_a_value_and_refuses_what_does_not_fit() -> None:
     data = random_episodes(3, [100], 2, 1)
     found = km.validate.coverage(data)
-    assert from_data(to_data(found)) == found
+    assert returned(found) == found
     with pytest.raises(km.errors.ShapeError, match=r"x and u have shapes \(3,\) and \(1,\), the coverage has 2 states"):
         found.seen([0, 0, 0], [0])
     with pytest.raises(km.errors.ShapeError, match="pass"):

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.linalg import subspace_angles
 
 import koopmpc as km
-from koopmpc.lifting.reduced import Projected
 from koopmpc.validate.residuals import proximity_of
 from tests.example_plants import one_step_pairs, random_episodes
 from tests.validate.test_residual_dmd import CLOSED, manifold, pendulum
@@ -70,7 +69,9 @@ def test_no_choice_of_basis_changes_it(seed: int) -> None:
     data = one_step_pairs(pendulum, 2, 1, 80, seed)
     rng = np.random.default_rng(seed)
     whole = DICTIONARY.bind(data.states)
-    mixed = Projected(whole, np.linalg.qr(rng.standard_normal((whole.nz, whole.nz)))[0] * rng.uniform(0.5, 2, whole.nz))
+    mixed = km.lifting.Projected(
+        whole, np.linalg.qr(rng.standard_normal((whole.nz, whole.nz)))[0] * rng.uniform(0.5, 2, whole.nz)
+    )
     one, other = (km.validate.invariance(data, psi).proximity for psi in (whole, mixed))
     assert one == pytest.approx(other, rel=1e-9)
 

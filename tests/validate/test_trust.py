@@ -1,14 +1,13 @@
 """The trust report: a good model is trusted, bad ones are not, and it says why."""
 
-import json
 import warnings
 
 import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.values import from_data, to_data
 from tests.example_plants import Pendulum
+from tests.roundtrip import returned
 
 HORIZON = 10
 LIFTING = km.State() + km.Fourier(2, states=[0])
@@ -196,7 +195,7 @@ def test_a_model_that_diverges_gets_a_report_too(data) -> None:
 def test_it_is_a_value_of_plain_data(data) -> None:
     train, held_out = data
     report = km.trust(km.edmd(train, LIFTING), held_out, HORIZON, train=train, closed_loop=train)
-    again = from_data(json.loads(json.dumps(to_data(report))))
+    again = returned(report)
     assert isinstance(again, km.validate.TrustReport)
     assert again == report
     assert str(again) == str(report)

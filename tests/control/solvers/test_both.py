@@ -12,10 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.linear.koopman_mpc import SOLVERS
-from koopmpc.control.solvers.base import QP, QPSolver
 from tests.control.kkt import meets_kkt
-from tests.control.solvers.random_qps import FEASIBLE, KINDS, exactness, random_qp
+from tests.control.solvers.random_qps import FEASIBLE, KINDS, QP, SOLVERS, QPSolver, exactness, random_qp
 
 TIGHT = {"osqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}, "daqp": {}}
 WELL_SCALED = ("box", "hard", "soft", "exact", "dense", "degenerate")

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.linear.koopman_mpc import SOLVERS
-from koopmpc.control.solvers.base import QP
+from tests.control.solvers.random_qps import QP, SOLVERS
 
 TIGHT = {"osqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20_000}, "daqp": {}}
 
