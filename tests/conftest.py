@@ -30,9 +30,9 @@ def _every_qp_meets_kkt():
         return
     import koopmpc.control.target
     from koopmpc.control.linear import koopman_mpc
-    from tests.control.kkt import CheckedOSQP
+    from tests.control.kkt import CheckedDAQP, CheckedOSQP
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(koopman_mpc.SOLVERS, "osqp", CheckedOSQP)
-        patch.setattr(koopmpc.control.target, "OSQP", CheckedOSQP)
+        patch.setattr(koopmpc.control.target, "DAQP", CheckedDAQP)
         yield

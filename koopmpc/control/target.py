@@ -10,7 +10,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolver
-from koopmpc.control.solvers.osqp import OSQP
+from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.tracking import LiftedTracking
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import constant_index
@@ -18,7 +18,6 @@ from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
-PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000}
 KEPT = 10_000  # coordinates remembered before the memory starts anew
 
 
@@ -97,7 +96,7 @@ class Targets:
             H = H / max(float(np.trace(H)), 1e-300) + 1e-9 * np.eye(len(H))
             free = np.full(count, np.inf)
             qp = QP(H, np.zeros(len(H)), self.rows[:count], -free, free)
-            self._solvers[count] = OSQP(qp, PRECISE)
+            self._solvers[count] = DAQP(qp)
         return self._solvers[count]
 
 

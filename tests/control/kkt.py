@@ -1,4 +1,4 @@
-"""OSQP with every answer checked: stationarity, feasibility and the signs of the multipliers of each QP."""
+"""OSQP and DAQP with every answer checked: stationarity, feasibility and the signs of the multipliers of each QP."""
 
 from typing import ClassVar
 
@@ -6,6 +6,7 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.osqp import DEFAULTS, OSQP
 
 
@@ -45,3 +46,14 @@ def meets_kkt(qp, solution, eps_abs, eps_rel):
     pushed = np.abs(y) > 10 * (eps_abs + eps_rel * size(y))
     end = np.where(y > 0, qp.high, qp.low)
     assert (np.abs(Av - end)[pushed] <= 3 * primal + 1e-9).all()
+
+
+class CheckedDAQP(DAQP):
+    """The same of DAQP, whose answers are exact to about 1e-8 of the size of what they are made of."""
+
+    def solve(self, v, y, time_limit=None):
+        solution = super().solve(v, y, time_limit)
+        if solution.status is km.Status.OPTIMAL:
+            qp = self._qp
+            meets_kkt(QP(qp.P, qp.q, qp.A, self.low, self.high), solution, 1e-7, 1e-6)
+        return solution
