@@ -206,7 +206,7 @@ def _is_a(value: Any, hint: Any) -> bool:
     if origin in (Union, UnionType):
         return any(_is_a(value, arg) for arg in args)
     if origin is Literal:
-        return value in args
+        return not isinstance(value, np.ndarray) and value in args
     if origin is tuple and args[-1:] != (...,):
         items = cast("Sequence[Any]", value)
         return isinstance(value, tuple) and len(items) == len(args) and all(map(_is_a, items, args))

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.values import Value
@@ -16,10 +16,12 @@ from koopmpc.values import Value
 
 @dataclass(frozen=True, eq=False)
 class Cost(Value):
-    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + ‖u_k − u_{k−1}‖²_{R_delta}) + terminal weight.
+    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + ‖u_k − u_{k−1}‖²_{R_delta}) + V(z_N).
 
-    The terminal term is ‖z_N − z_r‖²_{Q_N}, or ‖x_N − r_N‖²_{Q_N} for an (nx, nx) weight. By default Q_N is the P
-    of the infinite horizon; with R_delta that P weighs [z_N − z_r; u_{N−1} − u_r], for u_N has its price too.
+    V is by default the cost-to-go of the same tracking problem over a tail of steps after the horizon, without limits
+    and with an input of its own at each step: x_N and every later state are weighed by Q, inputs by R around u_r and
+    their changes by R_delta. The last reference row, its input target, the last measured disturbance and the estimated
+    one are held. No target state is needed, so a reference may move and need not be an equilibrium.
 
     Parameters
     ----------
@@ -28,27 +30,36 @@ class Cost(Value):
     R
         Weight of the inputs, ⪰ 0; a scalar or a vector is a diagonal. R + BᵀPB must be positive definite.
     Q_N
-        Terminal weight, (nx, nx) or (nz, nz). None takes the limit of the Riccati difference equation.
+        Terminal weight in place of the tail, of x_N − r_N if (nx, nx), of z_N − z_r if (nz, nz), where z_r is the
+        equilibrium that comes nearest to r_N.
     of
         The tracked outputs as observables of the state; the references have as many columns. A controller on a
         lifted predictor finds them in its own lifting by name: any lifted coordinates may be tracked.
     u_target
-        "equilibrium": u_r holds the reference, found for each reference inside the limits; "zero": u_r = 0.
+        u_r. "equilibrium": the input that holds the reference, or comes nearest to it inside the limits, found for each
+        reference row; "zero"; an input (nu,); or rows (k, nu) that go with the rows of a reference: row k counts at
+        the k-th step after the controller's reset, the last one from then on.
     R_delta
         Weight of the changes of the inputs from step to step, ⪰ 0; a scalar or a vector is a diagonal.
+    tail
+        Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
+        was fitted to data as long as the horizon, for beyond that the errors of such a model outweigh the rest.
 
     Raises
     ------
     DefinitenessError
         A weight is indefinite or not symmetric.
+    DataError
+        Both Q_N and tail are given; tail is no whole number or negative; u_target is none of the above.
     """
 
     Q: ArrayLike
     R: ArrayLike
     Q_N: ArrayLike | None = None
     of: Lifting = field(default_factory=State)
-    u_target: Literal["equilibrium", "zero"] = "equilibrium"
+    u_target: Literal["equilibrium", "zero"] | ArrayLike = "equilibrium"
     R_delta: ArrayLike | None = None
+    tail: int | None = None
 
     def __post_init__(self) -> None:
         checks.kind(self.of, "of", Lifting, 'for example km.State("theta"), or km.Fourier(1, states="theta")')
@@ -60,12 +71,40 @@ class Cost(Value):
                 stored = checks.array(value, name)
                 checks.weight(stored, name)
                 object.__setattr__(self, name, stored)
-        if self.u_target not in ("equilibrium", "zero"):
-            raise DataError(f'u_target is {self.u_target!r}; pass "equilibrium" or "zero"')
+        if isinstance(self.u_target, str):
+            if self.u_target not in ("equilibrium", "zero"):
+                known = '"equilibrium", "zero", an input or rows of inputs'
+                raise DataError(f"u_target is {self.u_target!r}; pass {known}")
+        else:
+            rows = np.atleast_1d(checks.array(self.u_target, "u_target"))
+            if rows.ndim > 2 or not rows.size:
+                raise ShapeError(f"u_target has shape {rows.shape}, expected (nu,) or rows (k, nu), one a step")
+            object.__setattr__(self, "u_target", rows)
+        if self.tail is not None:
+            object.__setattr__(self, "tail", int(checks.count(self.tail, "tail", 0)))
+            if self.Q_N is not None:
+                raise DataError(f"Q_N and tail = {self.tail} are given; Q_N takes the tail's place: pass one of them")
 
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
         """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
         return checks.weight(self.Q, "Q", nr), checks.weight(self.R, "R", nu)
+
+    def given_inputs(self, nu: int) -> Float[np.ndarray, "T nu"] | None:
+        """Return the rows of a u_target that is given as numbers, None for one by name.
+
+        Raises
+        ------
+        ShapeError
+            The rows have another number of inputs.
+        """
+        if isinstance(self.u_target, str):
+            return None
+        rows = np.atleast_2d(np.asarray(self.u_target, dtype=np.float64))
+        if rows.shape[1] != nu:
+            raise ShapeError(
+                f"u_target has shape {np.shape(self.u_target)}, expected ({nu},) or rows (k, {nu}), one value an input"
+            )
+        return rows
 
     def rate(self, nu: int) -> Float[np.ndarray, "nu nu"] | None:
         """Return R_delta (nu, nu), None where the changes of the inputs cost nothing."""

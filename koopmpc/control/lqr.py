@@ -1,4 +1,4 @@
-"""LQR: u = u_r − K (ψ(x) − z_r), clipped to the limits of the inputs and of their rates."""
+"""LQR: u = −K ψ(x) + feedforward, clipped to the limits of the inputs and of their rates."""
 
 from time import perf_counter
 
@@ -10,31 +10,32 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.control.riccati import one_step, stationary
-from koopmpc.control.target import reference_rows, targets_of
+from koopmpc.control.riccati import Gain
+from koopmpc.control.tail import tail_of, tail_stage
+from koopmpc.control.target import given_inputs, reference_rows, targets_of
 from koopmpc.control.tracking import lifted_tracking
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
-ITERATIONS = 10_000
 _NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here
 
 
 class LQR:
-    """u = u_r − K (ψ(x) − z_r) on a lifted predictor, or on a linearisation as `LinearPredictor.local` makes it.
+    """u = −K ψ(x) + v_r r + v_u u_r + v_w w on a lifted predictor, or on a linearisation of `LinearPredictor.local`.
 
-    K is the limit of the Riccati difference equation for the cost's Q and R; (z_r, u_r) is the equilibrium that
-    holds the reference. With R_delta it acts on [ψ(x) − z_r; u_{k−1} − u_r]. The input is clipped to the limits of
-    its change, soft or hard, and to its own (status SATURATED); other limits are not seen.
+    It minimises Σ ‖of(x_k) − r‖²_Q + ‖u_k − u_r‖²_R over an endless horizon, the reference r, its input target u_r and
+    the disturbance w held: the gain K and the feedforward are where the Riccati difference equation rests. Where r is
+    an equilibrium and u_r holds it, u = u_r − K (ψ(x) − z_r). With R_delta it acts on [ψ(x); u_{k−1}]. The input is
+    clipped to the limits of its change, soft or hard, and to its own (status SATURATED); other limits are not seen.
 
     Parameters
     ----------
     predictor
         z⁺ = A z + B u (+ E w).
     cost
-        Q, R and R_delta; a terminal weight has no meaning here.
+        Q, R, R_delta and u_target; Q_N and tail have no meaning here.
     limits
         Input and rate limits.
 
@@ -51,15 +52,17 @@ class LQR:
         checks.kind(predictor, "predictor", LinearPredictor, advice)
         self.predictor, self.cost, self.limits = predictor, cost, limits
         track = lifted_tracking(predictor, cost, Limits() if limits is None else limits)
-        C = track.tracked
-        step = one_step(predictor.A, predictor.B, C.T @ track.Q @ C, track.R, track.R_delta)
-        self.gain = stationary(step.A, step.B, step.Q, step.R, ITERATIONS, step.M)
-        self._K, self._K_rate = np.split(self.gain.K, [predictor.nz], axis=1)  # the second is of u_{k−1} − u_r
+        A, B, E, C = predictor.A, predictor.B, predictor.E, track.tracked
+        rest = tail_of(tail_stage(A, B, E, C, track.Q, track.R, track.R_delta), None)
+        self.gain, self._v = Gain(rest.K, rest.P), rest.v  # the feedforward of [w; r; u_r]
+        self._K, self._K_rate = np.split(rest.K, [predictor.nz], axis=1)  # the second is of u_{k−1}
         self._targets, self._inputs, self._nr = targets_of(predictor, cost, track), track.inputs, len(C)
+        self._given_rows = given_inputs(cost, track.inputs)
         self._rates = track.rates
         self._observer = Measured(predictor)
-        self._reference_key: bytes | None = None
+        self._reference_key: tuple[bytes, int] | None = None
         self._feedforward = np.zeros(self.nu)
+        self._row = 0  # of a given u_target, for the next call
         self._last = np.zeros(self.nu)
         self.reset()
 
@@ -81,9 +84,10 @@ class LQR:
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Set the last input, from which rates count, and which is held if the first measurement is bad.
 
-        By default it is zero inside the limits.
+        By default it is zero inside the limits. Rows of a given u_target start anew.
         """
         self._observer.reset()
+        self._row = 0
         zero = np.clip(np.zeros(self.nu), *self._inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
 
@@ -101,11 +105,13 @@ class LQR:
         start = perf_counter()
         x = checks.array(y, "y", (self.predictor.nx,), finite=False)
         target = np.asarray(reference, dtype=np.float64)
-        e = None if w is None else self._disturbance(np.asarray(w, dtype=np.float64))
-        key = target.tobytes() if e is None else target.tobytes() + e.tobytes()
+        told = None if w is None else self._disturbance(np.asarray(w, dtype=np.float64))
+        key = target.tobytes() + (b"" if told is None else told.tobytes()), self._row
         if key != self._reference_key:
-            self._aim(target, e)
+            self._aim(target, told)
             self._reference_key = key
+        if self._given_rows is not None and self._row + 1 < len(self._given_rows):
+            self._row += 1
         if applied is not None:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
             if (np.abs(got) < HUGE).all():
@@ -122,26 +128,28 @@ class LQR:
         self._last = u
         return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
 
-    def _disturbance(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nz"]:
-        """Return E w, NaN where w cannot be."""
+    def _disturbance(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nw"]:
+        """Return w of this step, NaN where it cannot be."""
         row = w[0] if w.ndim == 2 and len(w) else w
         if row.shape != (self.predictor.nw,):
             raise ShapeError(
                 f"w has shape {w.shape}, the predictor has {self.predictor.nw} disturbances; pass one value each"
             )
-        return self.predictor.E @ np.where(np.abs(row) < HUGE, row, np.nan)
+        return np.where(np.abs(row) < HUGE, row, np.nan)
 
-    def _aim(self, reference: Float[np.ndarray, "..."], e: Float[np.ndarray, " nz"] | None) -> None:
-        """Set the feedforward u_r + K z_r."""
+    def _aim(self, reference: Float[np.ndarray, "..."], w: Float[np.ndarray, " nw"] | None) -> None:
+        """Set the feedforward of a reference and a disturbance."""
         row = reference_rows(reference, 0, self._nr)
-        if not np.isfinite(row).all() or (e is not None and not np.isfinite(e).all()):
+        if not np.isfinite(row).all() or (w is not None and not np.isfinite(w).all()):
             self._feedforward = np.full(self.nu, np.nan)
             return
         found = self._targets
-        alpha = found.coordinates(row, e)[0]
-        z_r, u_r = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
-        if e is not None:
-            z_r, u_r = z_r + found.z_disturbance @ e, u_r + found.u_disturbance @ e
-        self._feedforward = u_r + self._K @ z_r
-        if self._K_rate.size:
-            self._feedforward += self._K_rate @ u_r
+        if self._given_rows is not None:
+            u_r = self._given_rows[self._row]
+        else:
+            e = None if w is None else self.predictor.E @ w
+            u_r = found.u0 + found.W @ found.coordinates(row, e)[0]
+            if e is not None:
+                u_r = u_r + found.u_disturbance @ e
+        w = np.zeros(self.predictor.nw) if w is None else w
+        self._feedforward = self._v @ np.concatenate([w, row[0], u_r])

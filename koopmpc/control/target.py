@@ -12,7 +12,7 @@ from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.tracking import LiftedTracking
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import constant_index
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
@@ -102,7 +102,7 @@ class Targets:
 
 def targets_of(predictor: LinearPredictor, cost: Cost, tracking: LiftedTracking) -> Targets:
     """Return the equilibria of a predictor under a cost and limits."""
-    track, hold = tracking, cost.u_target == "equilibrium"
+    track, hold = tracking, isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
     A, B, constant = predictor.A, predictor.B, constant_index(predictor)
     return targets(A, B, track.tracked, track.Q, track.inputs, track.limited, track.outputs, constant, hold=hold)
 
@@ -126,7 +126,7 @@ def targets(
     constant
         Index of the Constant observable, pinned to 1.
     hold
-        False: u_r = 0 on request; z_r is the equilibrium without it.
+        False: u_r is not that of the equilibrium, but zero or given.
     """
     nz, nu = B.shape
     E = np.hstack([A - np.eye(nz), B])
@@ -165,6 +165,30 @@ def targets(
         weighted=weighted,
         from_disturbance=-back @ C @ pushed[:nz],
     )
+
+
+def given_inputs(cost: Cost, inputs: Interval) -> Float[np.ndarray, "T nu"] | None:
+    """Return the rows of a u_target that is given as numbers, None for one by name.
+
+    Raises
+    ------
+    ShapeError
+        The rows have another number of inputs.
+    DataError
+        A row is outside the limits of the inputs.
+    """
+    rows = cost.given_inputs(len(inputs.low))
+    if rows is None:
+        return None
+    reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
+    outside = np.argwhere((rows < inputs.low - reach) | (rows > inputs.high + reach))
+    if len(outside):
+        k, i = outside[0]
+        raise DataError(
+            f"u_target is {rows[k, i]:g} for input {i} in row {k}, outside its limits {inputs.low[i]:g} …"
+            f" {inputs.high[i]:g}; pass inputs that the limits allow"
+        )
+    return rows
 
 
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:

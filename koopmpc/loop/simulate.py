@@ -70,7 +70,8 @@ def simulate(
         What the run is judged by; kept in the Run.
     u_reference
         (nu,) or (steps, nu): the inputs that hold the reference. The metrics charge ‖u_k − u_reference_k‖²_R, so
-        that rest on the reference costs nothing; zero by default. The controller is not told.
+        that rest on the reference costs nothing. By default they are those of the cost's u_target where that is given
+        as numbers, else zero. The controller is not told.
     disturbance
         d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
     noise
@@ -124,7 +125,7 @@ def simulate(
     if disturbed is not None and not isinstance(plant, SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
     noisy = _noise(noise, steps, ny)
-    held = np.zeros((steps, nu)) if u_reference is None else _held(u_reference, steps, nu)
+    held = _held(u_reference, cost, steps, nu)
     metadata = dict(metadata or {})
     W = None
     if measured is not None:
@@ -210,8 +211,15 @@ def _rows_ahead(
     return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
 
 
-def _held(u_reference: ArrayLike, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
-    """Return one row a step of the inputs that hold the reference."""
+def _held(u_reference: ArrayLike | None, cost: Cost | None, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
+    """Return one row a step of the inputs from which the metrics count: as given, or those of the cost's u_target."""
+    if u_reference is None:
+        given = None if cost is None else cost.given_inputs(nu)
+        if given is None:
+            return np.zeros((steps, nu))
+        if 1 < len(given) < steps:
+            raise ShapeError(f"u_target has {len(given)} rows, the run {steps} steps; pass one row, or one a step")
+        return np.array(np.broadcast_to(given, (steps, nu)) if len(given) == 1 else given[:steps])
     values = checks.array(u_reference, "u_reference")
     if values.ndim < 2:
         return np.tile(checks.vector(values, "u_reference", nu), (steps, 1))

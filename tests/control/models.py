@@ -4,7 +4,6 @@ import numpy as np
 import scipy.linalg
 
 import koopmpc as km
-from koopmpc.control.riccati import stationary
 from tests.example_plants import linear as linear
 from tests.example_plants import random_pair as random_pair
 from tests.example_plants import step_map as step_map
@@ -60,12 +59,38 @@ def equilibrium(A, B, C, Q, r, constant=None):
     return v[:nz], v[nz:]
 
 
-def terminal(model, cost, C, N):
-    """(P, weighs_state) of the cost's terminal term."""
-    Q, R = cost.matrices(len(C), model.nu)
+def tail(model, cost, r, u_r, push=None, C=None, steps=600):
+    """(F, h) of the tail's cost ‖F ξ − h‖² + const, ξ = z or [z; u_{k−1}], by orthogonal elimination of its inputs."""
+    A, B, C = model.A, model.B, model.C if C is None else C
+    (nz, nu), push = B.shape, np.zeros(len(A)) if push is None else push
+    Q, R = (scipy.linalg.sqrtm(M).real for M in cost.matrices(len(C), nu))
+    rated = cost.R_delta is not None
+    if rated:
+        A, B = scipy.linalg.block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
+        push = np.append(push, np.zeros(nu))
+    n = len(A)
+    at = np.hstack([Q @ C, np.zeros((len(C), n - nz))])  # every state of the tail is weighed by Q
+    F, h = at, Q @ r
+    for _ in range(steps):
+        rows = [(F @ B, F @ A, h - F @ push), (R, np.zeros((nu, n)), R @ u_r), (np.zeros((len(at), nu)), at, Q @ r)]
+        if rated:
+            S = scipy.linalg.sqrtm(cost.rate(nu)).real
+            rows.append((S, np.hstack([np.zeros((nu, nz)), -S]), np.zeros(nu)))
+        left = np.linalg.qr(np.vstack([np.hstack([u, x, y[:, None]]) for u, x, y in rows]), mode="r")
+        F, h = left[nu:, nu:-1], left[nu:, -1]
+    return F, h
+
+
+def end_of(model, cost, targets, rows, push=None, C=None):
+    """(F, h) of the terminal cost ‖F ξ_N − h‖²: a Q_N on the state or on z, or the tail."""
     if cost.Q_N is None:
-        return stationary(model.A, model.B, C.T @ Q @ C, R, 10 * N).P, False
-    return np.atleast_2d(cost.Q_N), len(np.atleast_2d(cost.Q_N)) == model.nx
+        steps = cost.tail if cost.tail is not None else 600 if model.report is None else len(rows) - 1
+        return tail(model, cost, rows[-1], targets[-1][1], push, C, steps)
+    P = np.asarray(cost.Q_N)
+    root = scipy.linalg.sqrtm(np.diag(P) if P.ndim == 1 else P).real
+    if len(P) == model.nx:
+        return root @ (model.C if C is None else C), root @ rows[-1]
+    return root, root @ targets[-1][0]
 
 
 def dense_plan(model, cost, z0, rows, targets, C=None):
@@ -75,7 +100,7 @@ def dense_plan(model, cost, z0, rows, targets, C=None):
     N, nu = len(rows) - 1, model.nu
     Q, R = cost.matrices(len(C), nu)
     root = lambda M: scipy.linalg.sqrtm(M).real  # noqa: E731
-    P, weighs_state = terminal(model, cost, C, N)
+    F, h = end_of(model, cost, targets, rows, C=C)
     blocks, right = [], []
     Z, D = np.array(z0), np.zeros((len(A), N * nu))
     for k in range(N):
@@ -86,12 +111,9 @@ def dense_plan(model, cost, z0, rows, targets, C=None):
         if k + 1 < N:
             blocks.append(root(Q) @ C @ D)
             right.append(root(Q) @ (rows[k + 1] - C @ Z))
-        elif weighs_state:
-            blocks.append(root(P) @ C @ D)
-            right.append(root(P) @ (rows[N] - C @ Z))
         else:
-            blocks.append(root(P) @ D)
-            right.append(root(P) @ (targets[N][0] - Z))
+            blocks.append(F @ D)
+            right.append(h - F @ Z)
     return np.linalg.lstsq(np.vstack(blocks), np.concatenate(right), rcond=None)[0].reshape(N, nu)
 
 
@@ -102,7 +124,7 @@ def cvxpy_plan(model, cost, limits, z0, rows, targets, C=None, of=None):
     C = model.C if C is None else C
     N, nu, nz = len(rows) - 1, model.nu, model.nz
     Q, R = cost.matrices(len(C), nu)
-    P, weighs_state = terminal(model, cost, C, N)
+    F, h = end_of(model, cost, targets, rows, C=C)
     psd = cp.psd_wrap
     Z, U = cp.Variable((N + 1, nz)), cp.Variable((N, nu))
     box = limits.inputs(nu)
@@ -121,8 +143,7 @@ def cvxpy_plan(model, cost, limits, z0, rows, targets, C=None, of=None):
         objective += cp.quad_form(U[k] - targets[k][1], psd(R))
         if k + 1 < N:
             objective += cp.quad_form(C @ Z[k + 1] - rows[k + 1], psd(Q))
-    end = C @ Z[N] - rows[N] if weighs_state else Z[N] - targets[N][0]
-    objective += cp.quad_form(end, psd(P))
+    objective += cp.sum_squares(F @ Z[N] - h)
     limited = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
     for i in limited:
         values = Z[1:] @ G[i]

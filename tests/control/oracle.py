@@ -7,11 +7,11 @@ import numpy as np
 TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 
 
-def oracle(model, cost, limits, z0, R, targets, *, P, u_prev, W=None, d=None, blocks=None, C=None, of=None):
+def oracle(model, cost, limits, z0, R, targets, *, end, u_prev, W=None, d=None, blocks=None, C=None, of=None):
     """U (N, nu) and the least cost, by CLARABEL; None where there is none.
 
-    `targets` are (z_r, u_r) of each row of R; P weighs x_N − r_N, z_N − z_r, or [z_N − z_r; u_{N−1} − u_r], by its
-    size; `of` are the matrix of the limited observables.
+    `targets` are (z_r, u_r) of each row of R; the end costs ‖F ξ_N − h‖², `end` being (F, h) and ξ_N = z_N or
+    [z_N; u_{N−1}] by the size of F; `of` are the matrix of the limited observables.
     """
     import cvxpy as cp
 
@@ -54,13 +54,8 @@ def oracle(model, cost, limits, z0, R, targets, *, P, u_prev, W=None, d=None, bl
             objective += cp.quad_form(U[k] - before, psd(cost.rate(nu)))
         if k + 1 < N:
             objective += cp.quad_form(C @ Z[k + 1] - R[k + 1], psd(Q))
-    if len(P) == len(C) and len(P) != nz:
-        end = C @ Z[N] - R[N]
-    else:
-        end = Z[N] - targets[N][0]
-        if len(P) > nz:
-            end = cp.hstack([end, U[N - 1] - targets[N][1]])
-    objective += cp.quad_form(end, psd(P))
+    F, h = end
+    objective += cp.sum_squares(F @ (Z[N] if F.shape[1] == nz else cp.hstack([Z[N], U[N - 1]])) - h)
 
     box = limits.inputs(nu)
     for i in range(nu):

@@ -53,7 +53,7 @@ LIMITS = [
 @pytest.mark.parametrize("nu", [1, 2])
 @pytest.mark.parametrize("limits", LIMITS)
 def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: km.Limits) -> None:
-    model, cost = linear(nu), km.Cost(Q=[1, 2, 1], R=0.3)
+    model, cost = linear(nu), km.Cost(Q=[1, 2, 1], R=0.3, Q_N=[[9, 1, 2], [1, 8, 3], [2, 3, 6]])
     ours = km.BilinearMPC(model, cost, limits, 15)
     theirs = km.KoopmanMPC(model, cost, limits, 15, settings=PRECISE)
     assert isinstance(ours, km.control.Controller)

@@ -112,7 +112,7 @@ show(lambda: km.metrics([1, 2]))
 """
     )
     assert lines == [
-        """DataError u_target is 'rest'; pass "equilibrium" or "zero\"""",
+        """DataError u_target is 'rest'; pass "equilibrium", "zero", an input or rows of inputs""",
         "DataError solver is 'simplex'; there are 'osqp', 'daqp'",
         "DataError horizon is 2.5; pass a whole number",
         "ShapeError slack is 5; pass (linear, quadratic), or None for hard limits",

@@ -41,7 +41,7 @@ def bilinear() -> km.BilinearPredictor:
     return km.bilinear_edmd(episodes(True), km.State() + km.Constant() + km.Monomials(2), embedding=km.Delay(1))
 
 
-FREE, SMOOTH = km.Cost(Q=[2.0], R=0.1), km.Cost(Q=[2.0], R=0.1, R_delta=0.3)
+FREE, SMOOTH = km.Cost(Q=[2.0], R=0.1), km.Cost(Q=[2.0], R=0.1, R_delta=0.3, Q_N=[[6.0]])
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import stationary
-from tests.control.models import PRECISE, Told, in_coordinates, linear, random_pair
+from tests.control.models import PRECISE, Told, end_of, in_coordinates, linear, random_pair
 from tests.control.oracle import oracle, targets_of
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -22,20 +21,6 @@ SOLVED = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
 
 def with_disturbances(model, E):
     return km.LinearPredictor(model.A, model.B, model.C, model.lifting, model.dt, model.states, model.inputs, E=E)
-
-
-def terminal(model, cost, N):
-    """The cost's own P, or that of the difference equation on z or on [z; u], 10 N steps of it."""
-    if cost.Q_N is not None:
-        return np.diag(cost.Q_N)
-    nz, nu = model.B.shape
-    Q, R = model.C.T @ np.diag(cost.Q) @ model.C, np.diag(cost.R)
-    if cost.R_delta is None:
-        return stationary(model.A, model.B, Q, R, 10 * N).P
-    A, B = scipy.linalg.block_diag(model.A, np.zeros((nu, nu))), np.vstack([model.B, np.eye(nu)])
-    R_delta = np.diag(cost.R_delta)
-    M = np.vstack([np.zeros((nz, nu)), -R_delta])
-    return stationary(A, B, scipy.linalg.block_diag(Q, R_delta), R + R_delta, 10 * N, M).P
 
 
 def draw(rng):
@@ -92,7 +77,6 @@ def equals_cvxpy(seed, coordinates):
     d = np.zeros(nz)
     told = Told(d) if disturbed else None
     mpc = in_coordinates(coordinates)(model, cost, limits, N, moves=blocks, estimator=told, settings=PRECISE)
-    P = terminal(model, cost, N)
     x = rng.normal(size=nx)
     u_prev = np.clip(0.3 * rng.normal(size=nu), *limits.inputs(nu))
     mpc.reset(u_prev=u_prev)
@@ -103,9 +87,10 @@ def equals_cvxpy(seed, coordinates):
         move = mpc(x, rows, u_prev if rng.random() < 0.5 else None, W if nw else None)
         e = model.E @ W[-1] + d if nw or disturbed else None
         targets = targets_of(mpc, rows, e)
-        if cost.Q_N is not None and nz == nx:
-            targets[-1] = rows[-1], targets[-1][1]
-        found = oracle(model, cost, limits, model.lift(x), rows, targets, P=P, u_prev=u_prev, W=W, d=d, blocks=blocks)
+        end = end_of(model, cost, targets, rows, e)
+        found = oracle(
+            model, cost, limits, model.lift(x), rows, targets, end=end, u_prev=u_prev, W=W, d=d, blocks=blocks
+        )
         if found is not None and np.abs(found[0]).max() > 100:
             return  # hard states without input limits: beyond the digits of both solvers
         if found is None:

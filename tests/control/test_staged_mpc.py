@@ -17,8 +17,9 @@ GOOD = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
 A = np.array([[1.05, 0.1, 0], [0, 1.02, 0.1], [0.05, 0, 0.9]])
 B = np.array([[0.02, 0.1], [0.1, 0], [0, 0.2]])
 E = np.array([[0.0], [0.1], [0.05]])
-R_DELTA = km.Cost(Q=[1, 2, 1], R=0.3, R_delta=[0.5, 0.1])
-PLAIN = km.Cost(Q=[1, 2, 1], R=0.3)
+END = [[9, 1, 2], [1, 8, 3], [2, 3, 6]]  # the default end of KoopmanMPC is another than that of a nonlinear controller
+R_DELTA = km.Cost(Q=[1, 2, 1], R=0.3, R_delta=[0.5, 0.1], Q_N=END)
+PLAIN = km.Cost(Q=[1, 2, 1], R=0.3, Q_N=END)
 BOX = {"u_min": -0.8, "u_max": 0.8}
 MIXES = [
     (R_DELTA, km.Limits(), None),

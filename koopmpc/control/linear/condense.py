@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
 from koopmpc.control.linear.horizon import Horizon
+from koopmpc.control.linear.terminal import Terminal
 from koopmpc.control.riccati import Law
 from koopmpc.control.target import Targets
 
@@ -29,10 +30,11 @@ INPUTS_ALONE = 1e5
 
 @dataclass(frozen=True)
 class Condensed:
-    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N] = F_x ξ_0 + F_r r + F_α α + F_g g + f + D w, a u a block.
+    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N] = F_x ξ_0 + F_r r + F_α α + F_u u_r + F_g g + f + D w, a u a block.
 
     ξ_0 is z_0, or [z_0; u_{−1}]; r holds the N + 1 reference rows one after the other, α the targets' coordinates of
-    the same rows, g the preview of disturbances. The changes of u are there where they have limits.
+    the same rows, u_r their input targets where these are given as numbers, g the preview of disturbances. The changes
+    of u are there where they have limits.
 
     Above the unconstrained optimum the cost is unit · wᵀH w, unit the mean diagonal of S_0: w has the size of u, and
     a cost in other units gives the same QP.
@@ -41,6 +43,7 @@ class Condensed:
     from_state: Float[np.ndarray, "n nx"]
     from_reference: Float[np.ndarray, "n nR"]
     from_target: Float[np.ndarray, "n nT"]
+    from_given: Float[np.ndarray, "n nI"]
     from_drive: Float[np.ndarray, "n ng"]
     offset: Float[np.ndarray, " n"]
     deviation: Float[np.ndarray, "n nw"]
@@ -49,7 +52,9 @@ class Condensed:
     coordinates: str
 
 
-def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordinates = "riccati") -> Condensed:
+def condense(
+    horizon: Horizon, law: Law, terminal: Terminal, targets: Targets, coordinates: Coordinates = "riccati"
+) -> Condensed:
     """Return the maps of a horizon whose blocks follow `law`; "auto" chooses the coordinates by cond(H)."""
     h, signals = horizon, horizon.signals
     moves, nu, nx = law.K.shape
@@ -86,13 +91,14 @@ def condense(horizon: Horizon, law: Law, targets: Targets, coordinates: Coordina
         rows.append((U - np.concatenate([last[None], U[:-1]])).reshape(n, -1))
     v = np.vstack([*rows, (h.G @ Z).reshape(h.N * ng, Z.shape[2])])
     W = v[:, nx + nf :]
-    reference, target = _asked(h, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
+    reference, target, given = _asked(h, terminal, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
     most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
     chosen, deviation, hessian = _coordinates(W, n, coordinates, most)
     return Condensed(
         v[:, :nx],
         W @ (reference / unit),
         W @ (target / unit),
+        W @ (given / unit),
         v[:, nx : nx + nf - 1],
         v[:, nx + nf - 1],
         deviation,
@@ -122,21 +128,22 @@ def row_sizes(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray,
 
 
 def _asked(
-    h: Horizon, targets: Targets, U: Float[np.ndarray, "moves nu nw"], Z: Float[np.ndarray, "N nz nw"]
-) -> tuple[Float[np.ndarray, "nw nR"], Float[np.ndarray, "nw nT"]]:
-    """Return what the references, and the coordinates of their targets, ask of w, times unit."""
-    nw, nr, na, nz = U.shape[2], len(h.C), targets.Z.shape[1], len(h.A)
-    reference, target = np.zeros((nw, h.N + 1, nr)), np.zeros((nw, h.N + 1, na))
+    h: Horizon,
+    terminal: Terminal,
+    targets: Targets,
+    U: Float[np.ndarray, "moves nu nw"],
+    Z: Float[np.ndarray, "N nz nw"],
+) -> tuple[Float[np.ndarray, "nw nR"], Float[np.ndarray, "nw nT"], Float[np.ndarray, "nw nI"]]:
+    """Return what the references, the coordinates of their targets and given input targets ask of w, times unit."""
+    nw, nr, na, nu = U.shape[2], len(h.C), targets.Z.shape[1], U.shape[1]
+    reference, target, given = (np.zeros((nw, h.N + 1, columns)) for columns in (nr, na, nu))
     reference[:, 1 : h.N] = (Z[:-1].transpose(2, 0, 1) @ h.C.T) @ h.Q
-    target[:, : h.N] = np.repeat(U, h.blocks, axis=0).transpose(2, 0, 1) @ (h.R @ targets.W)
-    if h.CQ_N is not None:
-        reference[:, h.N] = Z[-1].T @ h.CQ_N
-    else:
-        target[:, h.N] = Z[-1].T @ (h.P_N[:nz, :nz] @ targets.Z)
-        if h.with_rates:
-            both = h.P_N[:nz, nz:] @ targets.W
-            target[:, h.N] += Z[-1].T @ both + U[-1].T @ (h.P_N[nz:, :nz] @ targets.Z + h.P_N[nz:, nz:] @ targets.W)
-    return reference.reshape(nw, -1), target.reshape(nw, -1)
+    given[:, : h.N] = np.repeat(U, h.blocks, axis=0).transpose(2, 0, 1) @ h.R
+    target[:, : h.N] = given[:, : h.N] @ targets.W
+    last = np.vstack([Z[-1], U[-1]])[: h.size].T  # ξ_N
+    for asked, linear in ((reference, terminal.reference), (target, terminal.target), (given, terminal.given)):
+        asked[:, h.N] = -last @ linear
+    return reference.reshape(nw, -1), target.reshape(nw, -1), given.reshape(nw, -1)
 
 
 def _coordinates(

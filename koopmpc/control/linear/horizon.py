@@ -13,13 +13,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from koopmpc import checks
-from koopmpc.control.cost import Cost
-from koopmpc.control.riccati import Stage, one_step, stationary
+from koopmpc.control.riccati import Stage
 from koopmpc.control.target import Targets
 from koopmpc.control.tracking import LiftedTracking
-from koopmpc.errors import ShapeError
-from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
 
@@ -50,7 +46,7 @@ class Horizon:
     """z⁺ = A z + B u + E w + d over blocks of held inputs; tracked outputs C z, limited outputs G z, the weights.
 
     `with_rates` puts the last input beside z, ξ = [z; u_{k−1}], as a weight or a limit of u_k − u_{k−1} needs it;
-    `bounded` says that there is such a limit. P_N weighs ξ_N − ξ_r, or x_N − r_N where CQ_N = CᵀQ_N is given.
+    `bounded` says that there is such a limit.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -61,8 +57,6 @@ class Horizon:
     Q: Float[np.ndarray, "nr nr"]
     R: Float[np.ndarray, "nu nu"]
     R_delta: Float[np.ndarray, "nu nu"] | None
-    P_N: Float[np.ndarray, "nx nx"]
-    CQ_N: Float[np.ndarray, "nz nr"] | None
     blocks: tuple[int, ...]
     with_rates: bool
     bounded: bool
@@ -100,7 +94,7 @@ def stages(horizon: Horizon, targets: Targets) -> list[Stage]:
     powers = [(np.eye(nz), np.zeros((nz, nu))), (horizon.A, horizon.B)]
     while len(powers) <= max(horizon.blocks):
         powers.append((horizon.A @ powers[-1][0], horizon.A @ powers[-1][1] + horizon.B))
-    weighed = horizon.R @ _input(horizon, targets)
+    weighed = horizon.R @ input_target(horizon, targets)
     known: dict[tuple[int, int], Stage] = {}
     result: list[Stage] = []
     k = 0
@@ -136,25 +130,8 @@ def _stage(
     return Stage(A, B, *_weights(h, powers[:-1]), e, q, r)
 
 
-def end(horizon: Horizon, targets: Targets) -> Float[np.ndarray, "nx nf"]:
-    """Return the linear term p_N of the terminal weight, as a matrix on f."""
-    h, nz = horizon, len(horizon.A)
-    p = np.zeros((h.size, h.signals.size))
-    if h.CQ_N is not None:
-        return p
-    z_r = np.zeros((nz, h.signals.size))
-    z_r[:, -1] = targets.z0
-    moved = h.disturbance(h.N - 1)
-    if moved is not None:
-        z_r += targets.z_disturbance @ moved
-    p -= h.P_N[:, :nz] @ z_r
-    if h.with_rates:
-        p -= h.P_N[:, nz:] @ _input(h, targets)
-    return p
-
-
-def _input(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
-    """Return u_r less what the coordinates of the target add; the last disturbance of the preview stays."""
+def input_target(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
+    """Return the part of u_r that f decides, the rest being that of α: the last disturbance of the preview is held."""
     u_r = np.zeros((len(targets.u0), h.signals.size))
     u_r[:, -1] = targets.u0
     moved = h.disturbance(h.N - 1)
@@ -177,51 +154,20 @@ def _weights(
 
 
 def horizon_of(
-    predictor: LinearPredictor,
-    cost: Cost,
-    track: LiftedTracking,
-    blocks: tuple[int, ...],
-    *,
-    disturbed: bool,
+    predictor: LinearPredictor, track: LiftedTracking, blocks: tuple[int, ...], *, disturbed: bool
 ) -> Horizon:
-    """Return the horizon with the terminal weight that the cost asks for."""
-    A, B, C, nz, nx = predictor.A, predictor.B, track.tracked, predictor.nz, predictor.nx
-    with_rates = track.with_rates
-    size = nz + predictor.nu * with_rates
-    bounded = track.rates is not None
-    CQ_N = None
-    if cost.Q_N is None:
-        step = one_step(A, B, C.T @ track.Q @ C, track.R, track.R_delta)
-        found = stationary(step.A, step.B, step.Q, step.R, 10 * sum(blocks), step.M).P
-    else:
-        given = np.asarray(cost.Q_N)
-        own = len(given) if given.ndim else nx
-        on_state = own == nx and isinstance(cost.of, State) and cost.of.whole
-        if own == nx != nz and not on_state:
-            raise ShapeError(
-                f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})"
-            )
-        if own not in (nx, nz):
-            raise ShapeError(f"Q_N has shape {given.shape}, expected ({nx}, {nx}) on the state or ({nz}, {nz}) on z")
-        found = checks.weight(given, "Q_N", own)
-        if on_state:
-            CQ_N = C.T @ found
-            found = CQ_N @ C
-    P_N = np.zeros((size, size))
-    P_N[: len(found), : len(found)] = found
+    """Return the horizon of a predictor for what it tracks and limits."""
     return Horizon(
-        A=A,
-        B=B,
+        A=predictor.A,
+        B=predictor.B,
         E=predictor.E,
-        C=C,
+        C=track.tracked,
         G=track.limited,
         Q=track.Q,
         R=track.R,
         R_delta=track.R_delta,
-        P_N=P_N,
-        CQ_N=CQ_N,
         blocks=blocks,
-        with_rates=with_rates,
-        bounded=bounded,
+        with_rates=track.with_rates,
+        bounded=track.rates is not None,
         disturbed=disturbed,
     )

@@ -126,6 +126,7 @@ class KoopmanMPC(MPCBase):
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
+        self._given_row = 0  # of a u_target that is given in rows, for the next call
         self._see()
         self.reset()
 
@@ -155,6 +156,8 @@ class KoopmanMPC(MPCBase):
         """Forget all earlier steps; see `MPCBase`."""
         super().reset(x0, u_prev)
         self._qps.reset()
+        if self._given_row:
+            self._given_row, self._reference_key = 0, None
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
@@ -211,6 +214,8 @@ class KoopmanMPC(MPCBase):
         if key != self._reference_key:
             self._aim(target)
             self._reference_key = key
+            if self._given_row + 1 < self._map.given_rows:  # the next call has its own row of a given u_target
+                self._given_row, self._reference_key = self._given_row + 1, None
 
         t = self._spare
         self._map.matrix.dot(origin.known, t)
@@ -239,7 +244,7 @@ class KoopmanMPC(MPCBase):
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the last column."""
         self._reference = reference_rows(reference, self._N, self._reference.shape[1], self._latency)
-        self._map.aim(self._reference)
+        self._map.aim(self._reference, self._given_row + self._latency)
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._qps.cool()

@@ -6,10 +6,11 @@ from jaxtyping import Float
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.linear.condense import Coordinates, condense, scaled
-from koopmpc.control.linear.horizon import end, horizon_of, stages
+from koopmpc.control.linear.horizon import horizon_of, stages
 from koopmpc.control.linear.qp import groups, step_qp
+from koopmpc.control.linear.terminal import terminal_of
 from koopmpc.control.riccati import recursion
-from koopmpc.control.target import margin, targets_of
+from koopmpc.control.target import given_inputs, margin, targets_of
 from koopmpc.control.tracking import lifted_tracking
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
@@ -48,9 +49,12 @@ class PlanMap:
     ) -> None:
         self.track = track = lifted_tracking(predictor, cost, limits)
         self.targets = found = targets_of(predictor, cost, track)
-        horizon = horizon_of(predictor, cost, track, blocks, disturbed=disturbed)
-        law = recursion(stages(horizon, found), horizon.P_N, end(horizon, found))
-        self.maps = scaled(condense(horizon, law, found, coordinates), track.inputs, len(blocks))
+        given = given_inputs(cost, track.inputs)
+        self._given, self.given_rows = given, 0 if given is None else len(given)
+        horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
+        end = terminal_of(predictor, cost, horizon, found)
+        law = recursion(stages(horizon, found), end.P, end.p)
+        self.maps = scaled(condense(horizon, law, end, found, coordinates), track.inputs, len(blocks))
         self.moves = len(blocks) * predictor.nu
         self.deviation = self.maps.deviation[: self.moves]
         limits_of_plan = groups(track, horizon)
@@ -66,11 +70,14 @@ class PlanMap:
         self._disturbance = np.zeros((predictor.nz, 0)) if last is None else last[:, :-1]
         ng = self._disturbance.shape[1]
         checked = np.zeros(len(found.low), dtype=np.bool_)
+        self._aimed = bool(self.maps.from_target.any())  # else no target enters the plan
         if ng:
+            first = self.maps.from_drive
+        if ng and self._aimed:
             checked = np.isfinite(found.low) | np.isfinite(found.high)
             from_disturbance = found.from_disturbance @ self._disturbance
             every = self.maps.from_target.reshape(nv, horizon.N + 1, -1).sum(axis=1)
-            first = self.maps.from_drive + every @ from_disturbance
+            first = first + every @ from_disturbance
             moved = (found.rows @ from_disturbance + found.rows_disturbance @ self._disturbance)[checked]
             first = np.vstack([first, moved, moved])
             free = np.full(len(moved), np.inf)
@@ -85,19 +92,27 @@ class PlanMap:
         from_state[:nv] = self.maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
 
-    def aim(self, R: Float[np.ndarray, "N1 nr"]) -> None:
-        """Write the part of the reference rows into the last column; NaN where a row is."""
+    def aim(self, R: Float[np.ndarray, "N1 nr"], row: int = 0) -> None:
+        """Write the part of the reference rows into the last column, NaN where a row is.
+
+        Of a u_target that is given in rows, the plan starts at `row`.
+        """
         column, maps, found = self.matrix[:, -1], self.maps, self.targets
         if not np.isfinite(R).all():
             column[:] = np.nan
             return
-        driven = self._disturbance.shape[1] > 0
-        alpha = found.nearest(R) if driven else found.coordinates(R)
-        v = maps.from_reference @ R.ravel() + maps.from_target @ alpha.ravel() + maps.offset
+        v = maps.from_reference @ R.ravel() + maps.offset
+        if self._given is not None:
+            rows = self._given[np.minimum(np.arange(row, row + len(R)), self.given_rows - 1)]
+            v += maps.from_given @ rows.ravel()
+        if self._aimed:
+            driven = self._disturbance.shape[1] > 0
+            alpha = found.nearest(R) if driven else found.coordinates(R)
+            v += maps.from_target @ alpha.ravel()
+            if driven:
+                values = (alpha @ found.rows.T)[:, self._checked]
+                column[self.planned :] = np.concatenate([values.min(axis=0), values.max(axis=0)])
         column[: self.planned] = v
-        if driven:
-            values = (alpha @ found.rows.T)[:, self._checked]
-            column[self.planned :] = np.concatenate([values.min(axis=0), values.max(axis=0)])
 
     def correction(self, R: Float[np.ndarray, "N1 nr"], g: Float[np.ndarray, " ng"]) -> Float[np.ndarray, " nv"]:
         """Return what v gains from targets that a limit moves."""

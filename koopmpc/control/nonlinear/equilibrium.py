@@ -13,7 +13,8 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.problem import LearnedMap
-from koopmpc.control.riccati import one_step, stationary
+from koopmpc.control.riccati import one_step
+from koopmpc.control.tail import stationary
 from koopmpc.control.target import TOLERANCE, root
 from koopmpc.control.tracking import StateTracking
 from koopmpc.errors import ShapeError

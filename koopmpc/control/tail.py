@@ -1,0 +1,234 @@
+"""Tail: what the steps after a horizon cost, the same tracking problem going on without limits, its signals held."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+from scipy.linalg.lapack import dgesv
+
+from koopmpc.control.riccati import Gain, Stage, gain, one_step, recursion, solved, step
+from koopmpc.errors import DefinitenessError
+
+ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or not
+SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
+EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
+RESTS = 50  # steps for which it must have settled, at most
+LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
+LEAPT = 100.0  # growth of the closed loop over the first steps up to which doubling keeps its digits
+
+
+class Tail(NamedTuple):
+    """The cost-to-go V(ξ) = ξᵀP ξ + 2 ξᵀp g + const, and the law u = −K ξ + v g of the step before it."""
+
+    P: Float[np.ndarray, "nx nx"]
+    p: Float[np.ndarray, "nx ng"]
+    K: Float[np.ndarray, "nu nx"]
+    v: Float[np.ndarray, "nu ng"]
+
+
+def tail_stage(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    D: Float[np.ndarray, "nz ne"],
+    C: Float[np.ndarray, "nr nz"],
+    Q: Float[np.ndarray, "nr nr"],
+    R: Float[np.ndarray, "nu nu"],
+    R_delta: Float[np.ndarray, "nu nu"] | None,
+) -> Stage:
+    """Return one step of the tail, z⁺ = A z + B u + D e, at the cost ‖C z − r‖²_Q + ‖u − u_r‖²_R of a step.
+
+    The known signals are g = [e; r; u_r], held from step to step. With R_delta the step is on [z; u_{k−1}] and
+    ‖u − u_{k−1}‖²_{R_delta} is added.
+    Modes that grow and that no input moves are kept from growing, see `held`.
+    """
+    plain = one_step(held(A, B), B, C.T @ Q @ C, R, R_delta)
+    (nz, ne), nr, (n, nu) = D.shape, len(C), plain.B.shape
+    e, q, r = np.zeros((n, ne + nr + nu)), np.zeros((n, ne + nr + nu)), np.zeros((nu, ne + nr + nu))
+    e[:nz, :ne] = D
+    q[:nz, ne : ne + nr] = -C.T @ Q
+    r[:, ne + nr :] = -R
+    return plain._replace(e=e, q=q, r=r)
+
+
+def tail_of(stage: Stage, steps: int | None) -> Tail:
+    """Return the tail of so many steps, all of them `stage`, and its last state weighed like the others.
+
+    None lets it go on until it rests. K and v are those of its first step, without steps those of a step before it.
+
+    Raises
+    ------
+    DefinitenessError
+        R + BᵀPB is not positive definite at some step.
+    """
+    A, B, Q, M, R, e, q, r = stage
+    if e is None or q is None or r is None:
+        raise ValueError("a stage of a tail knows its signals")
+    if steps is not None:
+        last = Q
+        if M is not None:  # no change of the input follows the last state
+            last = Q.copy()
+            last[-len(R) :, -len(R) :] = 0.0
+        law = recursion([stage] * max(steps, 1), last, q)
+        return Tail(law.P, law.p, law.K[0], law.v[0]) if steps else Tail(last, q, law.K[0], law.v[0])
+    P = stationary(A, B, Q, R, ITERATIONS, M).P
+    K, L = gain(A, B, R, P, M)
+    p = _resting(A - B @ K, q + (A - B @ K).T @ (P @ e) - K.T @ r, B)
+    return Tail(P, p, K, -solved(L, B.T @ (p + P @ e) + r))
+
+
+def _resting(
+    Phi: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, "nx ng"], B: Float[np.ndarray, "nx nu"]
+) -> Float[np.ndarray, "nx ng"]:
+    """Return p = b + Φᵀb + (Φᵀ)²b + …, by doubling until Bᵀp rests: the part that no input sees may go on growing."""
+    p, power = b, Phi.T
+    for _ in range(int(np.log2(ITERATIONS)) + 1):
+        new = power @ p
+        if not np.isfinite(new).all():
+            break
+        p, power = p + new, power @ power
+        if np.abs(B.T @ new).max(initial=0.0) <= EXACT * np.abs(B.T @ p).max(initial=0.0):
+            break
+    return p
+
+
+def held(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nz"]:
+    """Return A with every eigenvalue |λ| > 1 of a mode that no input moves replaced by λ/|λ|.
+
+    Beyond the horizon such a mode stays as large as it is at its end; its growth, which no input can answer, would
+    outweigh everything else. All other modes are as before. What an input moves is decided in balanced coordinates.
+    """
+    balanced, (size, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    columns = B / size[:, None]
+    norms = np.linalg.norm(columns, axis=0)
+    V = controllable(balanced, columns / np.where(norms > 0, norms, 1.0))
+    U = scipy.linalg.null_space(V.T) if V.shape[1] else np.eye(len(A))
+    if not U.shape[1]:
+        return A
+    T, turn, grows = scipy.linalg.schur(U.T @ balanced @ U, output="real", sort="ouc")
+    if not grows:
+        return A
+    grown, mixed, rest = T[:grows, :grows], T[:grows, grows:], T[grows:, grows:]
+    X = scipy.linalg.solve_sylvester(grown, -rest, -mixed) if len(rest) else mixed  # T [X; 1] = [X; 1] rest
+    still = grown / _sizes(grown)[:, None]
+    change = np.zeros_like(T)
+    change[:grows, :grows] = still - grown
+    change[:grows, grows:] = X @ rest - still @ X - mixed
+    U = U @ turn
+    return A + size[:, None] * (U @ change @ U.T) / size
+
+
+def _sizes(T: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+    """Return |λ| of the diagonal block that each row of a real Schur form belongs to."""
+    result, i = np.abs(np.diag(T)), 0
+    while i < len(T):
+        pair = i + 1 < len(T) and T[i + 1, i] != 0
+        if pair:
+            result[i : i + 2] = np.sqrt(np.linalg.det(T[i : i + 2, i : i + 2]))
+        i += 1 + pair
+    return result
+
+
+def stationary(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    most: int,
+    M: Float[np.ndarray, "nz nu"] | None = None,
+) -> Gain:
+    """Iterate P ← Q + AᵀPA − KᵀSK from P = Q until K rests, at most `most` steps; the stage cost may hold 2xᵀMu.
+
+    K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
+    weight may take that long to reach an input. The steps before that are taken by doubling, as far as it is safe.
+    A Constant, or any other mode that u cannot move, only makes its own entries of P grow. Where P has grown by 1e12,
+    such a mode is unstable and has taken over; the iteration then runs on the controllable part alone.
+    """
+    try:
+        start, taken = _leap(A, B, Q, R, M, most)
+        found, bounded = _iterate(A, B, Q, R, M, start, most - taken)
+        if bounded:
+            return found
+    except DefinitenessError:  # R + BᵀQB is not positive definite, or P has lost its digits
+        pass
+    found, bounded = _iterate(A, B, Q, R, M, Q, most)
+    if not bounded:
+        V = controllable(A, B)
+        found, _ = _iterate(A @ V @ V.T, B, Q, R, M, Q, most)
+    return found
+
+
+def _iterate(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    M: Float[np.ndarray, "nz nu"] | None,
+    P: Float[np.ndarray, "nz nz"],
+    most: int,
+) -> tuple[Gain, bool]:
+    """Return the last gain of the iteration from P, and whether P stayed below `LARGEST`."""
+    K = np.zeros((B.shape[1], A.shape[0]))
+    scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
+    rested = 0
+    for _ in range(most):
+        K_next, _, P_next = step(A, B, Q, R, P, M)
+        if not P_next.max() <= LARGEST * scale:  # P ⪰ 0: its largest entry is on its diagonal; False for NaN
+            return Gain(K, P), False
+        moved = abs(K_next - K).max()
+        P, K = P_next, K_next
+        rested = rested + 1 if moved <= SETTLED * abs(K).max() else 0
+        if rested >= min(len(A), RESTS):
+            break
+    return Gain(K, P), True
+
+
+def _leap(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    M: Float[np.ndarray, "nz nu"] | None,
+    most: int,
+) -> tuple[Float[np.ndarray, "nz nz"], int]:
+    """Return P after so many steps of the difference equation, a power of two below `most`, by doubling.
+
+    P = Q + H after n steps, and after 2n with
+        H + ΦᵀH(I + GH)⁻¹Φ,   G + Φ(I + GH)⁻¹GΦᵀ,   Φ(I + GH)⁻¹Φ,
+    from H = P_1 − Q, G = BS⁻¹Bᵀ, Φ = A − BK of the first step: R itself may be singular. It ends where K rests, or
+    before Φ, the closed loop of n steps, is so large that rounding would show.
+
+    Chu, Fan, Lin & Wang, "Structure-preserving algorithms for periodic discrete-time algebraic Riccati equations",
+    Int. J. Control 77, 2004.
+    """
+    K, L, P = step(A, B, Q, R, Q, M)
+    H, G, Phi, taken = P - Q, B @ solved(L, B.T), A - B @ K, 1
+    nz, one = len(A), np.eye(len(A))
+    large = LEAPT * max(1.0, float(abs(Phi).max()))
+    while 2 * taken < most:
+        _, _, both, info = dgesv(one + G @ H, np.hstack([Phi, G]))
+        new = Phi.T @ (H @ both[:, :nz])
+        new = 0.5 * (new + new.T)
+        G_new = Phi @ both[:, nz:] @ Phi.T
+        Phi = Phi @ both[:, :nz]
+        if info or not abs(Phi).max() <= large:
+            break
+        H, G, taken = H + new, G + 0.5 * (G_new + G_new.T), 2 * taken
+        K_last, K = K, gain(A, B, R, Q + H, M)[0]
+        if abs(K - K_last).max() <= SETTLED * abs(K).max():
+            break
+    return Q + H, taken
+
+
+def controllable(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nc"]:
+    """Return an orthonormal basis of the controllable subspace, the span of [B, AB, A²B, …]."""
+    V = np.empty((len(A), 0))
+    new, least = B, SETTLED * float(np.linalg.norm(B, 2))
+    while new.shape[1] and V.shape[1] < len(A):
+        for _ in range(2):  # twice is enough for orthogonality to rounding
+            new = new - V @ (V.T @ new)
+        left, sigma, _ = np.linalg.svd(new, full_matrices=False)
+        left = left[:, sigma > least]
+        V = np.hstack([V, left])
+        new, least = A @ left, SETTLED * float(np.linalg.norm(A, 2))
+    return V
