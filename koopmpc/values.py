@@ -13,7 +13,7 @@ from functools import cache
 from importlib import import_module
 from math import copysign
 from types import UnionType
-from typing import Any, ClassVar, Literal, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Union, cast, get_args, get_origin, get_type_hints, no_type_check
 
 import numpy as np
 from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
@@ -197,6 +197,7 @@ def _hints(cls: type[Value]) -> dict[str, Any]:
     return get_type_hints(cls)
 
 
+@no_type_check  # a check of its own would open a new context, in which no letter has its size yet
 def _is_a(value: Any, hint: Any) -> bool:
     """Return whether `value` is of the type that `hint` declares; an int passes for a float.
 
