@@ -1,6 +1,6 @@
 """BilinearMPC: real-time iteration on a bilinear predictor, or on any map, in the dimension of the state."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -12,13 +12,17 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.iteration import SHORTEST, RealTimeIteration
+from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.estimate.observer import Estimator
+from koopmpc.lifting.buffered import HUGE
+from koopmpc.plants.step_map import StepMap
 
-FIRST = 10  # iterations of a first step, at most
+EACH, FIRST = 12, 10  # iterations from each start of a first step, and of its best plan, at most
+FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
 SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of 1 + its size
+NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
     "_kept",
@@ -43,8 +47,10 @@ class BilinearMPC(StagedMPC):
     The controller keeps the planned states X_k as well as the inputs U_k and moves both on by one step. Each iteration
     linearises at (X_k, U_k), with defects c_k = F(X_k, U_k) − X_{k+1} and δx_0 = x − X_0. The solution of that
     quadratic program (Gauss–Newton in the tracked outputs) is added to the plan, halved until F is near its
-    linearisation along the step. The inputs are never simulated over the horizon: on an unstable plant that multiplies
-    the model's error a thousandfold, and a first plan along the free motion may end where no data were.
+    linearisation along the step. The planned inputs are never simulated over the horizon: on an unstable plant that
+    multiplies the model's error a thousandfold. The first step, and one after a failure, compares the plans to which
+    several starts lead, for a swing has several local optima: rest at x, the line from x to the equilibrium, and, of
+    given equations, the free motion.
 
     A Riccati recursion solves the program; where that plan breaks a limit, an interior-point method does whose steps
     are Riccati recursions. Where changes of the inputs count, or moves are blocked, the changes are the inputs of the
@@ -59,7 +65,7 @@ class BilinearMPC(StagedMPC):
     horizon
         N steps of the model's dt.
     sqp_iterations
-        Linearisations a step. The first step starts from rest at x and may take up to ten.
+        Linearisations a step. The first step may take up to twelve from each of its starts, and ten more.
     estimator
         A `LiftedDisturbance`: x⁺ = F(x, u) + d with d filtered from what F misses, so that no offset is left.
     latency, moves
@@ -152,14 +158,60 @@ class BilinearMPC(StagedMPC):
             self._shift(u_prev)
             status, iterations = self._improve(s, u_prev, self._sqp_iterations, deadline)
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
-            u = np.clip(u_prev if self._with_rates else np.zeros(self.nu), *self._outputs.inputs)
-            # rest at x: the free motion of a learned model may leave its data, and lead to a plan there
-            x = s[: self._map.nx]
-            self._enter(np.tile(x, (self._N + 1, 1)), np.tile(u, (self._N, 1)), u_prev)
-            status, more = self._improve(s, u_prev, max(FIRST, self._sqp_iterations), deadline)
+            status, more = self._begin_anew(s, u_prev, deadline)
             iterations += more
         free = iteration.without_limits + (u_prev if self._with_rates else 0.0)
         return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
+
+    def _begin_anew(
+        self, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
+    ) -> tuple[Status, int]:
+        """Make the cheapest plan that several starts lead to the plan; return how it ended, and all iterations.
+
+        Plans that follow the model come before those that do not yet.
+        """
+        iteration, total, best = self._iteration, 0, (3, 0.0)
+        status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
+        for X, U in self._starts(s[: self._map.nx], u_prev):
+            self._enter(X, U, u_prev)
+            ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY)
+            total += iterations
+            rank = (2, 0.0)
+            if ended in GOOD:
+                rank = (0, iteration.cost()) if iteration.gap < FOLLOWED else (1, iteration.gap)
+            if rank < best:
+                best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
+            if perf_counter() > deadline:
+                break
+        iteration.X[:], iteration.U[:], iteration.slack = kept
+        if status not in GOOD or perf_counter() > deadline:
+            return status, total
+        polished, iterations = self._improve(s, u_prev, max(FIRST, self._sqp_iterations), deadline)
+        if polished not in GOOD:
+            iteration.X[:], iteration.U[:], iteration.slack = kept
+            polished = status
+        return polished, total + iterations
+
+    def _starts(
+        self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]
+    ) -> Iterator[tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]]:
+        """Yield states and inputs to start from: rest at x, the line from x to the equilibrium, the motion from x.
+
+        No input acts in them, or the last one where its changes count. The motion is that of given equations only: a
+        learned model may invent one that leaves its data, and a plan there that looks cheaper than any real one.
+        """
+        N, u = self._N, np.clip(u_prev if self._with_rates else np.zeros(self.nu), *self._outputs.inputs)
+        U, rest = np.tile(u, (N, 1)), np.tile(x, (N + 1, 1))
+        yield rest, U
+        end = (self._target or self._preview.target).equilibrium.x
+        yield rest + np.linspace(0.0, 1.0, N + 1)[:, None] * (end - x), U
+        if not isinstance(self.model, StepMap):
+            return
+        motion = rest.copy()
+        for k in range(N):
+            motion[k + 1] = self._map.step(motion[k], u) + self._e[k]
+        if np.abs(motion).max() < HUGE:
+            yield motion, U
 
     def _improve(
         self,
@@ -167,10 +219,12 @@ class BilinearMPC(StagedMPC):
         u_prev: Float[np.ndarray, " nu"],
         most: int,
         deadline: float,
+        settled: float = SETTLED,
     ) -> tuple[Status, int]:
         """Return how the last of at most this many iterations ended, and the solver's iterations of all.
 
-        They end early at a solution, and at the deadline: then what was found before it is used, and late.
+        They end early at a solution, where no more than a share `settled` of the plan moves, where F is nowhere near
+        its linearisation, and at the deadline: then what was found before it is used, and late.
         """
         total, status, iteration = 0, Status.FAILED, self._iteration
         for k in range(most):
@@ -180,13 +234,13 @@ class BilinearMPC(StagedMPC):
             total += found.iterations
             if found.status not in GOOD:
                 return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
-            length = iteration.take(s, found)
+            iteration.take(s, found)
+            if iteration.length == 0.0:
+                return (found.status if iteration.gap < NEAR else Status.FAILED), total
             self._enter(*self._trajectory(iteration.X, iteration.U), u_prev)
             status = Status.SOFTENED if iteration.slack else found.status
             moved = (found.U, iteration.U), (found.X, iteration.X)
-            if length < SHORTEST:
-                status = Status.FAILED
-            elif all(np.abs(d).max() <= SETTLED * (1 + np.abs(v).max()) for d, v in moved):
+            if all(np.abs(d).max() <= settled * (1 + np.abs(v).max()) for d, v in moved):
                 break
         return status, total
 

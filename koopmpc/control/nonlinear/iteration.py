@@ -17,6 +17,7 @@ from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
     interior_step,
     linearisation,
+    plan_cost,
     sides,
     simulation,
     unconstrained,
@@ -24,12 +25,14 @@ from koopmpc.control.nonlinear.stagewise import (
 )
 from koopmpc.plants.compiled import Routine
 
-MOST = 60  # interior-point steps
+MOST = 300  # interior-point steps
+STALLED, CENTRING = 5, 0.3  # steps without half the μ, then one aims at this share of μ for every pair
 # Of spans for distances, of the curvature along an input's span for μ and what is left of residuals: what is aimed
 # at, and what is good enough where large weights of slacks leave no digits for more.
 PRECISE, ENOUGH = 1e-11, 1e-9
+DIGITS = 1e-13  # share of the largest multiplier that rounding leaves in μ
 NEAR = 0.2  # of a change: how far F may be from its linearisation
-SHORTEST = 0.02  # of a step
+SHORTEST = 0.001  # of a step
 STUCK = 1e-9  # a step this short leads nowhere
 
 
@@ -66,6 +69,7 @@ class RealTimeIteration:
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
         self._allowance = allowance(Interval(*(end[soft] for end in self._limits)))
+        self.length, self.gap = 1.0, 0.0  # of the last step, and its defects as a share of the range of their state
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
@@ -86,10 +90,16 @@ class RealTimeIteration:
         self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
         self._next, after = _views([each.shape for each in state])
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
+        self._cost = plan_cost(problem)
         self._free = Routine(unconstrained(sweeps, R), stages, [self._dX, self._dU, curvature])
         self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
+        self._centring = zeros(1)
+        held = nu + problem.with_rates * (nu + len(problem.soft_rates))  # limits of inputs and rates, never in conflict
+        self._hard_states = bool((self._sides.row[: ns - nsoft] >= held).any())
         interior = interior_step(sweeps, R, self._sides, ng) if ns else None
-        self._interior = interior and Routine(interior, [*stages, self._G, self._d, *state], [*after, self._measures])
+        self._interior = interior and Routine(
+            interior, [*stages, self._G, self._d, self._centring, *state], [*after, self._measures]
+        )
 
     @property
     def compiled(self) -> bool:
@@ -119,16 +129,18 @@ class RealTimeIteration:
             return StageStep(self._dX, self._dU, nothing, Status.FAILED, 0)
         return self._limited(y, free, deadline)
 
-    def take(self, x: Float[np.ndarray, " nx"], found: StageStep) -> float:
+    def take(self, x: Float[np.ndarray, " nx"], found: StageStep) -> None:
         """Add the step to the plan, all of it or the half, quarter, … along which F is near its linearisation.
 
-        Over the length α the defects should become (1 − α) c; a difference of more than half of the largest change of
-        that state in the plan is too much. Far from a solution full steps lead to plans that no plant follows.
+        Over the length α the defects should become (1 − α) c; a difference of more than a fifth of the largest change
+        or defect of that state is too much. Far from a solution full steps lead to plans that no plant follows. Where
+        no length will do, `length` is zero and the plan is what it was.
         """
         X, U = self.X[1:], self.U
         left = self._c.copy()
         left[0] += self._x0 @ self._A[0]  # δx_0 is taken whole
-        reach = NEAR * np.abs(found.X).max(axis=0) + 1e-9 * (1 + np.abs(X).max(axis=0))
+        change = np.maximum(np.abs(found.X).max(axis=0), np.abs(left).max(axis=0))
+        reach = NEAR * change + 1e-9 * (1 + np.abs(X).max(axis=0))
         length = 1.0
         while True:
             X_new, U_new = X + length * found.X, U + length * found.U
@@ -138,9 +150,17 @@ class RealTimeIteration:
             if (error <= length * reach).all() or length < SHORTEST:
                 break
             length /= 2
-        self.X[0], X[:], U[:] = x, X_new, U_new
+        if length < SHORTEST:  # F is nowhere near its linearisation: the plan stays as it was
+            self.length, gap = 0.0, np.abs(left).max(axis=0)
+        else:
+            self.X[0], X[:], U[:] = x, X_new, U_new
+            self.length, gap = length, error if length == 1 else np.abs(self._trial + self.e - X_new).max(axis=0)
+        self.gap = float((gap / (self.X.max(axis=0) - self.X.min(axis=0) + 1e-9 * (1 + np.abs(x)))).max())
         self.slack = float(found.slacks[found.slacks > self._allowance].max(initial=0.0))
-        return length
+
+    def cost(self) -> float:
+        """Return what the plan costs, its breaches of soft limits included."""
+        return float(self._cost(self.X.T, self.U.T, self._R.T, self._U_r.T, *(each.T for each in self._terminal)))
 
     def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> StageStep:
         """Follow the central path from the unconstrained solution."""
@@ -154,34 +174,38 @@ class RealTimeIteration:
         worst = max(-float(distance.min()), 1e-3)
         start = min(worst, 1.0)
         np.maximum(distance, start, out=self._t)
-        level = unit * start * worst
-        np.divide(level, self._t, out=self._lam)
+        np.divide(unit * start * worst, self._t, out=self._lam)
         if s.soft:
             self._eps[:] = np.maximum(-distance[:, hard:], start)
-            self._lam[:, hard:] = np.minimum(self._lam[:, hard:], 0.5 * (s.linear + s.quadratic * self._eps))
-            self._nu[:] = s.linear + s.quadratic * self._eps - self._lam[:, hard:]
+            price = s.linear + s.quadratic * self._eps
+            self._lam[:, hard:] = self._nu[:] = 0.5 * price
+            self._lam[:, :hard] = 0.5 * float(price.mean()) * start / self._t[:, :hard]
         left, initial = 1.0, max(worst, float(self._lam.max()) / unit)
-        iterations, status, mu = 0, Status.MAX_ITERATIONS, np.inf
+        iterations, mu, best, since, enough, status = 0, np.inf, np.inf, 0, False, Status.MAX_ITERATIONS
         assert self._interior is not None, "there are limits"
         while iterations < MOST:
             if perf_counter() > deadline:
                 return StageStep(self._dX, self._dU, self._eps, Status.TIME_LIMIT, iterations)
+            self._centring[0] = CENTRING * (since == STALLED)
+            since %= STALLED
             self._interior.call()
             iterations += 1
+            length = float(self._measures[1])
+            if not (np.isfinite(self._measures).all() and np.isfinite(self._next).all()):
+                status = Status.FAILED
+                break  # with the iterate before
             self._now[:] = self._next
-            mu, length = self._measures
-            if not np.isfinite(mu) or not np.isfinite(length):
-                return StageStep(self._dX, self._dU, self._eps, Status.FAILED, iterations)
             left *= 1 - length
-            if length < STUCK:
-                break
             mu = float(np.vdot(self._t, self._lam) + np.vdot(self._eps, self._nu)) / (self._t.size + self._eps.size)
-            if mu <= PRECISE * unit and left * initial <= PRECISE:
-                status = Status.OPTIMAL
+            best, since = (mu, 0) if mu <= 0.5 * best else (best, since + 1)
+            good = ENOUGH + DIGITS * float(self._lam.max()) / unit
+            enough = mu <= good * unit and left * initial <= good
+            precise = mu <= PRECISE * unit and left * initial <= PRECISE
+            if precise or length < STUCK or (enough and since):
                 break
-        if mu <= ENOUGH * unit and left * initial <= ENOUGH:
+        if enough:
             status = Status.OPTIMAL
-        elif left * worst > 1e-6:
+        elif self._hard_states and left * worst > 1e-6:
             status = Status.INFEASIBLE
         return StageStep(self._dX, self._dU, self._eps * s.span[hard:], status, iterations)
 

@@ -107,6 +107,25 @@ def linearisation(problem: StagedProblem) -> ca.Function:
     return ca.Function("linearisation", [X, U, R, U_r, *goal, t], found)
 
 
+def plan_cost(problem: StagedProblem) -> ca.Function:
+    """Return (X, U, R, U_r, M, L, m) → the cost of a plan, with what it pays for breaking soft limits."""
+    nx, nu, nr, N = problem.nx, len(problem.R), len(problem.Q), len(problem.free)
+    X, U = ca.MX.sym("X", nx, N + 1), ca.MX.sym("U", nu, N)
+    R, U_r = ca.MX.sym("R", nr, N), ca.MX.sym("U_r", nu, N)
+    M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
+    of, moved = problem.tracked.map(N)(X[:, 1:]), U - U_r
+    missed = (of - R)[:, : N - 1]
+    cost = ca.sumsqr(M @ of[:, N - 1] + L @ X[:, N] - m) + ca.dot(moved, ca.DM(problem.R) @ moved)
+    cost += ca.dot(missed, ca.DM(problem.Q) @ missed)
+    if len(problem.box.low):
+        soft = np.isfinite(problem.softness.linear)
+        linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness)
+        g = problem.limited.map(N)(X[:, 1:])
+        over = ca.fmax(ca.fmax(ca.DM(problem.box.low) - g, g - ca.DM(problem.box.high)), 0)
+        cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
+    return ca.Function("plan_cost", [X, U, R, U_r, M, L, m], [cost])
+
+
 def simulation(problem: StagedProblem) -> ca.Function:
     """Return (X, U, θ) → F(X_k, U_k), stage beside stage."""
     nx, nu, N = problem.nx, problem.F.size1_in(1), len(problem.free)
@@ -192,14 +211,15 @@ def unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"]) -> ca.Fun
 def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
     """Return one predictor–corrector step of the interior-point method.
 
-    (A, B, c, Q, q, r, δx_0, G, d; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the distances of the plan
+    (A, B, c, Q, q, r, δx_0, G, d, σ; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the distances of the plan
     (ns, N), t ≥ 0 the distances, λ their multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean complementarity
-    before the step, α the step's length.
+    before the step, α the step's length. σ is zero in a predictor–corrector step. A step with σ > 0 aims at the
+    complementarity σ μ everywhere and leaves the corrector out: it returns to the central path.
     """
     nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
     ns, nsoft = len(sides.row), sides.soft
     A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
-    G, d = ca.MX.sym("G", ng, N * nx), ca.MX.sym("d", ns, N)
+    G, d, sigma = ca.MX.sym("G", ng, N * nx), ca.MX.sym("d", ns, N), ca.MX.sym("sigma")
     X, U = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N)
     t, lam = ca.MX.sym("t", ns, N), ca.MX.sym("lam", ns, N)
     eps, nu_ = ca.MX.sym("eps", nsoft, N), ca.MX.sym("nu", nsoft, N)
@@ -256,12 +276,15 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Si
     a = 1 / ca.fmax(longest(*affine), 1)
     a_t, a_lam, a_eps, a_nu = affine
     ahead = (ca.dot(t + a * a_t, lam + a * a_lam) + ca.dot(eps + a * a_eps, nu_ + a * a_nu)) / count
-    centre = mu * (ahead / mu) ** 3
-    step = solve(centre - a * a * a_t * a_lam, centre - a * a * a_eps * a_nu)
+    centre = mu * ca.if_else(sigma > 0, sigma, (ahead / mu) ** 3)
+    second = ca.if_else(sigma > 0, 0, a * a)
+    step = solve(centre - second * a_t * a_lam, centre - second * a_eps * a_nu)
     length = 1 / ca.fmax(longest(*step[2:]) / _SHORT, 1)
     variables = [X, U, t, lam, eps, nu_]
     after = [v + length * dv for v, dv in zip(variables, step, strict=True)]
-    return ca.Function("interior_step", [A, B, c, Q, q, r, x0, G, d, *variables], [*after, ca.vertcat(mu, length)])
+    return ca.Function(
+        "interior_step", [A, B, c, Q, q, r, x0, G, d, sigma, *variables], [*after, ca.vertcat(mu, length)]
+    )
 
 
 def _problem(nx: int, nu: int, N: int) -> list[ca.MX]:

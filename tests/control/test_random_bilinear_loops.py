@@ -1,0 +1,103 @@
+"""Random closed loops of BilinearMPC: soft limits of states, references beyond them, models that are wrong."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.plants import compiled
+
+FALLBACKS = ("FAILED", "MAX_ITERATIONS", "INFEASIBLE")
+
+
+@dataclass(frozen=True)
+class Oscillator(km.Dynamics):
+    """x₁' = x₂, x₂' = a x₁ − b x₁³ + c sin x₁ − d x₂ + u: unstable at zero, as a Duffing oscillator or a pendulum."""
+
+    states = ("x1", "x2")
+    inputs = ("u",)
+    a: float = 1.0
+    b: float = 1.0
+    c: float = 0.0
+    d: float = 0.3
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """Return [x₁', x₂']."""
+        return ca.vertcat(x[1], self.a * x[0] - self.b * x[0] ** 3 + self.c * ca.sin(x[0]) - self.d * x[1] + u)
+
+
+PLANTS = [
+    km.discretize(dynamics, dt)
+    for dynamics in (Oscillator(), Oscillator(a=0.0, b=0.0, c=4.9, d=0.1))
+    for dt in (0.05, 0.1)
+]
+
+
+def learned(plant: km.StepMap, seed: int, noise: float, degree: int, episodes: int) -> km.BilinearPredictor:
+    """Return a bilinear model of a few episodes, whose error leaves the state a hair beyond its limits."""
+    starts, excitation = km.Uniform([-1.2, -1.5], [1.2, 1.5]), km.Noise(-3.0, 3.0, hold=3)
+    data = km.collect(plant, starts, excitation, episodes=episodes, steps=30, rng=seed)
+    rng = np.random.default_rng(seed)
+    noisy = [km.Episode(X=e.X + noise * rng.standard_normal(e.X.shape), U=e.U) for e in data]
+    return km.bilinear_edmd(
+        km.Episodes(noisy, data.dt, data.states, data.inputs),
+        km.State() + km.Constant() + km.Monomials(degree),
+        ridge=1e-9,
+    )
+
+
+@pytest.fixture(scope="module")
+def models() -> list[list[km.StepMap | km.BilinearPredictor]]:
+    return [[plant, learned(plant, 0, 0.0, 5, 15), learned(plant, 1, 0.02, 4, 10)] for plant in PLANTS]
+
+
+def statuses(trial: int, models: list[list[km.StepMap | km.BilinearPredictor]]) -> Counter[str]:
+    """Return how the 40 steps of a random loop end; every input is inside its limits."""
+    rng = np.random.default_rng(trial)
+    which = int(rng.integers(len(PLANTS)))
+    model = models[which][int(rng.integers(3))]
+    x_max, u_max, v = rng.uniform(0.1, 0.9), 10.0 ** rng.uniform(-0.3, 1), rng.choice([np.inf, 0.5, 1.0])
+    reference = [x_max + 10.0 ** rng.uniform(-2, 0.3), 0.0]
+    target = str(rng.choice(["zero", "equilibrium"]))
+    cost = km.Cost(Q=10.0 ** rng.uniform(-1, 3, 2), R=10.0 ** rng.uniform(-3, 0), u_target=target)
+    limits = km.Limits(-u_max, u_max, x_max=[x_max, v], x_min=[-np.inf, -v])
+    mpc = km.BilinearMPC(model, cost, limits, int(rng.integers(5, 40)))
+    x, count = rng.uniform([-0.5, -0.5], [0.9 * x_max, 0.5]), Counter()
+    for _ in range(40):
+        move = mpc(x, reference)
+        assert np.abs(move.u).max() <= u_max
+        count[move.status.name] += 1
+        x = PLANTS[which](x, move.u)
+    return count
+
+
+@pytest.mark.parametrize("trials", [range(16), pytest.param(range(300), marks=pytest.mark.slow)])
+def test_a_soft_limit_or_a_reference_beyond_it_is_no_reason_to_fail(models, trials, monkeypatch) -> None:
+    monkeypatch.setattr(compiled, "compiler", lambda: None)  # a loop is shorter than its compilation
+    count = sum((statuses(trial, models) for trial in trials), Counter())
+    assert not any(count[name] for name in FALLBACKS), count
+    assert count["SOFTENED"] > 0
+
+
+@pytest.mark.parametrize("case", ["hang", "aside"])
+@pytest.mark.parametrize("name", ["cart_pole_swing", "pendulum_swing"])
+def test_a_swing_up_on_given_equations_costs_what_nonlinear_mpc_costs(name: str, case: str) -> None:
+    problem = km.load_problem(name)
+    plant, asked = km.discretize(problem.dynamics, problem.dt, problem.integrator), problem.cases[case]
+    cost = []
+    for kind in (km.BilinearMPC, km.NonlinearMPC):
+        mpc = kind(plant, problem.cost, problem.limits, problem.horizon)
+        run = km.simulate(
+            plant,
+            mpc,
+            x0=asked.x0,
+            reference=asked.reference,
+            steps=asked.steps,
+            cost=problem.cost,
+            limits=problem.limits,
+        )
+        cost.append(km.metrics(run).cost)
+    assert cost[0] <= 1.10 * cost[1]
