@@ -68,7 +68,7 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
     rest = Subset(source, [i for i in range(len(parts)) if i not in out])
     judged, _ = sampled(Subset(source, sorted(out)), _JUDGED)
-    ahead = usual_horizon(judged) if horizon is None else horizon
+    ahead = usual_horizon(judged, PAST)[0] if horizon is None else horizon
     held_out = _long(list(judged), ahead + PAST)
     if len(held_out) < 2:
         held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + PAST))], ahead + PAST)
@@ -96,7 +96,7 @@ def _in_memory(
     same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
     number = len(episodes)
     told = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
-    ahead = usual_horizon(episodes) if horizon is None else horizon
+    ahead = usual_horizon(episodes, PAST)[0] if horizon is None else horizon
     needed = ahead + PAST
     whole = list(episodes)
     notes: tuple[str, ...] = ()

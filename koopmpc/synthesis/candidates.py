@@ -143,6 +143,13 @@ def jumps(episodes: Episodes) -> dict[int, int]:
     return found
 
 
+def still(episodes: Episodes) -> list[str]:
+    """Return the names of the states and inputs that are constant throughout."""
+    table = np.concatenate([np.hstack([episode.X[:-1], episode.U]) for episode in episodes])
+    names = (*episodes.states, *episodes.inputs)
+    return [name for name, low, high in zip(names, table.min(axis=0), table.max(axis=0), strict=True) if low == high]
+
+
 def _angle(name: str) -> bool:
     stem, bracket, unit = name.partition("[")
     if bracket:

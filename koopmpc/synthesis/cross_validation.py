@@ -1,5 +1,6 @@
 """One candidate, cross-validated: fitted without each fold and rolled out over it, for every ridge at once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from time import perf_counter
@@ -12,16 +13,17 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.regression import regression_of
+from koopmpc.identify.regression import Regression, regression_of
 from koopmpc.identify.solve import RegressionRows, path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 from koopmpc.values import Value
 
+LEAST = 1e-9  # ridge: without one, observables that are almost dependent get weights that no controller has digits for
 _STARTS = 256  # forecasts a fold
-EXACT = 1e-10  # relative errors below are rounding
 _ALIKE = 1.02  # a larger ridge with errors so little above is worth having
+EXACT = 1e-6  # relative errors below are what rounding and the least ridge leave
 _LOST = 100.0  # a prediction that is so many spreads off is no prediction
 
 
@@ -41,7 +43,7 @@ class Trial:
         The step of an episode at which forecasts start at the earliest: the longest embedding of all candidates,
         so that every one is judged on the same forecasts.
     ridges
-        Weights to try.
+        Weights to try, the least first.
     """
 
     candidate: Candidate
@@ -57,36 +59,48 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Tried(Value):
-    """What came of a trial, its ridge the largest whose error in its worst fold is within 2 % of the least.
+    """What came of a trial, for each ridge.
 
     Attributes
     ----------
     candidate
         What was tried.
-    ridge
-        Weight on unit-norm columns.
-    error
-        (folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's spread;
-        infinite from where the forecasts of a fold run away.
+    ridges
+        Weights on unit-norm columns.
+    errors
+        (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
+        spread; infinite from where the forecasts of a fold run away.
     inputs
         Columns of B, with those of measured disturbances.
-    radius
-        Spectral radius of A, fitted to all folds.
+    A
+        (ridges, nz, nz), fitted to all folds.
+    misfit
+        Mean over the states of (one-step residual / root-mean-square)², of all folds with the least ridge.
     seconds
         Time that the trial took.
     """
 
     candidate: Candidate
-    ridge: float
-    error: Float[np.ndarray, "folds horizon"]
+    ridges: tuple[float, ...]
+    errors: Float[np.ndarray, "ridges folds horizon"]
     inputs: int
-    radius: float
+    A: Float[np.ndarray, "ridges nz nz"]
+    misfit: float
     seconds: float
 
     @property
-    def scores(self) -> Float[np.ndarray, " folds"]:
-        """Root-mean-square of `error` over the horizon, of each fold."""
-        return _scores(self.error)
+    def scores(self) -> Float[np.ndarray, "ridges folds"]:
+        """Root-mean-square of the errors over the horizon, of each fold."""
+        return np.sqrt(np.mean(self.errors**2, axis=2))
+
+    def best(self, floor: float) -> int:
+        """Return the place of the largest ridge whose worst fold is within 2 % of the least, of those from `floor` on.
+
+        The largest ridge counts whatever the floor.
+        """
+        worst, first = self.scores.max(axis=1), np.searchsorted(self.ridges[:-1], floor)
+        alike = max(_ALIKE * worst[first:].min(), EXACT)
+        return max(i for i in range(int(first), len(worst)) if worst[i] <= alike)
 
 
 def tried(trial: Trial) -> Tried:
@@ -99,37 +113,30 @@ def tried(trial: Trial) -> Tried:
     count = max(trial.fold) + 1
     folds = [_only(trial, i) for i in range(count)]
     parts = [_moments(trial.candidate, fold) for fold in folds]
-    spread = _spread(trial.episodes)
-    error = np.empty((len(trial.ridges), count, trial.horizon))
+    total, spread = reduce(Moments.__add__, parts), _spread(trial.episodes)
+    errors = np.empty((len(trial.ridges), count, trial.horizon))
     for i, fold in enumerate(folds):
         rest = reduce(Moments.__add__, (part for j, part in enumerate(parts) if j != i))
         models = fitted(trial.candidate, rest, trial.episodes, trial.ridges)
-        error[:, i] = _errors(trial, models, fold, spread)
-    worst = np.array([_scores(of).max() for of in error])
-    near = [i for i, of in enumerate(worst) if of <= max(_ALIKE * worst.min(), EXACT)]
-    best = max(near, key=lambda i: trial.ridges[i])
-    (model,) = fitted(trial.candidate, reduce(Moments.__add__, parts), trial.episodes, trial.ridges[best : best + 1])
+        errors[:, i] = _errors(trial, models, fold, spread)
     return Tried(
         candidate=trial.candidate,
-        ridge=trial.ridges[best],
-        error=error[best],
+        ridges=trial.ridges,
+        errors=errors,
         inputs=trial.episodes.nu + trial.episodes.nw,
-        radius=float(np.abs(np.linalg.eigvals(model.A)).max()),
+        A=np.array([model.A for model in fitted(trial.candidate, total, trial.episodes, trial.ridges)]),
+        misfit=_misfit(trial.candidate, total),
         seconds=perf_counter() - begun,
     )
 
 
 def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
-    task, nz, nu = regression_of(total, "select"), total.nz, like.nu
-    P, T, which = task.rows.P, task.rows.T[:, :nz], total.products
-    start = np.eye(P.shape[1], nz) * candidate.bilinear  # a bilinear model is drawn to z⁺ = z, as its refit is
-    rows = RegressionRows(P, T - P @ start, task.rows.rest[:nz], task.rows.samples)
+    task, nz, nu, which = regression_of(total, "select"), total.nz, like.nu, total.products
     C = task.C
     assert C is not None, "an extended regression has its C"
     models: list[AnyPredictor] = []
-    for solution in path(rows, ridges):
-        K = solution.K + start
+    for K in _solutions(candidate, task, ridges):
         A, B = K[:nz].T, K[nz : nz + nu].T
         common = (C, candidate.lifting, like.dt, like.states, like.inputs)
         if candidate.bilinear:
@@ -144,8 +151,20 @@ def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[f
     return models
 
 
-def _scores(error: Float[np.ndarray, "folds horizon"]) -> Float[np.ndarray, " folds"]:
-    return np.sqrt(np.mean(error**2, axis=1))
+def _misfit(candidate: Candidate, total: Moments) -> float:
+    task = regression_of(total, "select")
+    rows, where = task.rows, task.x_next
+    (K,) = _solutions(candidate, task, (LEAST,))
+    energy = (np.sum(rows.T[:, where] ** 2, axis=0) + rows.rest[where]) / rows.samples
+    return float(np.mean(rows.residual(where, task.decoded(K)) ** 2 / np.where(energy > 0, energy, 1.0)))
+
+
+def _solutions(candidate: Candidate, task: Regression, ridges: Sequence[float]) -> list[Float[np.ndarray, "n nz"]]:
+    """Return K of each ridge; a bilinear model is drawn to z⁺ = z, as its refit is."""
+    P, nz = task.rows.P, task.lifting.nz
+    start = np.eye(P.shape[1], nz) * candidate.bilinear
+    rows = RegressionRows(P, task.rows.T[:, :nz] - P @ start, task.rows.rest[:nz], task.rows.samples)
+    return [solution.K + start for solution in path(rows, ridges)]
 
 
 def _only(trial: Trial, fold: int) -> Episodes:
@@ -194,7 +213,7 @@ def _errors(
 
 
 def ridges_of(ridges: object) -> tuple[float, ...]:
-    """Return the ridges, each 0 or above, the least first.
+    """Return the ridges, the least first, those below 1e-9 raised to it.
 
     Raises
     ------
@@ -204,4 +223,4 @@ def ridges_of(ridges: object) -> tuple[float, ...]:
     given = checks.array(ridges, "ridges", (None,))  # pyright: ignore[reportArgumentType]  # array refuses what is none
     if not given.size or (given < 0).any():
         raise DataError(f"ridges is {given.tolist()}; pass weights of 0 or above, at least one")
-    return tuple(sorted(given.tolist()))
+    return tuple(sorted({max(ridge, LEAST) for ridge in given.tolist()}))

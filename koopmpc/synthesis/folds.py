@@ -12,8 +12,7 @@ from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import spread
 
 _PARTS = 16  # of a source that a sample is taken from
-_SHORTEST, _LONGEST = 10, 50  # steps of a horizon that nobody named
-_CORRELATED = 0.5
+_AHEAD = 20  # steps of a horizon that nobody named
 
 
 class Folds(NamedTuple):
@@ -64,22 +63,23 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     )
 
 
-def usual_horizon(episodes: Episodes) -> int:
-    """Return the steps after which half of the states have forgotten half of themselves, 10 to 50, if episodes last.
+def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ...]]:
+    """Return 20 steps, or as many as whole episodes allow, and a sentence if these are fewer.
 
-    A state has where its correlation with what it was, over all episodes, is below 0.5. At most half of the episodes'
-    length, that of the shortest fifth.
+    At least half of all steps are in episodes that are long enough for this and the `past` that embeddings need, so
+    that the shortest ones do not decide. A single one is cut into four blocks.
     """
-    longest = max(int(np.quantile([len(episode) for episode in episodes], 0.2)) // 2, 1)
-    mean = np.mean(np.concatenate([episode.X for episode in episodes]), axis=0)
-    for h in range(min(_SHORTEST, longest), min(_LONGEST, longest) + 1):
-        now = np.concatenate([e.X[:-h] for e in episodes if len(e) >= h]) - mean
-        then = np.concatenate([e.X[h:] for e in episodes if len(e) >= h]) - mean
-        size = np.sqrt(np.sum(now**2, axis=0) * np.sum(then**2, axis=0))
-        alike = np.sum(now * then, axis=0) / np.where(size > 0, size, 1.0)
-        if np.median(alike) < _CORRELATED:
-            return h
-    return min(_LONGEST, longest)
+    lengths = np.sort([len(episode) for episode in episodes])[::-1]
+    held = np.cumsum(lengths) >= lengths.sum() / 2
+    half = int(lengths[np.argmax(held)])  # episodes as long as this hold half of the steps
+    room = half if np.sum(lengths >= half) > 1 else half // 4
+    ahead = min(_AHEAD, max(room - past, 1))
+    if ahead == _AHEAD:
+        return ahead, ()
+    return ahead, (
+        f"judged {ahead} step{'s' * (ahead > 1)} ahead, not {_AHEAD}: episodes of {half} steps hold half of the data, "
+        "which leaves no more; a controller that looks further ahead than this needs longer episodes",
+    )
 
 
 def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator) -> Folds:

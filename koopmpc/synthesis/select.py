@@ -16,13 +16,13 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import StageProgress, map_tasks
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.synthesis.candidates import Candidate, expanded, jumps, usual
-from koopmpc.synthesis.cross_validation import Trial, ridges_of, tried
+from koopmpc.synthesis.candidates import Candidate, expanded, jumps, still, usual
+from koopmpc.synthesis.cross_validation import LEAST, Trial, ridges_of, tried
 from koopmpc.synthesis.folds import folded, sampled, usual_horizon
 from koopmpc.synthesis.selection import LeaderboardRow, Selection, choice, row_of
 from koopmpc.validate.scoring import AnyPredictor
 
-RIDGES = (0.0, 1e-9, 1e-7, 1e-5, 1e-3)
+RIDGES = tuple(10.0**power for power in range(-9, -2))
 
 
 def select(
@@ -31,7 +31,7 @@ def select(
     candidates: Sequence[Candidate | Lifting] | None = None,
     horizon: int | None = None,
     folds: int = 5,
-    ridges: ArrayLike = RIDGES,
+    ridges: ArrayLike | None = None,
     delays: Sequence[int] = (0, 1, 2),
     bilinear: bool = True,
     sample: int = 30_000,
@@ -44,8 +44,9 @@ def select(
 
     Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon: one-step errors
     do not choose a model that a controller can look ahead with. An error is relative to the state's standard deviation,
-    so neither units nor where zero is count; a forecast that runs away counts as infinite. The models are ranked by
-    their worst fold, and of all within one standard error of the best the smallest is taken (Breiman et al. 1984).
+    so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such model is taken
+    while there is another. The models are ranked by their worst fold, and of all within one standard error of the best
+    the smallest is taken (Breiman et al. 1984).
 
     A source larger than memory is chosen on a sample of it, whole episodes from evenly spread parts; the winner is
     then fitted to all of it, part by part.
@@ -59,12 +60,16 @@ def select(
         Liftings, each of which is tried with all `delays` and both kinds; or `Candidate`, each as it stands. By default
         linear, polynomial, trigonometric, radial and random ones, for plants of 2 to 12 states.
     horizon
-        Steps ahead: the controller's. By default those after which half of the states have forgotten half of
-        themselves, 10 to 50, at most half an episode.
+        Steps ahead: pass the controller's horizon. By default 20; fewer, and a note says so, where most of the
+        data are in shorter episodes.
     folds
         At least 2.
     ridges
-        Weights to try, on unit-norm columns.
+        Weights to try, on unit-norm columns; those below 1e-9 are raised to it. By default 1e-9 to 1e-3 by decades,
+        from ε² on, ε the share of the states' size that the best candidate misses in one step: what the data hold of
+        noise, or of what no candidate knows. Noise ε in the regressors adds M ε² rms² = ε² ‖p‖² to the diagonal of
+        PᵀP, which is a ridge ε² on columns of unit norm. With less, delays and other observables that are almost
+        functions of each other get large weights of opposite signs, which cancel on the training data alone.
     delays
         Past steps to try in an embedding.
     bilinear
@@ -96,7 +101,7 @@ def select(
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
     source, draw = source_of(episodes), checks.generator(rng)
-    weights = ridges_of(ridges)
+    weights = RIDGES if ridges is None else ridges_of(ridges)
     folds = checks.count(folds, "folds", 2)
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     if not past:
@@ -109,29 +114,34 @@ def select(
             FitWarning,
             stacklevel=2,
         )
-    ahead = usual_horizon(held) if horizon is None else checks.count(horizon, "horizon")
-    both = bilinear and source.nu > 0 and source.nw == 0
-    given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
-    first = max(one.delays for one in given)
-    data = folded(held, ahead + first, folds, draw)
-    trials = [Trial(one, data.episodes, data.fold, ahead, first, weights) for one in given]
-    results = map_tasks(
-        tried,
-        trials,
-        workers=workers,
-        scheduler=scheduler,
-        progress=None if progress is None else partial(progress, "candidates"),
-    )
-    rows = tuple(sorted(map(row_of, results), key=lambda row: (row.worst, row.size)))
-    chosen = choice(rows)
-    if not np.isfinite(rows[chosen].worst):
+    for name in still(held):
         warnings.warn(
-            f"the forecasts of all {len(rows)} candidates run away within {ahead} steps; pass a shorter horizon, or "
-            "candidates that know the plant",
+            f"{name} is constant in these data, so what it does cannot be learned; excite it, or leave it out",
             FitWarning,
             stacklevel=2,
         )
+    both = bilinear and source.nu > 0 and source.nw == 0
+    given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
+    first = max(one.delays for one in given)
+    ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
+    data = folded(held, ahead + first, folds, draw)
+    trials = [Trial(one, data.episodes, data.fold, ahead, first, weights) for one in given]
+    told = None if progress is None else partial(progress, "candidates")
+    results = list(map_tasks(tried, trials, workers=workers, scheduler=scheduler, progress=told))
+    # on a grid of decades the one nearest to ε² is the first
+    floor = LEAST if ridges is not None else min(result.misfit for result in results) / np.sqrt(10)
+    rows = tuple(sorted((row_of(result, floor) for result in results), key=lambda row: (row.worst, row.size)))
+    chosen = choice(rows)
     linear = choice(rows, "linear") if any(row.kind == "linear" for row in rows) else chosen
+    for place, which in ((chosen, f"all {len(rows)} candidates"), (linear, "all linear candidates")):
+        if not np.isfinite(rows[place].worst):
+            warnings.warn(
+                f"the forecasts of {which} run away within {ahead} steps, and the smallest is taken: trust no "
+                "controller of it; pass a shorter horizon, or candidates that know the plant",
+                FitWarning,
+                stacklevel=2,
+            )
+            break
 
     def refit(row: LeaderboardRow) -> AnyPredictor:
         told = None if progress is None else partial(progress, f"fit of {row.title}")
@@ -166,5 +176,5 @@ def select(
         chosen_linear=linear,
         horizon=ahead,
         folds=data.number,
-        notes=(*notes, *data.notes),
+        notes=(*notes, *short, *data.notes),
     )

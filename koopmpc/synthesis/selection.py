@@ -156,9 +156,10 @@ def _sentence(role: str, row: LeaderboardRow) -> str:
     return f"{role}: {row.title} ({row.nz} observables, ridge {row.ridge:g})"
 
 
-def row_of(trial: Tried) -> LeaderboardRow:
-    """Return the line of the leaderboard for a trial."""
-    candidate, scores, error = trial.candidate, trial.scores, trial.error
+def row_of(trial: Tried, floor: float) -> LeaderboardRow:
+    """Return the line of the leaderboard for a trial, with the best of its ridges from `floor` on."""
+    best = trial.best(floor)
+    candidate, scores, error = trial.candidate, trial.scores[best], trial.errors[best]
     horizon = error.shape[1]
     nz, nu = candidate.lifting.nz, trial.inputs
     with np.errstate(invalid="ignore"):
@@ -170,14 +171,14 @@ def row_of(trial: Tried) -> LeaderboardRow:
         nz=nz,
         size=nz * (nz + nu + nu * nz * candidate.bilinear),
         delays=candidate.delays,
-        ridge=trial.ridge,
+        ridge=trial.ridges[best],
         first=float(middle[0]),
         middle=float(middle[max(horizon // 2, 1) - 1]),
         last=float(middle[-1]),
         median=float(np.median(scores)),
         worst=float(scores.max()),
         deviation=float(deviation) if np.isfinite(deviation) else 0.0,
-        radius=trial.radius,
+        radius=float(np.abs(np.linalg.eigvals(trial.A[best])).max()),
         seconds=trial.seconds,
         lifting=candidate.lifting,
         embedding=candidate.embedding,
@@ -187,7 +188,8 @@ def row_of(trial: Tried) -> LeaderboardRow:
 def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None) -> int:
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
-    Errors below 1e-10 are rounding, and all alike. Where every forecast ran away it is the smallest of all.
+    Errors below 1e-6 are rounding and the least ridge, and all alike. Where every
+    forecast ran away it is the smallest of all.
     """
     places = [i for i, row in enumerate(rows) if kind is None or row.kind == kind]
     best = min((rows[i] for i in places), key=lambda row: row.worst)

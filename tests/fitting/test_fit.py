@@ -79,7 +79,7 @@ def fitted(tmp_path_factory):
     result = subprocess.run(command, cwd=place, capture_output=True, encoding="utf8", check=False)
     assert result.returncode == 0, result.stderr
     (folder,) = (place / "logs").iterdir()
-    return folder, result, cart_pole(20, rng=1)
+    return folder, result, cart_pole(20, steps=60, rng=1)
 
 
 def test_csv_logs_of_an_unknown_plant_give_a_predictor_without_any_option(fitted):

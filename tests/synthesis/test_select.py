@@ -58,7 +58,7 @@ def test_a_linear_plant_gets_the_linear_model_though_larger_ones_hold_it():
 def test_a_closed_quadratic_dictionary_wins_and_is_exact_over_the_horizon():
     found = km.select(episodes_of(quadratic), candidates=[PLAIN, SQUARES], horizon=10, delays=[0])
     assert found.best.nz == 6
-    assert found.best.worst < 1e-9
+    assert found.best.worst < 1e-6
     plain = next(row for row in found.leaderboard if row.kind == "linear" and row.nz == 3)
     assert plain.worst > 0.05
 
@@ -67,7 +67,7 @@ def test_inputs_that_multiply_the_state_get_a_bilinear_model_and_the_best_linear
     data = episodes_of(bilinear)
     found = km.select(data, candidates=[PLAIN], horizon=8, delays=[0])
     assert (found.best.kind, found.best_linear.kind) == ("bilinear", "linear")
-    assert found.best.worst < 1e-9 < 0.05 < found.best_linear.worst
+    assert found.best.worst < 1e-6 < 0.05 < found.best_linear.worst
     row = found.best
     assert found.predictor == km.bilinear_edmd(data, row.lifting, ridge=row.ridge, difference=True)
     assert found.linear == km.edmd(data, found.best_linear.lifting, ridge=found.best_linear.ridge)
@@ -79,7 +79,7 @@ def test_what_is_not_measured_is_found_in_the_past():
     """Of two linear states one is measured: one delay closes the model."""
     found = km.select(episodes_of(linear, keep=1), candidates=[km.State()], horizon=8)
     assert found.best.delays == 1
-    assert found.best.worst < 1e-9
+    assert found.best.worst < 1e-6
     assert isinstance(found.predictor.embedding, km.Delay)
 
 
@@ -100,8 +100,8 @@ def test_a_score_is_the_relative_error_of_fits_that_never_saw_the_fold():
             for k in range(2, len(e) - horizon + 1)
         ]
         expected = np.sqrt(np.mean(np.square(gaps), axis=(0, 2)))
-        assert result.error[f] == pytest.approx(expected, rel=1e-8)
-    assert result.scores == pytest.approx(np.sqrt(np.mean(result.error**2, axis=1)))
+        assert result.errors[0, f] == pytest.approx(expected, rel=1e-8)
+    assert result.scores == pytest.approx(np.sqrt(np.mean(result.errors**2, axis=2)))
 
 
 def test_neither_units_nor_offsets_change_the_choice_or_the_errors():
@@ -112,7 +112,9 @@ def test_neither_units_nor_offsets_change_the_choice_or_the_errors():
     one, other = km.select(data, **kwargs), km.select(moved, **kwargs)
     assert [r.title for r in one.leaderboard[:4]] == [r.title for r in other.leaderboard[:4]]
     assert one.best.title == other.best.title
-    assert other.best.worst == pytest.approx(one.best.worst, rel=1e-3)
+    assert other.best.worst == pytest.approx(
+        one.best.worst, rel=5e-3
+    )  # offsets make columns long, and a ridge relative
 
 
 def test_what_runs_away_counts_as_infinite_and_the_smallest_of_such_is_taken():
@@ -212,16 +214,58 @@ def test_a_sample_is_whole_episodes_or_the_beginning_of_one():
     assert [len(e) for e in held] == [100]
 
 
-@pytest.mark.parametrize(("decay", "expected"), [(0.5, 10), (0.97, 23), (0.9999, 50)])
-def test_the_usual_horizon_is_where_half_is_forgotten(decay, expected):
+@pytest.mark.parametrize(
+    ("lengths", "expected"),
+    [([40] * 20, 20), ([3] * 20 + [40] * 10, 20), ([15] * 20, 13), ([15] * 20 + [400], 20), ([60], 13), ([500], 20)],
+)
+def test_the_usual_horizon_is_twenty_steps_or_what_most_data_allow_and_then_a_note_says_so(lengths, expected):
+    X = np.random.default_rng(0).standard_normal((501, 1))
+    data = km.Episodes([km.Episode(X=X[: n + 1], U=np.zeros((n, 0))) for n in lengths], 0.1)
+    ahead, notes = usual_horizon(data, 2)
+    assert ahead == expected
+    assert [f"judged {expected} steps ahead, not 20" in note for note in notes] == [True] * (expected < 20)
+    assert folded(data, ahead + 2, 5, np.random.default_rng(0)).number > 1
+
+
+def test_a_few_short_episodes_do_not_shorten_the_horizon():
+    data = episodes_of(quadratic, count=20, steps=40)
+    short = [km.Episode(X=e.X[:5], U=e.U[:4]) for e in data]
+    found = km.select(km.Episodes([*data, *short], data.dt), candidates=[SQUARES], delays=[0])
+    assert found.horizon == 20
+    assert any("20 of 40 episodes are shorter than the 20 steps" in note for note in found.notes)
+
+
+def test_the_only_model_whose_forecasts_last_is_taken_however_small_the_error_of_a_step():
+    """Noise of sizes from 1e-3 to 1e3: a polynomial of degree 5 runs away, the linear model does not."""
     rng = np.random.default_rng(0)
-    X = np.zeros((20000, 1))
-    X[0] = rng.standard_normal(1) / np.sqrt(1 - decay**2)
-    for k in range(19999):
-        X[k + 1] = decay * X[k] + rng.standard_normal()
-    assert usual_horizon(km.Episodes([km.Episode(X=X, U=np.zeros((19999, 0)))], 0.1)) == pytest.approx(expected, abs=3)
-    short = km.Episodes([km.Episode(X=X[:8], U=np.zeros((7, 0)))], 0.1)
-    assert usual_horizon(short) == 3
+    made = [
+        km.Episode(X=rng.standard_normal((25, 2)) * 10.0 ** rng.integers(-3, 4), U=np.zeros((24, 0))) for _ in range(10)
+    ]
+    wild = km.State() + km.Monomials(5)
+    found = km.select(km.Episodes(made, 0.1), candidates=[wild, PLAIN], horizon=20, ridges=[0.0], delays=[0])
+    assert found.best.name.startswith("1")
+    assert np.isfinite(found.best.worst)
+
+
+def test_a_ridge_is_never_below_its_floor_nor_below_what_the_misfit_of_a_step_supports():
+    """Noise of a share s of the state's size is worth a ridge of s²."""
+    clean = episodes_of(quadratic)
+    given = km.select(clean, candidates=[SQUARES], horizon=6, delays=[0], bilinear=False, ridges=[0.0])
+    assert {row.ridge for row in given.leaderboard} == {1e-9}
+    size = 0.03 * np.sqrt(np.mean(np.concatenate([e.X for e in clean]) ** 2))
+    found = km.select(noisy(clean, size), candidates=[SQUARES], horizon=6, delays=[0, 1], bilinear=False)
+    assert min(row.ridge for row in found.leaderboard) == pytest.approx(1e-3)
+
+
+def test_what_is_constant_in_the_data_is_named():
+    data = episodes_of(linear)
+    held = km.Episodes([km.Episode(X=np.c_[e.X, 3 + 0 * e.X[:, 0]], U=np.c_[e.U, 0 * e.U]) for e in data], data.dt)
+    with pytest.warns(km.FitWarning) as told:
+        found = km.select(held, candidates=[PLAIN], horizon=6, delays=[0])
+    said = [str(one.message) for one in told]
+    assert "x2 is constant in these data, so what it does cannot be learned; excite it, or leave it out" in said
+    assert any(text.startswith("u1 is constant") for text in said)
+    assert found.linear.rollout([0.1, 0.2, 3.0], np.ones((5, 2)))[-1, 2] == pytest.approx(3.0, rel=1e-6)
 
 
 def test_angles_are_told_by_unit_then_by_name():
@@ -257,7 +301,7 @@ def test_measured_disturbances_are_in_the_fit_and_in_the_forecast():
         made.append(km.Episode(X=X, U=e.U, W=W))
     found = km.select(km.Episodes(made, 0.1), candidates=[PLAIN], horizon=6)
     assert {row.kind for row in found.leaderboard} == {"linear"}
-    assert found.best.worst < 1e-9
+    assert found.best.worst < 1e-6
     assert found.predictor.disturbances == ("w0",)
 
 
