@@ -1,7 +1,5 @@
 """Episodes keep runs apart: nothing is paired or split across them."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -104,55 +102,6 @@ def test_episodes_own_their_arrays_and_are_values() -> None:
 
 def zeros(rows: int, moves: int, nx: int = 2, nu: int = 1) -> km.Episode:
     return km.Episode(X=np.zeros((rows, nx)), U=np.zeros((moves, nu)))
-
-
-@pytest.mark.parametrize(
-    ("act", "kind", "text"),
-    [
-        (
-            lambda: zeros(5, 5),
-            km.errors.ShapeError,
-            "U has 5 rows and X 5: X must have one row more than U; x_0 … x_T, u_0 … u_{T-1}",
-        ),
-        (lambda: zeros(3, 5), km.errors.ShapeError, "U has 5 rows and X 3: X must have one row more"),
-        (lambda: km.Episode(X=np.zeros((0, 2))), km.errors.ShapeError, "X has no row; an episode holds x_0 at least"),
-        (lambda: km.Episode(X=[1.0, 2.0]), km.errors.ShapeError, r"X has shape \(2,\), expected \(any, any\)"),
-        (lambda: km.Episode(X=[[1.0], [np.nan]]), km.errors.DataError, r"X holds 1 NaN or inf, the first at \(1, 0\); remove"),
-        (lambda: km.Episode(X=[[1.0], [2.0]], U=[[np.inf]]), km.errors.DataError, "U holds 1 NaN or inf"),
-        (lambda: km.Episodes([], 0.1), km.errors.DataError, "there is no episode; pass at least one"),
-        (
-            lambda: km.Episodes([zeros(4, 3), zeros(1, 0)], 0.1),
-            km.errors.DataError,
-            "episode 1 is too short: X has 1 row and so no step; an episode needs at least 2 rows, drop it",
-        ),
-        (
-            lambda: km.Episodes([zeros(4, 3), zeros(4, 3, nx=3)], 0.1),
-            km.errors.ShapeError,
-            "episode 1 has 3 states and 1 inputs, episode 0 has 2 and 1; episodes of one set come from one plant",
-        ),
-        (lambda: km.Episodes([zeros(4, 3)], -0.1), km.errors.DataError, "dt is -0.1 s; it must be above zero"),
-        (lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a"]), km.errors.ShapeError, "states has 1 names, expected 2; give one name each"),
-        (lambda: km.Episodes([zeros(4, 3)], 0.1, inputs="u"), km.errors.DataError, "inputs is 'u'; pass a tuple of names"),
-        (
-            lambda: km.Episodes([zeros(4, 3)], 0.1, states=["a", "b"], inputs=["a"]),
-            km.errors.DataError,
-            "two states or inputs are named 'a'; rename one",
-        ),
-        (
-            lambda: km.Episodes([zeros(4, 3)], 0.1) + km.Episodes([zeros(4, 3)], 0.2),
-            km.errors.DataError,
-            "the second set has dt = 0.2 s, the first set has 0.1 s; resample one of them",
-        ),
-        (
-            lambda: km.Episodes([zeros(4, 3)], 0.1) + km.Episodes([zeros(4, 3)], 0.1, states=["a", "b"]),
-            km.errors.DataError,
-            "the second set names the states 'a', 'b', the first set 'x0', 'x1'; rename them, or leave it out",
-        ),
-    ],
-)  # fmt: skip
-def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
-    with pytest.raises(kind, match=text):
-        act()
 
 
 def test_what_is_no_episode_at_all() -> None:

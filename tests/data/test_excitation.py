@@ -1,7 +1,5 @@
 """What each excitation promises: bounds, levels, spectra, frequencies, feedback."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -120,47 +118,3 @@ def test_excitations_are_values_and_follow_the_seed(excitation: Excitation) -> N
     other = excitation.start(30, 0.05, generator(4))
     same = np.array_equal(U, [other(k, y) for k in range(30)])
     assert same == isinstance(excitation, km.Chirp)  # the one with nothing random in it
-
-
-@pytest.mark.parametrize(
-    ("act", "kind", "text"),
-    [
-        (lambda: km.Noise(1, -1), km.errors.DataError, "excitation limits cross at index 0: lower 1 is above upper -1; swap"),
-        (lambda: km.Noise([-1, -1], [1, 1, 1]), km.errors.ShapeError, r"low has shape \(2,\), expected \(3,\) or a scalar"),
-        (lambda: km.Noise([[1]], 2), km.errors.ShapeError, r"low has shape \(1, 1\), expected \(any,\)"),
-        (lambda: km.Noise(np.nan, 2), km.errors.DataError, "low holds 1 NaN or inf"),
-        (lambda: km.Noise(-1, 1, hold=0), km.errors.DataError, "hold is 0; it must be at least 1"),
-        (lambda: km.PRBS(-1, 1, order=2), km.errors.DataError, "order is 2; choose 3 … 16"),
-        (lambda: km.Multisine(1, 0.0, 3), km.errors.DataError, "period is 0 s; it must be above zero"),
-        (
-            lambda: km.Multisine(1, 0.12, 1).sequence(9, 0.05, generator(0)),
-            km.errors.DataError,
-            "period is 0.12 s, no multiple of dt 0.05 s; choose 0.1",
-        ),
-        (
-            lambda: km.Multisine(1, 0.5, 5).sequence(9, 0.05, generator(0)),
-            km.errors.DataError,
-            "harmonic 5 of 10 samples a period is not below the Nyquist frequency; lengthen the period or drop it",
-        ),
-        (
-            lambda: km.Chirp(1, 1, 10, 5).sequence(9, 0.05, generator(0)),
-            km.errors.DataError,
-            "a chirp up to 10 Hz needs dt below 0.05 s, dt is 0.05 s; lower the frequency",
-        ),
-        (lambda: km.Feedback([1, 2]), km.errors.ShapeError, r"K has shape \(2,\), expected \(any, any\)"),
-        (
-            lambda: km.Feedback([[1, 2]], km.Noise([-1, -1], [1, 1])),
-            km.errors.ShapeError,
-            "noise has 2 inputs and K 1 rows; pass one level for each input",
-        ),
-        (lambda: km.Feedback([[1, 2]], u_min=1, u_max=0), km.errors.DataError, "u limits cross at index 0"),
-        (
-            lambda: km.Feedback([[1, 2]]).start(3, 0.1, generator(0))(0, np.zeros(3)),
-            km.errors.ShapeError,
-            r"K has 2 columns, the plant measures 3; pass K of shape \(1, 3\)",
-        ),
-    ],
-)  # fmt: skip
-def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
-    with pytest.raises(kind, match=text):
-        act()

@@ -61,10 +61,3 @@ def test_episodes_give_the_ranges() -> None:
     axes = km.plot.eigenfunctions(turning(), 1, (1, 0), data, points=9).axes[0]
     assert axes.get_xlim() == pytest.approx((X[:, 1].min(), X[:, 1].max()))
     assert axes.get_ylim() == pytest.approx((X[:, 0].min(), X[:, 0].max()))
-
-
-def test_messages() -> None:
-    with pytest.raises(km.errors.DataError, match="there is no eigenfunction 2; the predictor has 0 … 1"):
-        km.plot.eigenfunctions(turning(), 2, (0, 1), SQUARE)
-    with pytest.raises(km.errors.DataError, match=r"asked for state 'x'; the states are angle \[rad\]"):
-        km.plot.eigenfunctions(turning(), 0, ("x", 1), SQUARE)

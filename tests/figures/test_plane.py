@@ -9,7 +9,7 @@ from koopmpc.figures.plane import eigenfunctions_on, plane_through
 NAMES = ("a [m]", "b [m/s]", "c [A]")
 
 
-def _model() -> km.LinearPredictor:
+def three_states() -> km.LinearPredictor:
     """A turn of (a, b) by 0.3 rad a step, and c halved."""
     A = np.zeros((3, 3))
     A[:2, :2] = 0.9 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
@@ -33,7 +33,7 @@ def test_episodes_give_ranges_and_the_median() -> None:
 
 
 def test_the_eigenfunctions_of_a_turn_are_the_polar_coordinates() -> None:
-    model = _model()
+    model = three_states()
     plane = plane_through(NAMES, (0, 1), [(-1, 1), (-1, 1)], points=20)
     a, b = plane.points[:, 0], plane.points[:, 1]
     phi = eigenfunctions_on(model, [0, 1], plane).reshape(2, -1)
@@ -41,22 +41,3 @@ def test_the_eigenfunctions_of_a_turn_are_the_polar_coordinates() -> None:
     for row, eigenvalue in zip(phi, model.eigenvalues, strict=False):
         turned = row / np.exp(1j * np.sign(eigenvalue.imag) * np.arctan2(b, a))
         assert np.ptp(np.angle(turned / turned[0])) < 1e-9
-
-
-def test_messages() -> None:
-    model, square = _model(), [(-1, 1), (-1, 1)]
-    with pytest.raises(km.errors.DataError, match=r"the plane is asked for state 'd'; the states are a \[m\], b"):
-        plane_through(NAMES, ("a", "d"), square)
-    with pytest.raises(km.errors.DataError, match=r"asked for b \[m/s\] twice; name two states"):
-        plane_through(NAMES, ("b", 1), square)
-    with pytest.raises(km.errors.DataError, match=r"the range of a \[m\] is 1 to -1; pass \(low, high\)"):
-        plane_through(NAMES, (0, 1), [(1, -1), (0, 1)])
-    with pytest.raises(km.errors.ShapeError, match=r"at has shape \(2,\), expected \(3,\)"):
-        plane_through(NAMES, (0, 1), square, [0, 0])
-    plane = plane_through(NAMES, (0, 1), square)
-    with pytest.raises(km.errors.DataError, match=r"there is no eigenfunction 3; the predictor has 0 … 2"):
-        eigenfunctions_on(model, 3, plane)
-    with pytest.raises(km.errors.DataError, match="which names no eigenfunction"):
-        eigenfunctions_on(model, [], plane)
-    with pytest.raises(km.errors.DataError, match=r"eigenfunction 2 is 0 on all of the plane; hold the other states"):
-        eigenfunctions_on(model, [0, 2], plane)

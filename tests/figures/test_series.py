@@ -106,26 +106,6 @@ def test_a_run_is_drawn_whole(tmp_path) -> None:
     km.figures.save(km.plot.run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
 
 
-def test_messages() -> None:
-    model, data = turning(), episodes(12)
-    with pytest.raises(km.errors.DataError, match="the episode has 25 steps from step 5 on, the horizon is 26"):
-        km.plot.rollout(model, data[0], 26, start=5)
-    with pytest.raises(km.errors.ShapeError, match="the episode has 3 states and 0 inputs, the predictor 2 and 1"):
-        km.plot.rollout(model, km.Episode(X=np.zeros((4, 3))))
-    with pytest.raises(km.errors.ShapeError, match="bands has 4 rows of 2, expected 5 of 2"):
-        km.plot.rollout(model, data[0], 5, np.ones((4, 2)))
-    with pytest.raises(km.errors.DataError, match="bands holds -1; half-widths are 0 or above"):
-        km.plot.rollout(model, data[0], 5, -np.ones((5, 2)))
-    with pytest.raises(km.errors.DataError, match="the band is for predictions with relift=True; pass relift=True"):
-        km.plot.rollout(model, data[0], 5, km.validate.conformal(model, data, 5, relift=True))
-    with pytest.raises(km.errors.DataError, match="asked for 0 states; choose 1 to 12 with states=…"):
-        km.plot.rollout(model, data[0], 5, states=[])
-    with pytest.raises(km.errors.DataError, match="there is no score; pass one"):
-        km.plot.error({})
-    with pytest.raises(km.errors.DataError, match="the figure is asked for state 'x'; the states are angle"):
-        km.plot.error(km.score(model, data, 3), states="x")
-
-
 def test_a_model_with_a_memory_forecasts_from_the_first_known_past() -> None:
     data = km.Episodes([km.Episode(X=e.X[:, :1], U=e.U) for e in episodes(20)], DT, STATES[:1], INPUTS)
     model = km.edmd(data, km.State(), embedding=km.Delay(1))  # two angles and an input tell the rate

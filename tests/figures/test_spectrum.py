@@ -9,7 +9,7 @@ from tests.figures.models import episodes, turning
 VALUES = np.array([1.2, -0.9, 0.5, 0.1])
 
 
-def _diagonal() -> km.LinearPredictor:
+def diagonal() -> km.LinearPredictor:
     return km.LinearPredictor(np.diag(VALUES), np.zeros((4, 0)), np.eye(4), km.State(), 0.1, list("abcd"), [])
 
 
@@ -33,7 +33,7 @@ def test_the_circle_has_radius_one_and_the_points_are_the_eigenvalues(residuals)
 
 def test_residuals_are_shades_sizes_and_shapes() -> None:
     residuals = np.array([1e-6, 1e-3, 0.5, np.inf])
-    made = km.plot.spectrum(_diagonal(), residuals)
+    made = km.plot.spectrum(diagonal(), residuals)
     good, bad = (_named(made.axes[0], gid) for gid in ("eigenvalues", "spurious eigenvalues"))
     assert np.array_equal(good.get_offsets()[:, 0], VALUES[:2])
     assert np.array_equal(bad.get_offsets()[:, 0], VALUES[2:])
@@ -52,7 +52,7 @@ def test_eigenvalues_that_crowd_are_drawn_closer() -> None:
     assert len(crowded.axes) == 2
     assert x[0] < 0.999 * np.cos(0.01) < x[1] < 1.2
     assert -0.2 < y[0] < -0.01 < 0.01 < y[1]
-    assert len(km.plot.spectrum(_diagonal()).axes) == 1
+    assert len(km.plot.spectrum(diagonal()).axes) == 1
 
 
 def test_a_bilinear_predictor_has_a_spectrum_too() -> None:
@@ -60,20 +60,6 @@ def test_a_bilinear_predictor_has_a_spectrum_too() -> None:
         np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), km.State(), 0.1, "ab", "u"
     )
     assert _named(km.plot.spectrum(model).axes[0], "eigenvalues").get_xdata() == pytest.approx([0.5, 0.5])
-
-
-def test_messages() -> None:
-    with pytest.raises(km.errors.ShapeError, match=r"residuals has shape \(3,\), expected \(2,\)"):
-        km.plot.spectrum(turning(), [0, 0, 0])
-    with pytest.raises(km.errors.DataError, match="residuals holds -1; they are norms, from 0 on"):
-        km.plot.spectrum(turning(), [0, -1])
-    data = episodes(3)
-    with pytest.raises(
-        km.errors.ShapeError, match="there are 2 residuals and 4 eigenvalues; pass the residuals of this"
-    ):
-        km.plot.spectrum(_diagonal(), km.validate.residual_dmd(turning(), data))
-    with pytest.raises(km.errors.DataError, match="the residuals are those of another predictor"):
-        km.plot.spectrum(turning(0.5), km.validate.residual_dmd(turning(), data))
 
 
 def test_residuals_of_the_trust_report_are_taken_with_their_tolerance() -> None:

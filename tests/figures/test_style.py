@@ -76,13 +76,3 @@ assert "matplotlib.pyplot" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_messages(tmp_path: Path) -> None:
-    with pytest.raises(km.errors.DataError, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
-        km.figures.save(_drawn(), tmp_path / "a.gif")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(km.errors.LogError, match=r"cannot be written: .*; pass another path"):
-        km.figures.save(_drawn(), tmp_path / "file" / "a.png")
-    with pytest.raises(km.errors.DataError, match="height is -1 in; it must be above zero"):
-        figure(height=-1.0)

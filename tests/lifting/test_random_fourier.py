@@ -51,16 +51,3 @@ def test_a_bound_copy_keeps_what_it_drew_in_a_file_too() -> None:
     x = np.array([0.2, -1.0])
     assert np.array_equal(again(x), lifting(x))
     assert buffered(lifting)(x)[0] == pytest.approx(lifting(x), rel=1e-12)
-
-
-def test_messages() -> None:
-    with pytest.raises(km.errors.DataError, match="count is 0; it must be at least 1"):
-        km.RandomFourier(0, 1.0)
-    with pytest.raises(km.errors.DataError, match="width is 0; it must be above zero"):
-        km.RandomFourier(3, 0.0)
-    with pytest.raises(km.errors.DataError, match="frequencies and phases belong together"):
-        km.RandomFourier(3, 1.0, phases=[0, 0, 0])
-    with pytest.raises(km.errors.ShapeError, match="frequencies has 1 columns and there are 3 states"):
-        km.RandomFourier(1, 1.0, frequencies=[[1.0]], phases=[0.0], bound=NAMES)
-    with pytest.raises(km.errors.DataError, match=r"RandomFourier does not know its states yet"):
-        km.RandomFourier(1, 1.0)([1.0])

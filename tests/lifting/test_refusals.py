@@ -1,7 +1,7 @@
 """Bad input: each message says what was got and what to do; and what a file refuses."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -73,88 +73,74 @@ def test_expressions_keep_no_python_function_once_bound() -> None:
     assert returned(lifting) == lifting
 
 
-@pytest.mark.parametrize(
-    ("act", "kind", "text"),
-    [
-        (
-            lambda: km.Fourier(2)([[1.0]]),
-            km.errors.DataError,
-            r"Fourier does not know its states yet; call .bind\(states\)",
-        ),
-        (lambda: (km.State() + km.Constant()).names, km.errors.DataError, "Sum does not know its states yet"),
-        (lambda: km.State().symbolic(ca.SX.sym("x", 2)), km.errors.DataError, "State does not know its states yet"),
-        (
-            lambda: km.State().bind(NAMES)([[1.0, 2.0]]),
-            km.errors.ShapeError,
-            r"x has 2 states, the lifting was bound to 3 \(theta \[rad\], omega \[rad/s\], p \[m\]\)",
-        ),
-        (
-            lambda: km.State().bind(NAMES)(np.zeros((2, 2, 3))),
-            km.errors.ShapeError,
-            r"x has shape \(2, 2, 3\), the lifting",
-        ),
-        (lambda: km.State().bind(NAMES)(1.0), km.errors.ShapeError, r"x has shape \(\), the lifting was bound to 3"),
-        (
-            lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 4)),
-            km.errors.ShapeError,
-            "x has 4 states, the lifting",
-        ),
-        (lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 1, 3)), km.errors.ShapeError, r"x has shape \(1, 3\)"),
-        (lambda: km.State().bind(("a", "a")), km.errors.DataError, "two states are named 'a'; rename one"),
-        (
-            lambda: km.Monomials(2).bind(("a [m]", "a [s]")),
-            km.errors.DataError,
-            r"two observables are named 'a\^2'; rename one",
-        ),
-        (lambda: km.Monomials(1), km.errors.DataError, "degree is 1; it must be at least 2"),
-        (lambda: km.Fourier(0), km.errors.DataError, "harmonics is 0; it must be at least 1"),
-        (
-            lambda: km.Fourier(1, "phi").bind(NAMES),
-            km.errors.DataError,
-            r"state 'phi'; the states are theta \[rad\], omega",
-        ),
-        (lambda: km.Fourier(1, 3).bind(NAMES), km.errors.DataError, r"state 3; the states are .* or 0 … 2"),
-        (
-            lambda: km.ThinPlate([[0, 1]]).bind(NAMES),
-            km.errors.ShapeError,
-            "centers has 2 columns and there are 3 states",
-        ),
-        (lambda: km.ThinPlate(np.zeros((0, 3))), km.errors.DataError, "pass at least one row, a row a centre"),
-        (lambda: km.ThinPlate([0, 1]), km.errors.ShapeError, r"centers has shape \(2,\), expected \(any, any\)"),
-        (lambda: km.Gaussian([[0, np.nan]], 1), km.errors.DataError, "centers holds 1 NaN or inf"),
-        (lambda: km.Gaussian([[0, 1]], 0), km.errors.DataError, "width is 0; it must be above zero"),
-        (
-            lambda: km.Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES),
-            km.errors.DataError,
-            r"fn returns shape \(1, 1\) and names has 2; return one expression for each name",
-        ),
-        (
-            lambda: km.Expressions(lambda x: [x[0], x[1]], ["a", "a"]).bind(NAMES),
-            km.errors.DataError,
-            "two observables are named",
-        ),
-        (
-            lambda: km.Expressions(lambda x: [ca.erf(x[0])], ["a"]).bind(NAMES),
-            km.errors.DataError,
-            "uses the operation 'erf'",
-        ),
-        (
-            lambda: to_data(km.Expressions(lambda x: [x[0]], ["a"])),
-            km.errors.DataError,
-            r"call .bind\(states\), which traces",
-        ),
-        (lambda: to_data(Error().bind(NAMES)), km.errors.DataError, "uses the operation 'erf'"),
-        (lambda: to_data(Drag()), km.errors.DataError, "Drag does not know its states yet"),
-        (
-            lambda: Traced(Drag().bind(NAMES)._graph, ("a",), bound=NAMES).symbolic(ca.SX.sym("x", 3)),
-            km.errors.ShapeError,
-            r"Traced.formula returns shape \(2, 1\), but names 1 observables; return a column of 1",
-        ),
-    ],
-)
-def test_messages(act: Callable[[], object], kind: type[km.KoopmpcError], text: str) -> None:
-    with pytest.raises(kind, match=text):
-        act()
+DATA, SHAPE = km.errors.DataError, km.errors.ShapeError
+MISTAKES = [
+    (DATA, r"Fourier does not know its states yet; call .bind\(states\)", lambda: km.Fourier(2)([[1.0]])),
+    (DATA, "Sum does not know its states yet", lambda: (km.State() + km.Constant()).names),
+    (DATA, "State does not know its states yet", lambda: km.State().symbolic(ca.SX.sym("x", 2))),
+    (
+        SHAPE,
+        r"x has 2 states, the lifting was bound to 3 \(theta \[rad\], omega \[rad/s\], p \[m\]\)",
+        lambda: km.State().bind(NAMES)([[1.0, 2.0]]),
+    ),
+    (SHAPE, r"x has shape \(2, 2, 3\), the lifting", lambda: km.State().bind(NAMES)(np.zeros((2, 2, 3)))),
+    (SHAPE, r"x has shape \(\), the lifting was bound to 3", lambda: km.State().bind(NAMES)(1.0)),
+    (SHAPE, "x has 4 states, the lifting", lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 4))),
+    (SHAPE, r"x has shape \(1, 3\)", lambda: km.State().bind(NAMES).symbolic(ca.SX.sym("x", 1, 3))),
+    (DATA, "two states are named 'a'; rename one", lambda: km.State().bind(("a", "a"))),
+    (DATA, r"two observables are named 'a\^2'; rename one", lambda: km.Monomials(2).bind(("a [m]", "a [s]"))),
+    (DATA, "degree is 1; it must be at least 2", lambda: km.Monomials(1)),
+    (DATA, "harmonics is 0; it must be at least 1", lambda: km.Fourier(0)),
+    (DATA, r"state 'phi'; the states are theta \[rad\], omega", lambda: km.Fourier(1, "phi").bind(NAMES)),
+    (DATA, r"state 3; the states are .* or 0 … 2", lambda: km.Fourier(1, 3).bind(NAMES)),
+    (SHAPE, "centers has 2 columns and there are 3 states", lambda: km.ThinPlate([[0, 1]]).bind(NAMES)),
+    (DATA, "pass at least one row, a row a centre", lambda: km.ThinPlate(np.zeros((0, 3)))),
+    (SHAPE, r"centers has shape \(2,\), expected \(any, any\)", lambda: km.ThinPlate([0, 1])),
+    (DATA, "centers holds 1 NaN or inf", lambda: km.Gaussian([[0, np.nan]], 1)),
+    (DATA, "width is 0; it must be above zero", lambda: km.Gaussian([[0, 1]], 0)),
+    (
+        DATA,
+        r"fn returns shape \(1, 1\) and names has 2; return one expression for each name",
+        lambda: km.Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES),
+    ),
+    (DATA, "two observables are named", lambda: km.Expressions(lambda x: [x[0], x[1]], ["a", "a"]).bind(NAMES)),
+    (DATA, "uses the operation 'erf'", lambda: km.Expressions(lambda x: [ca.erf(x[0])], ["a"]).bind(NAMES)),
+    (DATA, r"call .bind\(states\), which traces", lambda: to_data(km.Expressions(lambda x: [x[0]], ["a"]))),
+    (DATA, "uses the operation 'erf'", lambda: to_data(Error().bind(NAMES))),
+    (DATA, "Drag does not know its states yet", lambda: to_data(Drag())),
+    (
+        SHAPE,
+        r"Traced.formula returns shape \(2, 1\), but names 1 observables; return a column of 1",
+        lambda: Traced(Drag().bind(NAMES)._graph, ("a",), bound=NAMES).symbolic(ca.SX.sym("x", 3)),
+    ),
+    (
+        DATA,
+        r"a stream is read once, by the fit; take Standardized\.of from",
+        lambda: km.Standardized.of(km.Stream(iter([km.Episodes([km.Episode(X=np.zeros((4, 3)))], 0.1)])), km.State()),
+    ),
+    (DATA, "scale holds 0; it must be above zero for every state", lambda: km.Standardized(km.State(), [0, 0], [1, 0])),
+    (SHAPE, r"scale has shape \(1,\), expected \(2,\)", lambda: km.Standardized(km.State(), [0, 0], [1])),
+    (
+        SHAPE,
+        "mean and scale have 2 entries and there are 3 states",
+        lambda: km.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES),
+    ),
+    (DATA, "count is 0; it must be at least 1", lambda: km.RandomFourier(0, 1.0)),
+    (DATA, "width is 0; it must be above zero", lambda: km.RandomFourier(3, 0.0)),
+    (DATA, "frequencies and phases belong together", lambda: km.RandomFourier(3, 1.0, phases=[0, 0, 0])),
+    (
+        SHAPE,
+        "frequencies has 1 columns and there are 3 states",
+        lambda: km.RandomFourier(1, 1.0, frequencies=[[1.0]], phases=[0.0], bound=NAMES),
+    ),
+    (DATA, r"RandomFourier does not know its states yet", lambda: km.RandomFourier(1, 1.0)([1.0])),
+]
+
+
+@pytest.mark.parametrize(("error", "text", "mistake"), MISTAKES, ids=[text for _, text, _ in MISTAKES])
+def test_a_mistake_says_what_was_got_and_what_to_do(error: Any, text: str, mistake: Any) -> None:
+    with pytest.raises(error, match=text):
+        mistake()
 
 
 def test_a_lifting_that_a_file_spoils_is_a_log_error() -> None:

@@ -79,14 +79,3 @@ def test_files_are_read_part_by_part(tmp_path) -> None:
     read, whole = km.Standardized.of(km.Files(tmp_path), km.State()), km.Standardized.of(data, km.State())
     assert read.mean == pytest.approx(whole.mean, rel=1e-13)
     assert read.scale == pytest.approx(whole.scale, rel=1e-13)
-
-
-def test_messages() -> None:
-    with pytest.raises(km.errors.DataError, match=r"a stream is read once, by the fit; take Standardized\.of from"):
-        km.Standardized.of(km.Stream(iter([_data()])), km.State())
-    with pytest.raises(km.errors.DataError, match="scale holds 0; it must be above zero for every state"):
-        km.Standardized(km.State(), [0, 0], [1, 0])
-    with pytest.raises(km.errors.ShapeError, match=r"scale has shape \(1,\), expected \(2,\)"):
-        km.Standardized(km.State(), [0, 0], [1])
-    with pytest.raises(km.errors.ShapeError, match="mean and scale have 2 entries and there are 3 states"):
-        km.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES)

@@ -1,0 +1,109 @@
+"""Mistakes at figures say what was got and what to do."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.figures.plane import eigenfunctions_on, plane_through
+from koopmpc.figures.style import figure, save
+from tests.figures.models import episodes, turning
+from tests.figures.test_eigenfunctions import SQUARE
+from tests.figures.test_plane import NAMES, three_states
+from tests.figures.test_spectrum import diagonal
+
+DATA, SHAPE = km.errors.DataError, km.errors.ShapeError
+MODEL, EPISODES = turning(), episodes(12)
+CUBE, PLANE = three_states(), plane_through(NAMES, (0, 1), SQUARE)
+MISTAKES = [
+    (
+        DATA,
+        "the episode has 25 steps from step 5 on, the horizon is 26",
+        lambda: km.plot.rollout(MODEL, EPISODES[0], 26, start=5),
+    ),
+    (
+        SHAPE,
+        "the episode has 3 states and 0 inputs, the predictor 2 and 1",
+        lambda: km.plot.rollout(MODEL, km.Episode(X=np.zeros((4, 3)))),
+    ),
+    (SHAPE, "bands has 4 rows of 2, expected 5 of 2", lambda: km.plot.rollout(MODEL, EPISODES[0], 5, np.ones((4, 2)))),
+    (
+        DATA,
+        "bands holds -1; half-widths are 0 or above",
+        lambda: km.plot.rollout(MODEL, EPISODES[0], 5, -np.ones((5, 2))),
+    ),
+    (
+        DATA,
+        "the band is for predictions with relift=True; pass relift=True",
+        lambda: km.plot.rollout(MODEL, EPISODES[0], 5, km.validate.conformal(MODEL, EPISODES, 5, relift=True)),
+    ),
+    (
+        DATA,
+        "asked for 0 states; choose 1 to 12 with states=…",
+        lambda: km.plot.rollout(MODEL, EPISODES[0], 5, states=[]),
+    ),
+    (DATA, "there is no score; pass one", lambda: km.plot.error({})),
+    (
+        DATA,
+        "the figure is asked for state 'x'; the states are angle",
+        lambda: km.plot.error(km.score(MODEL, EPISODES, 3), states="x"),
+    ),
+    (
+        DATA,
+        r"the plane is asked for state 'd'; the states are a \[m\], b",
+        lambda: plane_through(NAMES, ("a", "d"), SQUARE),
+    ),
+    (DATA, r"asked for b \[m/s\] twice; name two states", lambda: plane_through(NAMES, ("b", 1), SQUARE)),
+    (
+        DATA,
+        r"the range of a \[m\] is 1 to -1; pass \(low, high\)",
+        lambda: plane_through(NAMES, (0, 1), [(1, -1), (0, 1)]),
+    ),
+    (SHAPE, r"at has shape \(2,\), expected \(3,\)", lambda: plane_through(NAMES, (0, 1), SQUARE, [0, 0])),
+    (DATA, r"there is no eigenfunction 3; the predictor has 0 … 2", lambda: eigenfunctions_on(CUBE, 3, PLANE)),
+    (DATA, "which names no eigenfunction", lambda: eigenfunctions_on(CUBE, [], PLANE)),
+    (
+        DATA,
+        r"eigenfunction 2 is 0 on all of the plane; hold the other states",
+        lambda: eigenfunctions_on(CUBE, [0, 2], PLANE),
+    ),
+    (
+        DATA,
+        "there is no eigenfunction 2; the predictor has 0 … 1",
+        lambda: km.plot.eigenfunctions(turning(), 2, (0, 1), SQUARE),
+    ),
+    (
+        DATA,
+        r"asked for state 'x'; the states are angle \[rad\]",
+        lambda: km.plot.eigenfunctions(turning(), 0, ("x", 1), SQUARE),
+    ),
+    (SHAPE, r"residuals has shape \(3,\), expected \(2,\)", lambda: km.plot.spectrum(turning(), [0, 0, 0])),
+    (DATA, "residuals holds -1; they are norms, from 0 on", lambda: km.plot.spectrum(turning(), [0, -1])),
+    (
+        SHAPE,
+        "there are 2 residuals and 4 eigenvalues; pass the residuals of this",
+        lambda: km.plot.spectrum(diagonal(), km.validate.residual_dmd(turning(), EPISODES)),
+    ),
+    (
+        DATA,
+        "the residuals are those of another predictor",
+        lambda: km.plot.spectrum(turning(0.5), km.validate.residual_dmd(turning(), EPISODES)),
+    ),
+    (DATA, "height is -1 in; it must be above zero", lambda: figure(height=-1.0)),
+]
+
+
+@pytest.mark.parametrize(("error", "text", "mistake"), MISTAKES, ids=[text for _, text, _ in MISTAKES])
+def test_a_mistake_says_what_was_got_and_what_to_do(error: Any, text: str, mistake: Any) -> None:
+    with pytest.raises(error, match=text):
+        mistake()
+
+
+def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DATA, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
+        save(figure(2, 1)[0], tmp_path / "a.gif")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(km.errors.LogError, match=r"cannot be written: .*; pass another path"):
+        save(figure(2, 1)[0], tmp_path / "file" / "a.png")
