@@ -1,4 +1,4 @@
-"""The one place that words messages about shapes, dtypes, NaN, definiteness and paths."""
+"""Checks of arguments and files, with the messages about shapes, dtypes, NaN, definiteness and paths."""
 
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
@@ -6,6 +6,7 @@ from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO, cast
+from zipfile import is_zipfile
 
 import numpy as np
 from jaxtyping import Float
@@ -224,3 +225,26 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
     except (TypeError, ValueError):
         pass
     return array(value, name, finite=False)  # pyright: ignore[reportArgumentType]
+
+
+def read_arrays(file: Path, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Return all arrays of a .npz file, those that are `needed` among them; a pickle in it is never opened.
+
+    Raises
+    ------
+    ValueError
+        The file cannot be read, or lacks an array; the message says why.
+    """
+    if not is_zipfile(file):
+        raise ValueError("it is no .npz file, or was cut")
+    try:
+        # Opened here, for numpy leaves a file that it refuses open.
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
+            arrays = {name: held[name] for name in held.files}
+    except Exception as error:  # numpy and zipfile raise a dozen kinds, and some advise to trust the file
+        raise ValueError("it is damaged, or holds something other than arrays of numbers") from error
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        names = ", ".join(arrays) or "nothing"
+        raise ValueError(f"it is of another program: it holds {names}, and lacks {', '.join(missing)}")
+    return arrays

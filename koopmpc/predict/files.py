@@ -7,7 +7,6 @@ from typing import TypeVar, cast
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.data.files.npz import read_arrays
 from koopmpc.errors import LogError
 from koopmpc.values import Arrays, Value, from_data, to_data
 
@@ -42,7 +41,7 @@ def load_value(path: str | Path, *kinds: type[V]) -> V:
     advice = f"pass the .npz of a saved {wanted}"
     source = checks.existing(path, advice)
     try:
-        arrays = read_arrays(source, ("tree",))
+        arrays = checks.read_arrays(source, ("tree",))
         tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise LogError(f"{path} is damaged: the text in it cannot be read; {advice}") from error

@@ -90,7 +90,7 @@ def test_the_batch_and_the_stepwise_way_agree(excitation: Callable[..., object],
 
 
 @given(SEEDS)
-def test_the_seed_decides(seed: int) -> None:
+def test_the_same_seed_gives_the_same_data(seed: int) -> None:
     def run(rng: np.random.Generator | int) -> km.Episodes:
         return km.collect(PENDULUM, BOX, km.Noise(-8, 8), episodes=2, steps=5, rng=rng)
 
@@ -112,7 +112,7 @@ def test_uniform_stays_in_its_box(seed: int) -> None:
     assert (X <= [1, 2.5]).all()
 
 
-def test_given_starts_are_used() -> None:
+def test_each_episode_begins_at_the_given_state() -> None:
     one = km.collect(PENDULUM, [0.1, 0.2], km.Noise(-8, 8), episodes=3, steps=2)
     assert [run.X[0].tolist() for run in one] == [[0.1, 0.2]] * 3
     each = km.collect(PENDULUM, [[1, 2], [3, 4]], km.Noise(-8, 8), episodes=2, steps=2)

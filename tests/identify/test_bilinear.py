@@ -43,7 +43,7 @@ def test_proctor_2018_inputs_that_enter_linearly_have_no_products() -> None:
     assert np.abs(model.report.residual).max() < 1e-7  # as far as the Gram route resolves it
 
 
-def test_safedmd_system() -> None:
+def test_a_bilinear_fit_is_exact_on_the_linear_system_of_safedmd() -> None:
     data = data_of(*slow_manifold(-2.0, 1.0, 0.01))
     model = km.bilinear_edmd(data, km.State() + km.Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"]))
     assert model.eigenvalues.real == pytest.approx([1.010050, 0.980199, 0.960789], abs=5e-7)
@@ -124,7 +124,7 @@ def test_doubts_are_said_and_kept() -> None:
     assert model.report.warnings == (str(caught[0].message),)
 
 
-def test_refusals() -> None:
+def test_data_without_inputs_and_wrong_settings_are_refused() -> None:
     with pytest.raises(km.errors.DataError, match="the episodes have no inputs; pass them to edmd"):
         km.bilinear_edmd(random_episodes(0, [20], 2, 0), km.State())
     with pytest.raises(km.errors.DataError, match="ridge is -1; it must be 0 or above"):

@@ -96,7 +96,7 @@ def test_known_B_and_rank_together() -> None:
     assert np.allclose(model.report.residual, np.sqrt(np.mean(error, axis=0)))
 
 
-def test_the_cut_is_stated() -> None:
+def test_the_report_states_the_cut_of_singular_values() -> None:
     data = random_episodes(0, [200], 3, 1)
     report = km.dmd(data).report
     assert (
@@ -106,7 +106,7 @@ def test_the_cut_is_stated() -> None:
     assert km.dmd(data, rank=2).report.route == "svd, truncated SVD of unscaled columns at rank 2"
 
 
-def test_bad_input_is_refused() -> None:
+def test_a_wrong_rank_or_known_matrix_is_refused() -> None:
     data = random_episodes(0, [20], 2, 0)
     with pytest.raises(km.errors.DataError, match="the episodes have no inputs; pass them to dmd"):
         km.dmdc(data)

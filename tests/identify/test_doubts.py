@@ -22,7 +22,7 @@ def warned(data: km.Episodes, lifting: km.Lifting, **options: float) -> tuple[km
     return model, sentences
 
 
-def test_fewer_snapshots_than_coefficients() -> None:
+def test_fewer_snapshots_than_coefficients_are_doubted() -> None:
     data = random_episodes(0, [5], 2, 1)
     model, sentences = warned(data, km.Constant() + km.State() + km.Monomials(2))
     assert len(sentences) == 1

@@ -173,7 +173,7 @@ def test_full_rank_without_truncation_predicts_the_same() -> None:
     assert np.allclose(whole.rollout([0.3, -0.2], U), reduced.rollout([0.3, -0.2], U), atol=1e-10)
 
 
-def test_bad_settings_are_refused() -> None:
+def test_a_wrong_ridge_or_rank_is_refused() -> None:
     data = random_episodes(0, [50], 2, 1)
     with pytest.raises(km.errors.DataError, match=r"ridge is -1; it must be 0 or above"):
         km.edmd(data, LIFTING, ridge=-1)

@@ -28,7 +28,7 @@ def data_of(A: np.ndarray, B: np.ndarray, count: int = 300) -> km.Episodes:
     return one_step_pairs(lambda x, u: A[:2] @ [*x, x[0] ** 2] + B[:2] @ u, 2, 1, count)
 
 
-def test_brunton_2016_slow_manifold() -> None:
+def test_edmd_is_exact_on_the_slow_manifold_of_brunton_2016() -> None:
     A, B = slow_manifold(-0.1, 1.0, 0.01)
     model = km.edmd(data_of(A, B), SQUARE)
     assert np.allclose(model.A, A, rtol=0, atol=1e-12)
@@ -92,7 +92,7 @@ def test_williams_2015_eigenvalues_are_the_products() -> None:
     assert np.abs(model.eigenvalues - products).max() < 1e-10
 
 
-def test_safedmd_system() -> None:
+def test_edmd_is_exact_on_the_system_of_safedmd() -> None:
     A, B = slow_manifold(-2.0, 1.0, 0.01)
     data = data_of(A, B)
     lifting = km.State() + km.Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"])
@@ -106,7 +106,7 @@ def test_safedmd_system() -> None:
 
 
 @pytest.mark.parametrize(("lam", "mu", "delta"), [(0.9, 0.5, 1.0), (0.7, 1.1, 0.3)])
-def test_proctor_kic_example(lam: float, mu: float, delta: float) -> None:
+def test_edmd_is_exact_on_the_example_of_proctor(lam: float, mu: float, delta: float) -> None:
     def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.array([lam * x[0], mu * x[1] + (lam**2 - mu) * x[0] ** 2 + delta * u[0]])
 

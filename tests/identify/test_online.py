@@ -209,14 +209,14 @@ def test_long_runs_stay_exact() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("forgetting", [1.0, 0.9995])
-def test_ten_million_updates(forgetting: float) -> None:
+def test_ten_million_updates_in_blocks_stay_exact(forgetting: float) -> None:
     error = long_run(7_000_000, 1000, forgetting, 3_000_000)
     print(f"10⁷ updates in blocks, forgetting {forgetting}: largest error of A, B {error:.1e}")  # noqa: T201
     assert error < 1e-9
 
 
 @pytest.mark.slow
-def test_single_updates() -> None:
+def test_a_hundred_thousand_single_updates_stay_exact() -> None:
     error = long_run(100_000, 1, 0.999, 0)
     print(f"10⁵ single updates: largest error of A, B {error:.1e}")  # noqa: T201
     assert error < 1e-9
@@ -280,7 +280,7 @@ def test_few_pairs_are_told_in_the_report_and_do_not_warn() -> None:
     assert np.allclose(model.rollout([1, 2], [[3]])[1], [4, 5])
 
 
-def test_bad_arguments() -> None:
+def test_wrong_forgetting_windows_and_shapes_are_refused() -> None:
     def make(**options: float) -> km.OnlineEDMD:
         return km.OnlineEDMD(km.State(), dt=0.1, states=("a", "b"), inputs=("u",), **options)
 

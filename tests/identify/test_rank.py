@@ -141,7 +141,7 @@ def test_inputs_multiply_the_named_observables_alone(seed: int) -> None:
     assert not none.N.any()
 
 
-def test_refusals() -> None:
+def test_a_rank_that_cannot_be_kept_is_refused() -> None:
     data = random_episodes(0, [50], 2, 1)
     with pytest.raises(
         km.errors.DataError, match="rank is 1; pass a whole number, or a share of energy between 0 and 1"

@@ -70,7 +70,7 @@ def test_on_an_orthogonal_design_it_is_leave_one_out() -> None:
 
 
 @given(st.integers(0, 99))
-def test_units_mean_nothing(seed: int) -> None:
+def test_the_chosen_ridge_does_not_depend_on_units(seed: int) -> None:
     data = noisy(seed, 40, 0.3)
     units = np.array([1e4, 1e-3])
     other = km.Episodes([km.Episode(X=e.X * units, U=e.U) for e in data], data.dt)
@@ -101,7 +101,7 @@ def test_few_noisy_pairs_predict_better_with_it() -> None:
     assert won >= 18
 
 
-def test_exact_data_need_none() -> None:
+def test_exact_data_need_no_ridge() -> None:
     data = one_step_pairs(lambda x, u: np.array([0.9 * x[0] + u[0], 0.5 * x[1]]), 2, 1, 60)
     model = km.edmd(data, km.State(), ridge="gcv")
     assert model.report.ridge == 0
@@ -124,7 +124,7 @@ def test_of_fewer_pairs_than_coefficients_it_chooses_too() -> None:
 
 
 @given(st.integers(0, 99))
-def test_of_a_bilinear_model(seed: int) -> None:
+def test_the_ridge_of_a_bilinear_model_minimises_its_score(seed: int) -> None:
     data = random_episodes(seed, [60], 2, 1)
     model = km.bilinear_edmd(data, km.State(), ridge="gcv")
     D = brute_force(data, model.lifting)
@@ -135,7 +135,7 @@ def test_of_a_bilinear_model(seed: int) -> None:
     assert np.array_equal(model.N, plain.N)
 
 
-def test_another_word_is_refused() -> None:
+def test_a_ridge_that_is_no_number_or_gcv_is_refused() -> None:
     code = 'data = km.Episodes([km.Episode(X=np.eye(4))], 0.1)\nshow(lambda: km.edmd(data, km.State(), ridge="cv"))'
     assert shown(code) == ["DataError ridge is 'cv'; pass a number, or \"gcv\""]
     with pytest.raises(km.errors.DataError, match="ridge is -1; it must be 0 or above"):

@@ -32,7 +32,7 @@ def slow_manifold(noise: float = 0.0, seed: int = 0, count: int = 600) -> km.Epi
 
 @given(st.integers(0, 999), st.booleans(), st.floats(0.01, 3.0), st.integers(1, 3))
 @settings(max_examples=6)
-def test_the_solver_equals_cvxpy(seed: int, grouped: bool, penalty: float, targets: int) -> None:
+def test_the_lasso_solver_agrees_with_cvxpy(seed: int, grouped: bool, penalty: float, targets: int) -> None:
     rng = np.random.default_rng(seed)
     P, T = rng.standard_normal((30, 6)), rng.standard_normal((30, targets))
     P[:, 5] = P[:, 0] + 0.1 * P[:, 5]
@@ -107,7 +107,7 @@ def test_a_large_penalty_leaves_the_states_and_a_small_one_everything() -> None:
     assert np.allclose(whole.A, km.edmd(data, every).A, rtol=0, atol=1e-9)
 
 
-def test_units_mean_nothing() -> None:
+def test_the_kept_observables_do_not_depend_on_units() -> None:
     data = slow_manifold(0.02, seed=3)
     units = np.array([1e-4, 1e4])
     scaled = km.Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
@@ -127,7 +127,7 @@ def test_the_chosen_lifting_is_data_and_the_same_function_twice(tmp_path) -> Non
     assert np.allclose(model.step_map()(X[0], [0.3]), [0.9 * X[0, 0], 0.5 * X[0, 1] + 0.3 * X[0, 0] ** 2 + 0.3])
 
 
-def test_bad_arguments() -> None:
+def test_a_wrong_penalty_or_lifting_is_refused() -> None:
     assert shown(CODE) == ['DataError over is \'rows\'; pass "observables" or "entries"']
     data = slow_manifold(count=30)
     with pytest.raises(km.errors.DataError, match="penalty is 0"):

@@ -125,7 +125,7 @@ def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
     assert sizes[1] <= 0.8 + 1e-9
 
 
-def test_a_ridge_is_kept() -> None:
+def test_a_ridge_counts_in_the_plain_and_in_the_stable_fit() -> None:
     data = runs(4, 3, 1, radius=1.0, noise=0.3)
     plain = km.stable_edmd(data, km.State(), ridge=0.1, radius=5.0)
     assert np.allclose(plain.A, km.edmd(data, km.State(), ridge=0.1).A, atol=1e-12)
@@ -190,7 +190,7 @@ def test_a_stable_model_that_keeps_little_of_the_plant_says_so() -> None:
 
 
 @pytest.mark.slow
-def test_two_hundred_observables() -> None:
+def test_two_hundred_observables_take_a_few_seconds() -> None:
     import time
 
     data = runs(0, 200, 2, radius=1.0, noise=0.5)
@@ -223,7 +223,7 @@ def test_delays_weights_and_the_past_in_all_three_fits() -> None:
         assert model.lifting.names == plain.lifting.names
 
 
-def test_bad_arguments() -> None:
+def test_a_wrong_radius_or_ridge_is_refused() -> None:
     data = random_episodes(0, [30], 2, 1)
     for radius in (0.0, -1.0):
         with pytest.raises(km.errors.DataError, match="radius is"):

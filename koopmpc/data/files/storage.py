@@ -12,7 +12,6 @@ import numpy as np
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature, joined
 from koopmpc.data.files import csv, parquet
-from koopmpc.data.files.npz import read_arrays
 from koopmpc.data.files.tables import Told, read_table
 from koopmpc.errors import DataError, LogError
 
@@ -129,7 +128,7 @@ def _own(file: Path, suffix: str, about: str | None) -> tuple[np.ndarray, np.nda
         return csv.read(file, about)
     if suffix == ".parquet":
         return parquet.read(file)
-    held = read_arrays(file, ("X", "U", "steps", "about"))
+    held = checks.read_arrays(file, ("X", "U", "steps", "about"))
     return held["X"], held["U"], held["steps"], str(held["about"])
 
 
