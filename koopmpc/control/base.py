@@ -117,7 +117,8 @@ class InitialCondition:
         if got is not None and (np.abs(got) < HUGE).all():
             acted = got
         good = observer.observe(measured, acted, self._w)
-        self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)  # an unknown one stays as it was
+        if len(self._w):  # an unknown one stays as it was
+            self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         for i in range(self._latency):
             z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d)

@@ -82,7 +82,12 @@ class LiftedModel:
     ) -> Float[np.ndarray, " nz"]:
         """Return z⁺."""
         model = self._predictor
-        return model.A @ z + model.B @ u + model.E @ w + d
+        z_next = model.A.dot(z)
+        z_next += model.B.dot(u)
+        if self.nw:
+            z_next += model.E.dot(w)
+        z_next += d
+        return z_next
 
 
 def state_model(model: LinearPredictor | StateModel) -> StateModel:
@@ -177,7 +182,6 @@ class History:
         return zeta
 
 
-TINY = 1e-300  # a change of a state that never moved
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
 
 
@@ -193,8 +197,8 @@ class LiftedDisturbance(Value):
     A plan holds d over its horizon, but what a model lacks in a transient is not what it lacks where the plan ends.
     Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the
     states show it: c = 1 − Σ vᵢ/sᵢ² / Σ max((C m)ᵢ², (C d)ᵢ²)/sᵢ², at least 0. v is the variance of C e about C m,
-    without half the mean square of its successive differences, which is noise, and s the largest change of a state in
-    a step so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0, and d = m = e.
+    without half the mean square of its successive differences, which is noise, and s the largest step or misfit that a
+    state has shown so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0, and d = m = e.
 
     Parameters
     ----------
@@ -285,9 +289,9 @@ class Filtered(Measured):
         self._C = self._state_rows(model)
         nz, nx = len(self.d), len(self._C)
         self._still = np.zeros(nz)
-        # [e; f; f²; half the square of its change] of the newest misfit e, f = C e, and the means of all of them
-        self._newest, self._means = np.zeros(nz + 3 * nx), np.zeros(nz + 3 * nx)
-        self._parts = [slice(0, nz), *(slice(nz + i * nx, nz + (i + 1) * nx) for i in range(3))]
+        # of the newest misfit e and f = C e, and the means of all: [e; f; f² less half the square of its change]
+        self._newest, self._means = np.zeros(nz + 2 * nx), np.zeros(nz + 2 * nx)
+        self._lifted, self._states, self._squares = slice(nz), slice(nz, nz + nx), slice(nz + nx, None)
         self._known = self._known_places(model)
         self._forget()
 
@@ -305,7 +309,7 @@ class Filtered(Measured):
     def _forget(self) -> None:
         self._means[:] = 0.0
         self._learned = False
-        self._size = np.full(len(self._C), TINY)
+        self._sizes, self._weights = np.zeros(len(self._C)), np.zeros(len(self._C))
         self._last: Float[np.ndarray, " nz"] | None = None
 
     def reset(self, x0: ArrayLike | None = None) -> None:
@@ -321,31 +325,41 @@ class Filtered(Measured):
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and learn from the misfit of the step that led here."""
         super().observe(y, u, w)
-        z = self.z
-        if not np.abs(z).max() < HUGE:  # False for NaN
+        z, last = self.z, self._last
+        if not z.dot(z) < HUGE * HUGE:  # False for NaN
             self._last = None
             return False
-        if self._last is not None:
-            self._learn(z - self._model.advance(self._last, u, w, self._still), z - self._last)
+        if last is not None:
+            self._learn(z - self._model.advance(last, u, w, self._still), z - last)
         self._last = z.copy()
         return True
 
     def _learn(self, misfit: Float[np.ndarray, " nz"], moved: Float[np.ndarray, " nz"]) -> None:
         """Move d towards the mean of the misfits, by the share of them that was constant."""
         misfit[self._known] = 0.0
-        if not np.abs(misfit).max() < HUGE:
+        if not misfit.dot(misfit) < HUGE * HUGE:
             return
-        e, f, square, rough = self._parts
-        newest, means = self._newest, self._means
-        states = self._C @ misfit
-        newest[rough] = 0.5 * (states - newest[f]) ** 2 if self._learned else 0.0
-        self._learned = True
-        newest[e], newest[f], newest[square] = misfit, states, states**2
+        C, newest, means = self._C, self._newest, self._means
+        states, step = C.dot(misfit), C.dot(moved)
+        squares = states * states
+        self._measure(np.maximum(step * step, squares))
+        if self._learned:
+            change = states - newest[self._states]
+            newest[self._squares] = squares - 0.5 * change * change
+        else:
+            newest[self._squares] = squares
+            self._learned = True
+        newest[self._lifted], newest[self._states] = misfit, states
         means += self._gain * (newest - means)
-        self._size = np.maximum(self._size, (self._C @ moved) ** 2)
-        mean = means[f]
-        varied = np.maximum(means[square] - mean**2 - means[rough], 0.0)
-        most = float((np.maximum(mean**2, (self._C @ self.d) ** 2) / self._size).sum())
-        share = 1.0 - float((varied / self._size).sum()) / most if most > 0 else 0.0
-        if share > 0:
-            self.d += share * (means[e] - self.d)
+        mean, believed = means[self._states], C.dot(self.d)
+        mean = mean * mean
+        varied = float(np.maximum(means[self._squares] - mean, 0.0).dot(self._weights))
+        most = float(np.maximum(mean, believed * believed).dot(self._weights))
+        if varied < most:
+            self.d += (1.0 - varied / most) * (means[self._lifted] - self.d)
+
+    def _measure(self, squares: Float[np.ndarray, " nx"]) -> None:
+        """Weigh each state by one over the square of the largest step or misfit that it has shown."""
+        if (squares > self._sizes).any():
+            self._sizes = np.maximum(self._sizes, squares)
+            np.divide(1.0, self._sizes, out=self._weights, where=self._sizes > 0)

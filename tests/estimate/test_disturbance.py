@@ -37,7 +37,7 @@ def test_d_moves_to_the_mean_of_the_misfits_by_the_share_that_was_constant(gain,
             rough = weights[1:] @ np.diff(seen, axis=0) ** 2 / 2 if k > 1 else 0.0
             varied = np.maximum(weights @ seen**2 - (weights @ seen) ** 2 - rough, 0)
             largest = np.maximum((weights @ seen) ** 2, (model.C @ d) ** 2)
-            size = (np.diff(X[: k + 1], axis=0) ** 2).max(axis=0)
+            size = np.maximum((np.diff(X[: k + 1], axis=0) ** 2).max(axis=0), (seen**2).max(axis=0))
             share = max(1 - (varied / size).sum() / (largest / size).sum(), 0)
             d = d + share * (weights @ np.array(E) - d)
         np.testing.assert_allclose(observer.z, model.lift(X[k]), atol=1e-14)
