@@ -198,7 +198,8 @@ class LiftedDisturbance(Value):
     Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the
     states show it: c = 1 − Σ vᵢ/sᵢ² / Σ max((C m)ᵢ², (C d)ᵢ²)/sᵢ², at least 0. v is the variance of C e about C m,
     without half the mean square of its successive differences, which is noise, and s the largest step or misfit that a
-    state has shown so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0, and d = m = e.
+    state has shown so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0 and
+    d = m = e.
 
     Parameters
     ----------

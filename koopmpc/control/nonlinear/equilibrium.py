@@ -15,13 +15,14 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.problem import LearnedMap
 from koopmpc.control.riccati import one_step
 from koopmpc.control.tail import stationary
-from koopmpc.control.target import TOLERANCE, root
+from koopmpc.control.target import root
 from koopmpc.control.tracking import StateTracking
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.plants.compiled import Buffered
 
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
+RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too
 CLOSE = 1e-2  # the same where the next control step goes on: the error left is of the square of this share
 _QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
 _NEWTON = 20  # Gauss–Newton steps, at most
@@ -297,5 +298,5 @@ class TerminalTargets:
 def _inverse(E: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n k"]]:
     """Return the pseudo-inverse of E, and a basis of its null space."""
     left, sigma, right = np.linalg.svd(E)
-    rank = int((sigma > TOLERANCE * max(float(sigma[0]), 1e-300)).sum())
+    rank = int((sigma > RANK * max(float(sigma[0]), 1e-300)).sum())
     return right[:rank].T @ (left[:, :rank].T / sigma[:rank, None]), right[rank:].T
