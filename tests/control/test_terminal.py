@@ -247,6 +247,22 @@ def test_rows_of_inputs_go_with_the_rows_of_a_reference():
     np.testing.assert_array_equal(run.u_reference, np.full((40, 1), 0.2))
 
 
+@pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
+@pytest.mark.parametrize("latency", [0, 1])
+def test_nonlinear_controllers_take_the_same_inputs(kind, latency):
+    """On a linear plant they are KoopmanMPC, with a terminal weight of the cost and rows of inputs."""
+    model, rows = linear(*random_pair(np.random.default_rng(3), 2, 1)), 0.3 * np.sin(np.arange(7))[:, None]
+    for R_delta in (None, 0.2):
+        cost = km.Cost([2, 0.5], 0.1, Q_N=[[5, 1], [1, 3]], R_delta=R_delta, u_target=rows)
+        mpcs = [km.KoopmanMPC(model, cost, horizon=4, latency=latency), kind(model, cost, horizon=4, latency=latency)]
+        for _ in range(2):
+            runs = [
+                km.simulate(model.step_map(), mpc, x0=[0.3, -0.2], reference=[0.2, 0], steps=7, cost=cost)
+                for mpc in mpcs
+            ]
+            np.testing.assert_allclose(runs[0].U, runs[1].U, atol=1e-6)
+
+
 def test_lqr_takes_a_row_of_inputs_a_step():
     A, B = np.array([[1.02, 0.1], [0.05, 1.01]]), np.array([[0.005], [0.1]])
     rows, x = np.array([[0.1], [-0.3], [0.2]]), np.array([0.1, 0.2])

@@ -230,7 +230,7 @@ class TerminalTargets:
 
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking, most: int) -> None:
         self._cost, self._outputs, self._most = cost, outputs, most
-        self._hold = cost.u_target == "equilibrium"
+        self._hold = isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
         self.equilibria = Equilibria(model, cost, outputs)
         if cost.Q_N is not None:
             checks.weight(cost.Q_N, "Q_N", model.ny)

@@ -16,7 +16,7 @@ from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
-from koopmpc.control.target import reference_rows, root
+from koopmpc.control.target import given_inputs, reference_rows, root
 from koopmpc.control.tracking import state_tracking
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
@@ -71,6 +71,7 @@ class StagedMPC(MPCBase):
         self._outputs = o = state_tracking(model.states, given.nu, self.cost, self.limits, given.nx)
         self._problem = staged_problem(given.F, o, self._blocks)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
+        self._rows, self._row = given_inputs(self.cost, o.inputs), 0  # of a given u_target, and the next call's
         self._R_root = root(o.R)
         self._disturbed = estimator is not None or given.nw > 0
         self._begin(given, o, estimator, with_rates=self._problem.with_rates)
@@ -90,6 +91,7 @@ class StagedMPC(MPCBase):
         super().reset(x0, u_prev)
         self._warm = self._moved = False
         self._forget_targets()
+        self._row = 0
         self._e[:] = 0.0
 
     def update(self, model: ModelOrMap) -> None:
@@ -205,8 +207,14 @@ class StagedMPC(MPCBase):
             end = self._target = self._terminal.disturbed(R[-1], e, self._target)
             U = np.clip(U + slopes @ e, *self._outputs.inputs)
             U[held] = end.u
-        self._track(self._staged(R[1:], U, end))
         self._moved = False
+        if self._rows is not None:  # row k of a given u_target counts at the k-th step
+            ahead = np.arange(self._N + 1) + self._row + self._latency
+            given = self._rows[np.minimum(ahead, len(self._rows) - 1)]
+            U, end = given[:-1], end._replace(u=given[-1], m=end.m + end.V @ given[-1])
+            self._moved = self._row + 1 < len(self._rows)
+            self._row += self._moved
+        self._track(self._staged(R[1:], U, end))
         return True
 
     def _staged(
