@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
+from koopmpc.control.cost import state_tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.linear.linear_mpc import LinearMPC
@@ -18,7 +19,6 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import Equilibria
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.nonlinear.problem import learned_map
-from koopmpc.control.tracking import state_tracking
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import ProblemError

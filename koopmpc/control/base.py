@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, Tracking, checked
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.control.tracking import Tracking, checked
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
 from koopmpc.lifting.buffered import HUGE

@@ -7,13 +7,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import Gain
 from koopmpc.control.tail import tail_of, tail_stage
 from koopmpc.control.target import given_inputs, reference_rows, targets_of
-from koopmpc.control.tracking import lifted_tracking
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.buffered import HUGE

@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, LiftedTracking, root
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.daqp import DAQP
-from koopmpc.control.tracking import LiftedTracking
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import constant_index
 from koopmpc.lifting.buffered import HUGE
@@ -208,9 +207,3 @@ def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: 
 def margin(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return by how much a target may stand outside its limits before it is moved: rounding."""
     return 1e-9 * (1 + np.abs(values))
-
-
-def root(Q: Float[np.ndarray, "nr nr"]) -> Float[np.ndarray, "nr nr"]:
-    """Return a matrix S with SᵀS = Q."""
-    values, vectors = np.linalg.eigh(Q)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
+from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.riccati import Stage
 from koopmpc.control.target import Targets
-from koopmpc.control.tracking import LiftedTracking
 from koopmpc.predict.predictors import LinearPredictor
 
 

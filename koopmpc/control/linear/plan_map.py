@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.linear.condense import Coordinates, condense, scaled
 from koopmpc.control.linear.horizon import horizon_of, stages
@@ -11,7 +11,6 @@ from koopmpc.control.linear.qp import groups, step_qp
 from koopmpc.control.linear.terminal import terminal_of
 from koopmpc.control.riccati import recursion
 from koopmpc.control.target import given_inputs, margin, targets_of
-from koopmpc.control.tracking import lifted_tracking
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 

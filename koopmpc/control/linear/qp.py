@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
+from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.limits import Interval, Softness, allowance
 from koopmpc.control.linear.condense import Condensed, row_sizes
 from koopmpc.control.linear.horizon import Horizon
 from koopmpc.control.solvers.base import StepQP
-from koopmpc.control.tracking import LiftedTracking
 
 
 class Group(NamedTuple):

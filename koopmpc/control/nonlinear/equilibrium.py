@@ -10,13 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, StateTracking, root
 from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.problem import LearnedMap
 from koopmpc.control.riccati import one_step
 from koopmpc.control.tail import stationary
-from koopmpc.control.target import root
-from koopmpc.control.tracking import StateTracking
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.plants.compiled import Buffered

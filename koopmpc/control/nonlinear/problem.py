@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from koopmpc import checks
+from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import Interval, Softness
-from koopmpc.control.tracking import StateTracking
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plants.compiled import Buffered

@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, root, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
-from koopmpc.control.target import given_inputs, reference_rows, root
-from koopmpc.control.tracking import state_tracking
+from koopmpc.control.target import given_inputs, reference_rows
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.plants.step_map import StepMap
