@@ -22,7 +22,7 @@ from koopmpc.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """How the data of a problem are collected: the arguments of `collect`.
+    """The collection of a problem's data: the arguments of `collect`.
 
     Attributes
     ----------

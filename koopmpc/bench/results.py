@@ -88,7 +88,7 @@ def failures(run: Run, steps: int) -> list[str]:
 
 @np.errstate(invalid="ignore", over="ignore")  # a state that diverged reaches nothing
 def reached(run: Run) -> bool:
-    """Return whether √(eᵀQe) stays below 5 % of its first value over the last tenth of the run.
+    """Return True where √(eᵀQe) stays below 5 % of its first value over the last tenth of the run.
 
     A run that starts on its reference is measured against its largest error.
     """

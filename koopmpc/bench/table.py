@@ -43,7 +43,7 @@ def _under_faults(title: str, rows: Sequence[RunRow]) -> Table:
 
 
 def _cell(row: RunRow, whole: RunRow) -> str:
-    """Return how a controller fared under a fault, compared with its run without faults."""
+    """Return the cell of a run under a fault: its cost over that of the run without the fault, or a word."""
     if row.metrics is None:
         return "raised"
     if not row.reached:

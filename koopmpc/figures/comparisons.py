@@ -98,7 +98,7 @@ def error(
 
 
 def _extent(score: Score, i: int) -> tuple[float, float]:
-    """Return how far below and above 0 the finite errors of state i reach."""
+    """Return the least and the largest finite error of state i."""
     rows = np.concatenate([score.low[:, i], score.high[:, i], score.rmse[:, i]])
     finite = rows[np.isfinite(rows)]
     return float(finite.min(initial=0.0)), float(finite.max(initial=0.0))

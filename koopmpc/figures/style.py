@@ -1,5 +1,5 @@
 # pyright: basic
-"""How every figure looks: for one column or two of a page, to be read in black and white, the same bytes each time.
+"""The style of every figure: for one column or two of a page, readable in black and white, the same bytes each time.
 
 A figure is a `matplotlib.figure.Figure` of its own: nothing of pyplot, so no display, no backend, and nothing that
 stays when it is let go. matplotlib is imported where it is used.

@@ -38,7 +38,7 @@ LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What came of a fit.
+    """The outcome of a fit.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ def _logs(data: Data) -> Data:
 
 
 def _understood(split: Divided, notes: list[str]) -> str:
-    """Return what was made of the data: sizes, sample time, names and ranges, and all that was repaired."""
+    """Return lines on the data: sizes, sample time, names and ranges, and all repairs."""
     seen, X = split.seen, np.concatenate([e.X for e in split.seen])
     pairs = [("data", split.size), ("step", f"dt = {seen.dt:g} s")]
     V = np.concatenate([np.hstack([e.U, e.W]) for e in seen])

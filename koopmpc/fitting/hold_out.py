@@ -21,7 +21,7 @@ _JUDGED = 10_000  # steps that a report is made of
 
 @dataclass(frozen=True, eq=False)
 class Divided:
-    """What a model is fitted to, and what it is judged by.
+    """The data that a model is fitted to, and the held-out episodes that judge it.
 
     Attributes
     ----------

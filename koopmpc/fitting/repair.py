@@ -1,4 +1,4 @@
-"""What logs bring that no model can use, put right and said: columns that stand still or repeat, wrapped angles."""
+"""Repairs of logs, each reported: columns that stand still or repeat others are dropped, angles are unwrapped."""
 
 import warnings
 from collections.abc import Generator, Iterable
@@ -60,7 +60,7 @@ class Repair:
 
 
 def needed(episodes: Episodes) -> Repair:
-    """Return what these episodes need.
+    """Return the repairs that these episodes need.
 
     Raises
     ------

@@ -1,11 +1,11 @@
-"""The ridge by generalised cross-validation."""
+"""cross_validated: the ridge by generalised cross-validation."""
 
 import numpy as np
 from jaxtyping import Float
 
 _ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
-_NOTHING = 1e-14
-_LARGEST = 1e3  # times σ₁²: beyond it next to nothing is left of K
+_NOTHING = 1e-14  # share of the smallest σ² below which a ridge changes nothing
+_LARGEST = 1e3  # share of σ₁² above which a ridge leaves next to nothing of K
 _POINTS = 300  # of the first grid, about ten a decade
 _ZOOMS = 5  # each ten times finer than the one before
 
@@ -19,8 +19,8 @@ def cross_validated(
 ) -> float:
     """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
 
-    Each target counts relative to its own size, so that units mean nothing. Where P holds all of them to
-    rounding there is no noise, and λ is 0.
+    Each target counts relative to its own size, so that λ does not depend on units. Where P fits all targets to
+    rounding, there is no noise, and λ is 0.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def cross_validated(
     outside
         Energy of each target that P cannot reach.
     samples
-        M.
+        The number M of snapshot pairs.
     cut
         Singular values below cut · σ₁ are rounding.
 

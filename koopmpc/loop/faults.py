@@ -15,7 +15,7 @@ from koopmpc.errors import DataError
 
 
 class Wiring(NamedTuple):
-    """What a fault may know of the loop that it breaks: the number of measurements, and the input limits."""
+    """The facts of the loop that a fault may use: the number of measurements, and the input limits."""
 
     ny: int
     inputs: Interval
@@ -94,7 +94,7 @@ class Injections(Injection):
         return got
 
     def solver_fails(self, k: int) -> bool:
-        """Return whether any fault makes the solver fail; each is asked, so that each draws its own numbers."""
+        """Return True where any fault makes the solver fail; all are asked, so that each draws its own numbers."""
         failing = [part.solver_fails(k) for part in self._parts]
         return any(failing)
 
@@ -266,7 +266,7 @@ class SolverFailure(_Windowed):
     probability: float
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
-        """Return which steps of one run lose the solver's answer."""
+        """Return for each step of one run whether the solver's answer is lost."""
         return Injection(solver_fails=lambda k: rng.random() < self.probability and self._at(k))
 
 

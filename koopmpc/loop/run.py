@@ -131,7 +131,7 @@ _OF_STATES = ("X", "Y", "reference")  # the columns with a row for each state; t
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class About(Value):
-    """What does not change from step to step of a closed loop.
+    """The data of a closed loop that do not change from step to step.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""Published results, reproduced."""
+"""Papers whose published results `koopmpc reproduce` computes anew, one folder each."""

@@ -27,7 +27,7 @@ _STEADY = 1e-4  # an eigenfunction with |λ − 1| below it is a constant
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction(Value):
-    """How well z⁺ = A z with z = ψ(x) rebuilds a trajectory from its first state, x(t) = Re Φ exp(Ωt) b.
+    """The error of rebuilding a trajectory from its first state by z⁺ = A z, z = ψ(x): x(t) = Re Φ exp(Ωt) b.
 
     Attributes
     ----------

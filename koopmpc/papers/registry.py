@@ -18,7 +18,7 @@ from koopmpc.errors import ProblemError
 
 
 class Verdict(Enum):
-    """How a claim fares against our measurements."""
+    """The verdict of our measurements on a claim."""
 
     HOLDS = "holds"
     IN_PART = "holds in part"

@@ -1,4 +1,4 @@
-"""What all lifted predictors share: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, and the report of their fit."""
+"""The base of all lifted predictors: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, and the report of the fit."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +21,7 @@ _DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are depe
 
 @dataclass(frozen=True, eq=False)
 class FitReport(Value):
-    """How z⁺ = A z + B u was fitted, and how far the fit can be trusted.
+    """The report of a fit of z⁺ = A z + B u: method, conditioning, residuals and doubts.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the spectrum of a predictor says: Ω = log Λ / dt, b = Φ⁺ψ(x₀), x(t) = Re Φ exp(Ωt) b, φ(x⁺) = λ φ(x).
+"""Functions of the spectrum of a predictor: Ω = log Λ / dt, b = Φ⁺ψ(x₀), x(t) = Re Φ exp(Ωt) b, φ(x⁺) = λ φ(x).
 
 References
 ----------

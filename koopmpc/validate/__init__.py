@@ -1,4 +1,4 @@
-"""Whether a model is good, and where: `km.validate`."""
+"""Checks of a model on held-out episodes, and of the data that it was fitted to: `km.validate`."""
 
 from typing import TYPE_CHECKING
 

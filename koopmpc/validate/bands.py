@@ -21,7 +21,7 @@ _NORMAL = 1.959964  # two-sided 95 % of a normal law
 
 @dataclass(frozen=True, eq=False)
 class Covered(Value):
-    """How many forecasts lay in a band at all of their steps.
+    """The number of forecasts that lay in a band at all of their steps.
 
     Attributes
     ----------
@@ -269,7 +269,7 @@ def forecast(
 
 
 def _offsets(bands: Bands | None, steps: int, nx: int, relift: bool) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return how far the band reaches below and above the prediction, in rows h = 0 … steps, and what the band is."""
+    """Return the widths of the band below and above the prediction, in rows h = 0 … steps, and the name of the band."""
     if bands is None:
         return np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx)), ""
     if isinstance(bands, ConformalBand):

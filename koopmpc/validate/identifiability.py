@@ -1,4 +1,4 @@
-"""What the inputs of the data allow to be told apart: persistency of excitation, and feedback."""
+"""Identifiability of A and B from the inputs of the data: persistency of excitation, and feedback."""
 
 from dataclasses import dataclass
 
@@ -123,7 +123,7 @@ def feedback_share(
 
 
 def explained_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
-    """Return what `feedback_share` returns, from the moments, in the order of their inputs."""
+    """Return the shares of `feedback_share` from the moments, in the order of their inputs."""
     P, _, cut = both_sides(total)
     nz, nu = total.nz, len(total.inputs)
     one = total.lifting.constant_index

@@ -1,4 +1,4 @@
-"""Which part of the state and input space the data saw."""
+"""Coverage: the part of the state and input space that the data visited."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ _PAIRED = 40  # coordinates up to which pairs are looked at
 
 @dataclass(frozen=True, eq=False)
 class Coverage(Value):
-    """Where the samples (x_k, u_k) of a data set lay, in bins of each coordinate and of each pair.
+    """The regions of the samples (x_k, u_k) of a data set, in bins of each coordinate and of each pair.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class Coverage(Value):
         return empty_regions(self.names, self.low, self.high, self.pairs > 0)
 
     def share(self, x: ArrayLike, u: ArrayLike | None = None) -> Float[np.ndarray, "..."]:
-        """Return which share of the coordinates and pairs of (x, u) lies in cells that the data saw, 0 … 1.
+        """Return the share, 0 … 1, of the coordinates and pairs of (x, u) that lie in cells that the data visited.
 
         Parameters
         ----------
@@ -171,7 +171,7 @@ class Coverage(Value):
         return result.reshape(()) if single else result
 
     def seen(self, x: ArrayLike, u: ArrayLike | None = None) -> Bool[np.ndarray, "..."]:
-        """Return whether each coordinate and each pair of (x, u) lies in a cell that the data saw.
+        """Return True for each coordinate and each pair of (x, u) that lies in a cell that the data visited.
 
         True for every sample of the data; false outside their range. For use in a closed loop: a state that was
         never seen is one where the model extrapolates.
@@ -207,7 +207,7 @@ def coverage(
     high: ArrayLike | None = None,
     bins: int | None = None,
 ) -> Coverage:
-    """Return where the samples (x_k, u_k), k < T, of these episodes lie.
+    """Return the regions in which the samples (x_k, u_k), k < T, of these episodes lie.
 
     Parameters
     ----------

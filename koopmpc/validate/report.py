@@ -1,4 +1,4 @@
-"""Whether to trust a predictor: all checks on held-out episodes in one call, and the report of them."""
+"""trust: all checks of a predictor on held-out episodes in one call, and their report."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,19 +28,19 @@ _REGIONS = 3  # empty regions that are named
 
 @dataclass(frozen=True, eq=False)
 class TrustReport(Evidence):
-    """What a predictor does on episodes that it was not fitted to; `print` shows it, the verdict first.
+    """All checks of a predictor on episodes that it was not fitted to; `print` shows them, the verdict first.
 
     Its attributes are those of `Evidence`.
     """
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the predictor, the gravest first; empty where nothing does."""
+        """Findings against the predictor, the gravest first; empty where there are none."""
         return findings(self)
 
     @property
     def trusted(self) -> bool:
-        """Whether the predictor can be trusted over the whole horizon; `findings` may still ask for care."""
+        """True where the predictor can be trusted over the whole horizon; `findings` may still ask for care."""
         return self.steps == self.score.horizon
 
     def __str__(self) -> str:

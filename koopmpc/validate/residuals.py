@@ -1,4 +1,4 @@
-"""What one step leaves unexplained: the residual of each eigenpair, and the invariance of the dictionary.
+"""Residuals of one step: of each eigenpair, and of the invariance of the dictionary.
 
 Both are read from the second moments of the rows [ψ(x) u ψ(x⁺)], so that a pass over the data serves all of them.
 """
@@ -67,7 +67,7 @@ def moments_of(
 
 @dataclass(frozen=True, eq=False)
 class ResidualDMD(Value):
-    """How far each eigenfunction of a predictor is from one of the Koopman operator.
+    """The distance of each eigenfunction of a predictor from one of the Koopman operator.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ def residual_dmd(predictor: AnyPredictor, episodes: Episodes | Source, *, tolera
 
 
 def eigen_residuals(predictor: AnyPredictor, total: Moments, tolerance: float = TOLERANCE) -> ResidualDMD:
-    """Return what `residual_dmd` returns, from the moments in the predictor's own lifting."""
+    """Return the result of `residual_dmd` from the moments in the predictor's own lifting."""
     values, V = eigen(np.ascontiguousarray(predictor.A.T))
     P, T, _ = both_sides(total)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -186,7 +186,7 @@ def eigenpairs(predictor: AnyPredictor, residuals: "ResidualDMD | ArrayLike") ->
 
 @dataclass(frozen=True, eq=False)
 class Invariance(Value):
-    """How far span ψ is from being mapped into itself, by the data.
+    """The distance of span ψ from invariance, by the data.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ def invariance(
 
 
 def proximity_of(total: Moments) -> Invariance:
-    """Return what `invariance` returns, from the moments; Gram sums resolve it to 1e-8 times the condition number."""
+    """Return the result of `invariance` from the moments; Gram sums resolve it to 1e-8 times the condition number."""
     P, T, cut = both_sides(total)
     known = orthonormal(P, cut)
     size = norms(T)

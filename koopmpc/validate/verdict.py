@@ -20,7 +20,7 @@ SMALL = 0.05  # share up to which it need not beat x̂ = x_k
 
 @dataclass(frozen=True, eq=False)
 class Evidence(Value):
-    """What a predictor does on episodes that it was not fitted to.
+    """The results of all checks of a predictor on episodes that it was not fitted to.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Evidence(Value):
 
     @property
     def steps(self) -> int:
-        """How many steps ahead all states can be trusted."""
+        """The number of steps ahead for which all states can be trusted."""
         return int(self.usable.min())
 
 
@@ -117,7 +117,7 @@ class Finding(Value):
 
 
 def findings(evidence: Evidence) -> tuple[Finding, ...]:
-    """Return what speaks against the predictor, the gravest first."""
+    """Return the findings against the predictor, the gravest first."""
     checks = (_errors, _spectrum, _dictionary, _fit, _inputs, _band, _closed_loop)
     found = [finding for check in checks for finding in check(evidence)]
     return tuple(sorted(found, key=lambda finding: not finding.grave))

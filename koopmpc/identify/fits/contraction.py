@@ -38,9 +38,9 @@ def clipped(A: Float[np.ndarray, "n n"], radius: float) -> Float[np.ndarray, "n 
     size = np.abs(values)
     if np.linalg.cond(V) < 1e8:
         kept = np.where(size > radius, values * radius / np.where(size > 0, size, 1.0), values)
-        found = np.ascontiguousarray(((V * kept) @ np.linalg.inv(V)).real)
-        if radius_of(found) <= radius * (1 + 1e-9):
-            return found
+        moved = np.ascontiguousarray(((V * kept) @ np.linalg.inv(V)).real)
+        if radius_of(moved) <= radius * (1 + 1e-9):
+            return moved
     return A * (radius / size.max())
 
 

@@ -121,8 +121,8 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         rows: Any = validate_data(self, X, reset=False, dtype=np.float64)
         nx = rows.shape[1] - self.n_inputs
-        found = np.hstack([self.lifting_(rows[:, :nx]), rows[:, nx:]]) @ self.coef_.T
-        return found[:, 0] if self._flat else found
+        targets = np.hstack([self.lifting_(rows[:, :nx]), rows[:, nx:]]) @ self.coef_.T
+        return targets[:, 0] if self._flat else targets
 
     def __sklearn_tags__(self) -> Any:
         """Tell scikit-learn that y may have several columns."""
@@ -133,12 +133,12 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
     def _lifting(self) -> Lifting:
         if self.lifting is not None:
             return lifting_of(self.lifting)
-        found: Lifting = State() + Constant()
+        lifting: Lifting = State() + Constant()
         if checks.count(self.degree, "degree") > 1:
-            found = found + Monomials(self.degree)
+            lifting = lifting + Monomials(self.degree)
         if checks.count(self.harmonics, "harmonics", 0):
-            found = found + Fourier(self.harmonics)
-        return found
+            lifting = lifting + Fourier(self.harmonics)
+        return lifting
 
     @staticmethod
     def _solved(P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:

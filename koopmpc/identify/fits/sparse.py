@@ -118,7 +118,7 @@ def sparse_edmd(
         "observables" (group LASSO: few columns of A) or "entries" (LASSO: few numbers in A and B).
     adaptive
         Weigh each coefficient by 1 / |its value in a ridge fit|, the ridge by generalised cross-validation. Large
-        coefficients are then hardly shrunk, and with enough data the true set is found. False: all weights are 1.
+        coefficients are then hardly shrunk, and with enough data the true set is solution. False: all weights are 1.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
@@ -199,11 +199,11 @@ def _closed(
             plain = np.sqrt(np.sum(plain**2, axis=1, keepdims=True)) * np.ones_like(plain)
         weights = penalty / np.maximum(plain, 1e-12) if adaptive else np.full_like(plain, penalty)
         own = P[:, rated] - onto(P[:, ~rated], P[:, rated])
-        found = lasso(own.T @ own, own.T @ T[:, targets], weights, grouped=not entries)
-        worst = max(worst, found.missed)
+        solution = lasso(own.T @ own, own.T @ T[:, targets], weights, grouped=not entries)
+        worst = max(worst, solution.missed)
         used = np.zeros((P.shape[1], nz), dtype=bool)
         used[np.ix_(~rated, kept)] = True
-        used[np.ix_(rated, kept)] = found.K != 0
+        used[np.ix_(rated, kept)] = solution.K != 0
         more = used[:nz].any(axis=1) & ~kept
         if not more.any():
             return used, worst

@@ -134,10 +134,10 @@ def _stabilised(
         return Misfit(K[np.ix_(moving, moving)].T * scale, free.T @ free)
 
     asked = misfit(K, ridge)
-    found = [_nearest(asked, rho)]
+    candidates = [_nearest(asked, rho)]
     if ridge < _HELP and np.linalg.cond(asked.G) > 1 / _HELP:  # too steep a valley for the descent
-        found.append(_nearest(misfit(solve(rows, ridge=_HELP).K, _HELP), rho))
-    choices = [_refitted(rows, K, moving, A / scale, rho, ridge) for A in found]
+        candidates.append(_nearest(misfit(solve(rows, ridge=_HELP).K, _HELP), rho))
+    choices = [_refitted(rows, K, moving, A / scale, rho, ridge) for A in candidates]
     return min(choices, key=lambda K: relative_misfit(rows, K))
 
 
@@ -160,10 +160,10 @@ def _refitted(
 ) -> Float[np.ndarray, "n nz"]:
     """Return K with A as the block of the `moving` observables; the coefficients of the others are fitted to it."""
     others = np.setdiff1d(np.arange(len(K)), moving)
-    found = K.copy()
-    found[np.ix_(moving, moving)] = inside(A, rho).T
+    fitted = K.copy()
+    fitted[np.ix_(moving, moving)] = inside(A, rho).T
     if len(others):
-        known = rows.P[:, moving] @ found[np.ix_(moving, moving)]
+        known = rows.P[:, moving] @ fitted[np.ix_(moving, moving)]
         rest = RegressionRows(rows.P[:, others], rows.T[:, moving] - known, rows.rest[moving], rows.samples)
-        found[np.ix_(others, moving)] = solve(rest, ridge=ridge).K
-    return found
+        fitted[np.ix_(others, moving)] = solve(rest, ridge=ridge).K
+    return fitted

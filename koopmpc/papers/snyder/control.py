@@ -66,7 +66,7 @@ In the shift of the cart-pole, which stays within 0.04 rad of upright, all model
 
 
 def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, Prediction]:
-    """Return how well models predict that were fitted to one trajectory under feedback, or to exciting data.
+    """Return the prediction errors of models fitted to one trajectory under feedback, or to exciting data.
 
     Inputs are held over a sample, and the coordinates are x − x_ref.
 

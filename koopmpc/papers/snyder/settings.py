@@ -111,7 +111,7 @@ def gains() -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Shaking:
-    """How a plant is excited for data: episodes start in x ± spread, and uniform noise of ± `noise` is added to u."""
+    """Excitation of a plant for data: episodes start in x ± spread, and uniform noise of ± `noise` is added to u."""
 
     spread: Sequence[float]
     noise: float
@@ -125,7 +125,7 @@ SHAKINGS: Mapping[str, Shaking] = {
 
 @dataclass(frozen=True)
 class ControlTask:
-    """What a controller has to do, and how the plant is excited for the data of its model.
+    """The task of a controller, and the excitation of the plant for the data of its model.
 
     Attributes
     ----------
