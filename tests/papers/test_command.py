@@ -47,7 +47,7 @@ def test_energy_bounds_the_cost_of_the_hanging_pendulum_from_below():
     def value(x):  # V = 2√10 E solves min over u of 10 ω² + u² + ∇V·f(x, u) = 0
         return 2 * np.sqrt(10) * (2 * x[1] ** 2 + 19.62 * (1 - np.cos(x[0])))
 
-    task = contest("pendulum, hanging, π/4", 40, 12, episodes=20)
+    task = contest("pendulum, hanging, π/4", 40, 20, episodes=20)  # horizon and tail see most of a swing
     task = replace(task, models={"Fourier 1": task.models["Fourier 1"]})
     runs = task.runs()
     free, limited = costs(runs, False), costs(runs, True)
