@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -17,6 +17,8 @@ from koopmpc.lifting.base import Lifting, short
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
+PROCESS, DRIFT, NOISE = 1e-4, 1.0, 1e-4  # default variances, in the model's units
+LEAST = 1e-8  # the same of a noise that a fit without residual leaves
 TOLERANCE = 1e-6  # singular values below this share of the largest, or of |λ|; |λ| as near to 1 does not die out
 
 
@@ -66,7 +68,10 @@ class LiftedKalman(Value):
     process, drift, noise
         Covariances of a step of z (without the Constant), of a step of d, and of y; a scalar or a vector is a
         diagonal. Only their ratios matter. More `drift` learns disturbances faster, more `noise` trusts y less, and
-        much `process` gives misfits to slow modes of z, which then return slowly.
+        much `process` gives misfits to slow modes of z, which then return slowly. By default standard deviations of
+        0.01, 1 and 0.01, in units of the model: of the root mean squares of its lifted data, a disturbance of an input
+        in that which moves z by as much in one step. An output that is a state of a fitted model has the noise of the
+        fit's residuals. A model that was given has units of one.
     delay
         y is `delay` steps old; what followed is predicted from the inputs that acted since.
     patience
@@ -87,9 +92,9 @@ class LiftedKalman(Value):
 
     outputs: str | Sequence[str] | ArrayLike
     disturbance: Literal["input", "output"] = "input"
-    process: ArrayLike = 1e-4
-    drift: ArrayLike = 1.0
-    noise: ArrayLike = 1e-4
+    process: ArrayLike | None = None
+    drift: ArrayLike | None = None
+    noise: ArrayLike | None = None
     delay: int = 0
     patience: int = 10
 
@@ -104,6 +109,8 @@ class LiftedKalman(Value):
         if self.disturbance not in ("input", "output"):
             raise DataError(f'disturbance is {self.disturbance!r}; pass "input" or "output"')
         for name in ("process", "drift", "noise"):
+            if getattr(self, name) is None:
+                continue
             stored = checks.array(getattr(self, name), name)
             checks.weight(stored, name, definite=True)
             object.__setattr__(self, name, stored)
@@ -146,13 +153,19 @@ class LiftedKalman(Value):
             Bd, Cd = np.hstack([predictor.B, np.zeros((nz, ny - nu))]), np.eye(ny, ny)
             Cd[:nu] = 0.0
         model = Augmented(predictor, kept, H, Bd, Cd)
-        lost = hidden(model.F, model.M)
+        size, y_size = _sizes(predictor, kept, H, Cd)
+        F, M = model.F * size / size[:, None], model.M * size / y_size[:, None]
+        lost = hidden(F, M)
         if lost is not None:
             raise DataError(self._words(predictor, model, lost))
-        n = len(kept)
-        Q = scipy.linalg.block_diag(checks.weight(self.process, "process", n), checks.weight(self.drift, "drift", ny))
-        R = checks.weight(self.noise, "noise", ny)
-        return FilterModel(model, _stationary(model.F, model.M, Q, R), R)
+        n, units = len(kept), np.outer(size, size)
+        Q = scipy.linalg.block_diag(
+            PROCESS * np.diag(size[:n] ** 2) if self.process is None else checks.weight(self.process, "process", n),
+            DRIFT * np.diag(size[n:] ** 2) if self.drift is None else checks.weight(self.drift, "drift", ny),
+        )
+        R = np.diag(_noise(predictor, H, y_size)) if self.noise is None else checks.weight(self.noise, "noise", ny)
+        P = _stationary(F, M, Q / units, R / np.outer(y_size, y_size))
+        return FilterModel(model, P * units, R)
 
     def _matrix(self, predictor: LinearPredictor) -> Float[np.ndarray, "ny nz"]:
         if isinstance(self.outputs, tuple):
@@ -181,6 +194,39 @@ class LiftedKalman(Value):
             f"not detectable from {', '.join(str(name) for name in outputs)}: with λ = {written}, {moved} can move "
             f"without a trace in y; measure one of them, drop it from the lifting, or use disturbance={other!r}"
         )
+
+
+def _sizes(
+    predictor: LinearPredictor,
+    kept: Int[np.ndarray, " n"],
+    H: Float[np.ndarray, "ny nz"],
+    Cd: Float[np.ndarray, "ny nd"],
+) -> tuple[Float[np.ndarray, " nzd"], Float[np.ndarray, " ny"]]:
+    """Return the units of [z; d] and of y: root mean squares of the data that a model was fitted to, or ones."""
+    ny = len(H)
+    if predictor.scale is None:
+        return np.ones(len(kept) + ny), np.ones(ny)
+    z = np.linalg.norm(predictor.scale, axis=0)[kept]
+    y = np.linalg.norm(predictor.scale @ H.T, axis=0)
+    d = y.copy()  # an offset has the unit of its output
+    for i in np.flatnonzero(~Cd.any(axis=0)):
+        moved = float(np.linalg.norm(predictor.B[kept, i] / z))
+        d[i] = 1.0 / moved if moved > 0 else 1.0
+    return np.concatenate([z, d]), y
+
+
+def _noise(
+    predictor: LinearPredictor, H: Float[np.ndarray, "ny nz"], size: Float[np.ndarray, " ny"]
+) -> Float[np.ndarray, " ny"]:
+    """Return the variances of y: the fit's residuals where an output is a state, else a share of its size."""
+    variance = NOISE * size**2
+    if predictor.report is not None and predictor.scale is not None:
+        residual = predictor.report.residual
+        for i, row in enumerate(H):
+            found = np.flatnonzero((row == predictor.C).all(axis=1))
+            if len(found):
+                variance[i] = max(float(residual[found[0]]) ** 2, LEAST * size[i] ** 2)
+    return variance
 
 
 def _stationary(

@@ -269,3 +269,36 @@ def test_names_with_and_without_units_and_a_matrix_are_the_same():
     for other in seen[1:]:
         np.testing.assert_array_equal(seen[0], other)
     assert km.LiftedKalman("x1") == km.LiftedKalman(["x1"])
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=3, max_size=3))
+def test_units_do_not_decide_where_the_model_was_learned(seed, powers):
+    """x′ = S x and u′ = s u in the data and in the loop give z′ = S z and d′ = S d."""
+    rng = np.random.default_rng(seed)
+    A, B = stable(rng, 2, 1)
+    s, S = 10.0 ** powers[2], 10.0 ** np.array(powers[:2])
+    X, U = [rng.normal(size=2)], rng.normal(size=(200, 1))
+    for u in U:
+        X.append(A @ X[-1] + B @ u + [0.3, -0.2] + 1e-2 * rng.normal(size=2))
+    Y, V, found = rng.normal(size=(60, 1)), rng.normal(size=(60, 1)), []
+    for size, by in ((np.ones(2), 1.0), (S, s)):
+        data = km.Episodes([km.Episode(X=np.array(X) * size, U=U * by)], 0.1, ("x0 [m]", "x1 [m]"), ("u0 [N]",))
+        model = km.edmd(data, km.State() + km.Constant())
+        observer = km.LiftedKalman("x0").start(model, 20)
+        for y, u in zip(Y * size[0], V * by, strict=True):
+            observer.observe(y, u, NO_W)
+        found.append((observer.z[:2] / size, observer.d[:2] / size))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4, atol=1e-6 * np.abs(found[0]).max())
+
+
+def test_a_disturbance_that_cannot_be_seen_is_told_in_any_units():
+    """An offset of y is the integrator's own position, whether in metres or in micrometres."""
+    rng = np.random.default_rng(0)
+    X, U = np.zeros((201, 2)), rng.normal(size=(200, 1))
+    for k, u in enumerate(U):
+        X[k + 1] = [[1.0, 0.1], [0.0, 0.8]] @ X[k] + [0.0, 0.1] * u
+    for size in (1e-6, 1.0, 1e6):
+        data = km.Episodes([km.Episode(X=X * [size, 1.0], U=U)], 0.1, ("x0 [m]", "x1 [m]"), ("u0 [N]",))
+        with pytest.raises(km.errors.DataError, match=r"not detectable from x0: .*an offset of output 'x0'"):
+            km.LiftedKalman("x0", "output").start(km.dmdc(data), 20)
