@@ -83,7 +83,8 @@ def _resting(
     """Return p = b + Φᵀb + (Φᵀ)²b + …, by doubling until Bᵀp rests: the part that no input sees may go on growing."""
     p, power = b, Phi.T
     for _ in range(int(np.log2(ITERATIONS)) + 1):
-        new = power @ p
+        with np.errstate(over="ignore", invalid="ignore"):
+            new = power @ p
         if not np.isfinite(new).all():
             break
         p, power = p + new, power @ power

@@ -7,6 +7,7 @@ from rich.console import RenderableType
 
 from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
+from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.cross_validation import EXACT, Tried
 from koopmpc.validate.scoring import AnyPredictor
@@ -178,7 +179,7 @@ def row_of(trial: Tried, floor: float) -> LeaderboardRow:
         median=float(np.median(scores)),
         worst=float(scores.max()),
         deviation=float(deviation) if np.isfinite(deviation) else 0.0,
-        radius=float(np.abs(np.linalg.eigvals(trial.A[best])).max()),
+        radius=float(np.abs(eigen(trial.A[best])[0][0])),
         seconds=trial.seconds,
         lifting=candidate.lifting,
         embedding=candidate.embedding,

@@ -32,7 +32,7 @@ class Terminal(NamedTuple):
 def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, targets: Targets) -> Terminal:
     """Return the terminal cost that `cost` asks for.
 
-    The default tail of a model with a fit report is as long as the horizon. Small errors of such a model grow in many
+    The default tail of a model with a fit report or a scale is as long as the horizon. Its small errors grow in many
     tail steps to eigenvalues beyond 1 that rule the plan.
 
     Raises
@@ -45,7 +45,7 @@ def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, target
     h, signals = horizon, horizon.signals
     D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
     steps = cost.tail
-    if steps is None and predictor.report is not None:
+    if steps is None and not (predictor.report is None and predictor.scale is None):
         steps = h.N
     tail = tail_of(tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), steps)
     n, nr = len(tail.P), len(h.C)
