@@ -1,4 +1,4 @@
-"""Problems, the seven controllers that are compared on them, and the results."""
+"""Problems, the eight controllers that are compared on them, and the results."""
 
 from typing import TYPE_CHECKING
 

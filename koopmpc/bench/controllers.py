@@ -1,4 +1,4 @@
-"""The seven controllers of the bench, and what they share of one problem: step map, plant, data and models."""
+"""The eight controllers of the bench, and what they share of one problem: step map, plant, data and models."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -152,6 +152,12 @@ def _bilinear_mpc(parts: Prepared, limits: Limits) -> Controller:
     return BilinearMPC(parts.bilinear, parts.problem.cost, limits, parts.problem.horizon)
 
 
+def _bilinear_offset(parts: Prepared, limits: Limits) -> Controller:
+    """The same on the bilinear predictor, with an estimated disturbance of every state."""
+    problem = parts.problem
+    return BilinearMPC(parts.bilinear, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
+
+
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
     """MPC on the model itself, the best of twelve initial guesses: the oracle where the model is the plant."""
     return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
@@ -164,14 +170,15 @@ CONTROLLERS: dict[str, Build] = {
     "koopman-mpc": _koopman_mpc,
     "offset-free": _offset_free,
     "bilinear-mpc": _bilinear_mpc,
+    "bilinear-offset": _bilinear_offset,
     "nonlinear-mpc": _nonlinear_mpc,
 }
 
-LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc")
+LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset")
 
 
 def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the names as a tuple, by default all seven.
+    """Return the names as a tuple, by default all eight.
 
     Raises
     ------

@@ -65,8 +65,8 @@ def sweep(
     problems
         The problems; `load_problem("cart_pole:recover")` holds one case alone.
     controllers
-        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc and nonlinear-mpc; by default
-        the controllers that each problem names, which are all seven where it names none.
+        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc, bilinear-offset and
+        nonlinear-mpc; by default the controllers that each problem names, which are all eight where it names none.
     folder
         Receives <problem>-<case>-<controller>.rrd for each run, and results.parquet; it is made where it is missing.
     faults

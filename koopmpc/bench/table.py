@@ -27,18 +27,19 @@ def plain_table(title: str, **settings: Any) -> Table:
 
 
 def _under_faults(title: str, rows: Sequence[RunRow]) -> Table:
-    """Return a table of the runs of one case with a line for each fault, relative to the runs without faults."""
+    """Return a table of the runs of one case with a line for each controller, relative to its run without faults."""
     whole = {row.controller: row for row in rows if row.fault is None}
     found = {(row.fault, row.controller): row for row in rows if row.fault is not None}
     # Without padding the box still has a blank between columns.
     lines = plain_table(title, min_width=len(title), padding=0, show_edge=False)
-    lines.add_column("fault", no_wrap=True)
-    for controller in whole:
-        lines.add_column(controller.replace("-", "\n"), justify="right", no_wrap=True)
-    for fault in dict.fromkeys(fault for fault, _ in found):
-        cells = [_cell(found[fault, name], whole[name]) for name in whole]
-        failed = any(found[fault, name].failure for name in whole)
-        lines.add_row(fault, *cells, style="red" if failed else None)
+    faults = list(dict.fromkeys(fault for fault, _ in found))
+    lines.add_column("controller", no_wrap=True)
+    for fault in faults:
+        lines.add_column(str(fault).replace("-", "\n"), justify="right", no_wrap=True)
+    for name, own in whole.items():
+        cells = [_cell(found[fault, name], own) for fault in faults]
+        failed = any(found[fault, name].failure for fault in faults)
+        lines.add_row(name, *cells, style="red" if failed else None)
     return lines
 
 

@@ -28,7 +28,7 @@ Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this cal
 Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
 LogFiles = Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]
 Controllers = Annotated[
-    list[str] | None, typer.Option("--controller", "-c", help="One of the seven; may be repeated. Default: all.")
+    list[str] | None, typer.Option("--controller", "-c", help="One of the eight; may be repeated. Default: all.")
 ]
 
 
@@ -88,7 +88,7 @@ def bench(
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
-    """Compare the seven controllers on several problems."""
+    """Compare the eight controllers on several problems."""
     from koopmpc.bench.library import load_problem, shipped
 
     with _friendly():

@@ -49,6 +49,6 @@ def test_only_the_estimator_leaves_no_offset_where_nobody_was_told_of_the_load(r
 
 
 @pytest.mark.slow
-def test_all_seven_controllers_end_as_they_should_on_all_cases(tmp_path):
+def test_all_eight_controllers_end_as_they_should_on_all_cases(tmp_path):
     swept = km.sweep([km.load_problem(path) for path in km.bench.shipped()], folder=tmp_path)
     assert [row.failure for row in swept if row.failure] == []

@@ -12,7 +12,16 @@ from koopmpc.bench.results import failures
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
 
-SEVEN = ["lqr", "koopman-lqr", "linear-mpc", "koopman-mpc", "offset-free", "bilinear-mpc", "nonlinear-mpc"]
+EIGHT = [
+    "lqr",
+    "koopman-lqr",
+    "linear-mpc",
+    "koopman-mpc",
+    "offset-free",
+    "bilinear-mpc",
+    "bilinear-offset",
+    "nonlinear-mpc",
+]
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +36,15 @@ def swept(tmp_path_factory):
 def test_every_controller_meets_every_case_once(swept):
     _, rows, _, told = swept
     assert [(r.problem, r.case, r.controller) for r in rows] == [
-        ("tiny", case, name) for case in ("near", "far") for name in SEVEN
+        ("tiny", case, name) for case in ("near", "far") for name in EIGHT
     ]
-    assert [done for _, done, _ in told] == list(range(15))
-    assert {total for *_, total in told} == {14}
+    assert [done for _, done, _ in told] == list(range(17))
+    assert {total for *_, total in told} == {16}
 
 
 def test_all_end_as_they_should_and_the_short_case_is_no_failure(swept):
     _, rows, _, _ = swept
-    assert [row.failure for row in rows] == [None] * 14
+    assert [row.failure for row in rows] == [None] * 16
     assert all(row.reached for row in rows if row.case == "near")
     assert not any(row.reached for row in rows if row.case == "far")  # 6 steps are too few: a result, not a failure
 
@@ -129,6 +138,7 @@ def test_a_model_that_cannot_be_learned_takes_only_its_own_controllers(tmp_path)
         "koopman-mpc",
         "offset-free",
         "bilinear-mpc",
+        "bilinear-offset",
     ]
 
 
@@ -279,7 +289,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(km.bench.CONTROLLERS) == SEVEN
+    assert list(km.bench.CONTROLLERS) == EIGHT
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
@@ -300,7 +310,7 @@ def faulty(swept, tmp_path_factory):
 def test_every_controller_meets_every_fault_on_every_case_and_ends_as_it_should(faulty):
     rows, folder = faulty
     assert [(r.case, r.fault, r.controller) for r in rows] == [
-        (case, fault, name) for case in ("near", "far") for fault in (None, *km.bench.FAULTS) for name in SEVEN
+        (case, fault, name) for case in ("near", "far") for fault in (None, *km.bench.FAULTS) for name in EIGHT
     ]
     assert [row.failure for row in rows] == [None] * len(rows)
     assert len({row.log for row in rows}) == len(rows)
