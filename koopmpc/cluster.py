@@ -1,4 +1,4 @@
-"""Tasks on a Dask cluster, and what tasks are wherever they are done."""
+"""Tasks on a Dask cluster, and the job that local workers and a cluster share."""
 
 import os
 from collections import deque
@@ -37,7 +37,7 @@ class Job(Generic[Task]):
 
 
 def died(job: str, how: str) -> str:
-    """Return what to tell of a job that each of its workers died of."""
+    """Return the message for a job that killed each of its workers."""
     return (
         f"{job}: each worker that did it died ({how}); run it with workers=1 to see why, "
         "or give the workers more memory"

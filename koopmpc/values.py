@@ -64,7 +64,7 @@ class Value:
 
 
 class Named:
-    """What has named states and inputs, and so knows how many there are."""
+    """Base of classes with named states and inputs, which count them."""
 
     @property
     def nx(self) -> int:
@@ -84,7 +84,7 @@ def freeze(value: object, **fields: object) -> None:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Return whether two trees of values are equal to the bit."""
+    """Return True where two trees of values are equal to the bit."""
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         x, y = cast("Array", a), cast("Array", b)
         return bool(x.dtype == y.dtype) and x.shape == y.shape and x.tobytes() == y.tobytes()
@@ -199,7 +199,7 @@ def _hints(cls: type[Value]) -> dict[str, Any]:
 
 @no_type_check  # a check of its own would open a new context, in which no letter has its size yet
 def _is_a(value: Any, hint: Any) -> bool:
-    """Return whether `value` is of the type that `hint` declares; an int passes for a float.
+    """Return True where `value` is of the type that `hint` declares; an int passes for a float.
 
     Types that stand in no file, such as callables and numpy's ArrayLike, are left to the constructors.
     """

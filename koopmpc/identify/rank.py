@@ -53,7 +53,7 @@ def leading(rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]) -> 
 
 
 def kept(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple[int, str]:
-    """Return how many singular values of the (samples, nz) snapshots a rank keeps, and the rule in words."""
+    """Return the number of singular values of (samples, nz) snapshots that a rank keeps, and the rule in words."""
     if isinstance(rank, str):
         if rank != "hard-threshold":
             raise DataError(f'rank is {rank!r}; pass a whole number, a share of energy in (0, 1), or "hard-threshold"')

@@ -22,7 +22,7 @@ class Wiring(NamedTuple):
 
 
 class Injection:
-    """What one fault does in one run: functions of the step k in place of these methods, which change nothing.
+    """The effect of one fault in one run: functions of the step k in place of these methods, which change nothing.
 
     Each is called once a step, for k = 0, 1, 2, … in order. Pass functions, or override the methods in a subclass.
     """
@@ -38,20 +38,20 @@ class Injection:
         self.__dict__.update({name: function for name, function in given.items() if function is not None})
 
     def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
-        """Return what the controller gets in place of the measurement y_k; y itself is not written to."""
+        """Return the measurement that the controller gets in place of y_k; y itself is not written to."""
         return y
 
     def applied(self, k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
-        """Return what the plant gets in place of the controller's u_k; u itself is not written to."""
+        """Return the input that the plant gets in place of the controller's u_k; u itself is not written to."""
         return u
 
     def solver_fails(self, k: int) -> bool:
-        """Return whether the controller's solver loses its answer at step k."""
+        """Return True where the controller's solver loses its answer at step k."""
         return False
 
 
 class Fault(ABC):
-    """What breaks in a loop; subclass as a frozen dataclass. A fault holds no state and serves any number of runs."""
+    """A fault in a loop; subclass as a frozen dataclass. A fault holds no state and serves any number of runs."""
 
     @abstractmethod
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
