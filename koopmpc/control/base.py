@@ -206,6 +206,7 @@ class MPCBase:
         self._initial = InitialCondition(
             state_model(model), observer, self._N, self._latency, with_rates=with_rates, estimated=estimated
         )
+        MPCBase.reset(self)
 
     def __copy__(self) -> "MPCBase":
         """Return a copy that shares nothing with this one that moves in a step."""

@@ -12,7 +12,6 @@ from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.observer import constant_index
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -102,7 +101,7 @@ class Targets:
 def targets_of(predictor: LinearPredictor, cost: Cost, tracking: LiftedTracking) -> Targets:
     """Return the equilibria of a predictor under a cost and limits."""
     track, hold = tracking, isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
-    A, B, constant = predictor.A, predictor.B, constant_index(predictor)
+    A, B, constant = predictor.A, predictor.B, predictor.lifting.constant_index
     return targets(A, B, track.tracked, track.Q, track.inputs, track.limited, track.outputs, constant, hold=hold)
 
 

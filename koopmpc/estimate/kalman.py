@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.filtered import Augmented, FilterModel, Kalman
-from koopmpc.estimate.observer import StateModel, constant_index
+from koopmpc.estimate.observer import StateModel
 from koopmpc.lifting.base import Lifting, short
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
@@ -138,7 +138,7 @@ class LiftedKalman(Value):
         """Return the filter's matrices for a predictor, or say why there are none."""
         nz, nu = predictor.nz, predictor.nu
         H = self._matrix(predictor)
-        ny, constant = len(H), constant_index(predictor)
+        ny, constant = len(H), predictor.lifting.constant_index
         kept = np.array([i for i in range(nz) if i != constant], dtype=np.intp)
         if np.linalg.matrix_rank(H[:, kept]) < ny:
             raise DataError("outputs depend on each other (or on the Constant alone); name each one once")

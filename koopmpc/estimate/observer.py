@@ -145,11 +145,6 @@ class Estimator(Protocol):
         ...
 
 
-def constant_index(predictor: LinearPredictor) -> int | None:
-    """Return where the lifting holds the Constant, which is known; None where it does not."""
-    return predictor.lifting.constant_index
-
-
 class History:
     """ζ_k = [x_k, u_{k−1}, x_{k−1}, …] of a run.
 
@@ -304,7 +299,7 @@ class Filtered(Measured):
         """Return where z is known beforehand."""
         if not isinstance(model, LinearPredictor):
             return slice(self.ny, None)
-        known = constant_index(model)
+        known = model.lifting.constant_index
         return slice(0, 0) if known is None else slice(known, known + 1)
 
     def _forget(self) -> None:

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
-from koopmpc.control.linear.horizon import Horizon
-from koopmpc.control.linear.terminal import Terminal
+from koopmpc.control.linear.horizon import Horizon, Terminal
 from koopmpc.control.riccati import Law
 from koopmpc.control.target import Targets
 

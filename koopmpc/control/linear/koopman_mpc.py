@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan_map import PlanMap
@@ -106,29 +106,27 @@ class KoopmanMPC(MPCBase):
             checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
         super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, moves, time_limit)
-        self.predictor = predictor
-        self._disturbed = estimator is not None
+        self.predictor, self._disturbed = predictor, estimator is not None
+        track = lifted_tracking(predictor, self.cost, self.limits)
+        move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
+        self._begin(predictor, track, estimator, with_rates=track.with_rates, move_of=move_of)
         self._map = PlanMap(
             predictor,
             self.cost,
-            self.limits,
+            track,
             self._blocks,
             disturbed=self._disturbed,
             coordinates=self._wanted or COORDINATES[solver],
         )
-        track = self._map.track
         given = settings or {}
         soft = {**SOFT_SETTINGS[solver], **given}
         self._qps = StepSolver(self._map.hard, self._map.soft, SOLVERS[solver], given, soft)
-        move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
-        self._begin(predictor, track, estimator, with_rates=track.with_rates, move_of=move_of)
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
         self._given_row = 0  # of a u_target that is given in rows, for the next call
         self._see()
-        self.reset()
 
     def _see(self) -> None:
         """Make the views of the bytes that say which limits are met; a copy makes its own."""
@@ -175,7 +173,7 @@ class KoopmanMPC(MPCBase):
         self._map = PlanMap(
             predictor,
             self.cost,
-            self.limits,
+            lifted_tracking(predictor, self.cost, self.limits),
             self._blocks,
             disturbed=self._disturbed,
             coordinates="plain" if self.coordinates == "plain" else "riccati",

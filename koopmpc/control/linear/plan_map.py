@@ -3,12 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.cost import Cost, lifted_tracking
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.cost import Cost, LiftedTracking
+from koopmpc.control.limits import Interval
 from koopmpc.control.linear.condense import Coordinates, condense, scaled
-from koopmpc.control.linear.horizon import horizon_of, stages
+from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
 from koopmpc.control.linear.qp import groups, step_qp
-from koopmpc.control.linear.terminal import terminal_of
 from koopmpc.control.riccati import recursion
 from koopmpc.control.target import given_inputs, margin, targets_of
 from koopmpc.lifting.buffered import HUGE
@@ -26,8 +25,10 @@ class PlanMap:
 
     Parameters
     ----------
-    predictor, cost, limits
+    predictor, cost
         As for KoopmanMPC.
+    track
+        What they track and limit.
     blocks
         Lengths of the blocks of held inputs.
     disturbed
@@ -40,13 +41,13 @@ class PlanMap:
         self,
         predictor: LinearPredictor,
         cost: Cost,
-        limits: Limits,
+        track: LiftedTracking,
         blocks: tuple[int, ...],
         *,
         disturbed: bool,
         coordinates: Coordinates,
     ) -> None:
-        self.track = track = lifted_tracking(predictor, cost, limits)
+        self.track = track
         self.targets = found = targets_of(predictor, cost, track)
         given = given_inputs(cost, track.inputs)
         self._given, self.given_rows = given, 0 if given is None else len(given)
