@@ -49,6 +49,8 @@ class Cost(Value):
     tail
         Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
         was fitted to data as long as the horizon, for beyond that the errors of such a model outweigh the rest.
+        BilinearMPC and NonlinearMPC have no tail: without Q_N their end costs the Riccati solution at the equilibrium
+        nearest to r_N.
 
     Raises
     ------

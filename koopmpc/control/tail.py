@@ -13,6 +13,8 @@ from koopmpc.errors import DefinitenessError
 ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or not
 SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
+GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row come out as 1 ± 1e-8, three as 1 ± 1e-5
+APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
 RESTS = 50  # steps for which it must have settled, at most
 LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
 LEAPT = 100.0  # growth of the closed loop over the first steps up to which doubling keeps its digits
@@ -83,10 +85,9 @@ def _resting(
     """Return p = b + Φᵀb + (Φᵀ)²b + …, by doubling until Bᵀp rests: the part that no input sees may go on growing."""
     p, power = b, Phi.T
     for _ in range(int(np.log2(ITERATIONS)) + 1):
-        with np.errstate(over="ignore", invalid="ignore"):
-            new = power @ p
-        if not np.isfinite(new).all():
+        if not np.abs(power).max() < LARGEST:  # the loop is not stable
             break
+        new = power @ p
         p, power = p + new, power @ power
         if np.abs(B.T @ new).max(initial=0.0) <= EXACT * np.abs(B.T @ p).max(initial=0.0):
             break
@@ -106,17 +107,34 @@ def held(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[
     U = scipy.linalg.null_space(V.T) if V.shape[1] else np.eye(len(A))
     if not U.shape[1]:
         return A
-    T, turn, grows = scipy.linalg.schur(U.T @ balanced @ U, output="real", sort="ouc")
-    if not grows:
+    unmoved = U.T @ balanced @ U
+    if np.abs(np.linalg.eigvals(unmoved)).max() <= GROWS:
         return A
-    grown, mixed, rest = T[:grows, :grows], T[:grows, grows:], T[grows:, grows:]
-    X = scipy.linalg.solve_sylvester(grown, -rest, -mixed) if len(rest) else mixed  # T [X; 1] = [X; 1] rest
-    still = grown / _sizes(grown)[:, None]
-    change = np.zeros_like(T)
-    change[:grows, :grows] = still - grown
-    change[:grows, grows:] = X @ rest - still @ X - mixed
-    U = U @ turn
-    return A + size[:, None] * (U @ change @ U.T) / size
+    change = U @ (_stilled(unmoved) - unmoved) @ U.T
+    return A + size[:, None] * change / size
+
+
+def _stilled(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return A with its eigenvalues beyond 1 scaled back to 1, all other modes as they were.
+
+    Where the two groups of modes cannot be told apart by their eigenvectors, the others are no longer pushed as much.
+    """
+    try:
+        T, Z, grows = scipy.linalg.schur(A, output="real", sort=_grows)
+        grown, mixed, rest = T[:grows, :grows], T[:grows, grows:], T[grows:, grows:]
+        X = scipy.linalg.solve_sylvester(grown, -rest, -mixed) if len(rest) else mixed  # T [X; 1] = [X; 1] rest
+    except np.linalg.LinAlgError:  # eigenvalues within rounding of the bound changed sides when they were sorted
+        pass
+    else:
+        if np.abs(X).max(initial=0.0) < APART:
+            still = grown / _sizes(grown)[:, None]
+            return Z @ np.block([[still, X @ rest - still @ X], [np.zeros_like(mixed.T), rest]]) @ Z.T
+    T, Z = scipy.linalg.schur(A, output="real")
+    return Z @ (T / np.maximum(_sizes(T), 1.0)[:, None]) @ Z.T
+
+
+def _grows(real: float, imaginary: float = 0.0) -> bool:
+    return abs(complex(real, imaginary)) > GROWS
 
 
 def _sizes(T: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -229,6 +230,24 @@ def test_only_modes_that_grow_and_that_no_input_moves_are_held(seed, nc, nu, siz
     v = stable.eigenvectors[:, np.abs(stable.eigenvalues - 0.8).argmin()].real
     np.testing.assert_allclose(span @ still @ v, span @ (0.8 * v), atol=1e-6 * np.abs(span @ v).max())
     np.testing.assert_allclose(span @ still @ B, span @ A @ B, atol=1e-6 * np.abs(span @ A @ B).max())
+
+
+@given(seed=SEEDS)
+def test_no_model_makes_the_constructor_raise(seed):
+    """Integrators in a row, defective and turning modes that no input moves, in mixed coordinates."""
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0, np.pi)
+    pair = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    kinds = [np.eye(1), pair, 1.2 * pair, 1.01 * np.eye(1), [[1.0, 1.0], [0.0, 1.0]], [[1.1, 1.0], [0.0, 1.1]]]
+    free = scipy.linalg.block_diag(*(kinds[i] for i in rng.integers(0, 6, size=rng.integers(1, 5))))
+    A, B = random_pair(rng, int(rng.integers(1, 5)), int(rng.integers(1, 3)), radius=rng.uniform(0.5, 1.3))
+    n, m, nu = len(A), len(free), B.shape[1]
+    T = np.linalg.qr(rng.normal(size=(n + m, n + m)))[0]
+    whole = T @ np.block([[A, 0.3 * rng.normal(size=(n, m))], [np.zeros((m, n)), free]]) @ T.T
+    model = linear(whole, T @ np.vstack([B, np.zeros((m, nu))]), constant=rng.normal(size=n + m))
+    cost = km.Cost(rng.uniform(0.1, 2, n + m), 0.3, R_delta=[None, 0.3][seed % 2], tail=[None, 30][seed // 2 % 2])
+    for controller in (km.KoopmanMPC(model, cost, km.Limits(-1, 1), int(rng.integers(1, 15))), km.LQR(model, cost)):
+        assert np.isfinite(controller(0.1 * rng.normal(size=n + m), np.zeros(n + m)).u).all()
 
 
 def test_rows_of_inputs_go_with_the_rows_of_a_reference():
