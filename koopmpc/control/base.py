@@ -234,12 +234,18 @@ class MPCBase:
         self._given = plan[: self.nu]
 
     def _move(
-        self, u: Float[np.ndarray, " nu"], status: Status, iterations: int, start: float, slack: float = 0.0
+        self,
+        u: Float[np.ndarray, " nu"],
+        status: Status,
+        iterations: int,
+        start: float,
+        slack: float = 0.0,
+        solver: str = "",
     ) -> Move:
         """Return a good step; a late one says so."""
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
-        return Move(u, status, Fallback.NONE, taken, iterations, slack)
+        return Move(u, status, Fallback.NONE, taken, iterations, slack, solver)
 
     def _fail(
         self,
@@ -248,6 +254,7 @@ class MPCBase:
         status: Status,
         iterations: int,
         start: float,
+        solver: str = "",
     ) -> Move:
         """Return what stands in for a failed step, with the status that says why: a late one says that it is late.
 
@@ -274,7 +281,7 @@ class MPCBase:
         self._given = admitted(u, self._inputs, self._rates, before)
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
-        return Move(self._given.copy(), status, fallback, taken, iterations)
+        return Move(self._given.copy(), status, fallback, taken, iterations, solver=solver)
 
 
 def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:

@@ -51,9 +51,11 @@ class Move:
     solve_time
         Wall-clock time of the whole step, from y to u [s].
     iterations
-        Iterations of the solver; 0 where none ran.
+        Iterations of all solvers; 0 where none ran.
     slack
         How far the plan breaks the soft limit, or the rate, that gives way most, in its own unit; 0 but for SOFTENED.
+    solver
+        Whose answer it is where several may solve a step: "osqp" or "daqp", the last asked where none had one.
     """
 
     u: Float[np.ndarray, " nu"]
@@ -62,6 +64,7 @@ class Move:
     solve_time: float
     iterations: int
     slack: float = 0.0
+    solver: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,9 +58,7 @@ class PlanMap:
         self.moves = len(blocks) * predictor.nu
         self.deviation = self.maps.deviation[: self.moves]
         limits_of_plan = groups(track, horizon)
-        self.hard = step_qp(self.maps, limits_of_plan, soft_rows=False)
-        softens = bool(np.isfinite(self.hard.most).any())
-        self.soft = step_qp(self.maps, limits_of_plan, soft_rows=True) if softens else None
+        self.qp = step_qp(self.maps, limits_of_plan)
 
         low, high = (
             np.concatenate([np.tile(group.bounds[i], len(group.next)) for group in limits_of_plan]) for i in (0, 1)

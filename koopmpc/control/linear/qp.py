@@ -1,17 +1,16 @@
-"""The QP of one step: deviations w from the unconstrained plan, slacks ε of soft rows, limits that move with it."""
+"""The QP of one step: deviations w from the unconstrained plan, within limits that move with it."""
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import block_diag
 
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.limits import Interval, Softness, allowance
 from koopmpc.control.linear.condense import Condensed, row_sizes
 from koopmpc.control.linear.horizon import Horizon
-from koopmpc.control.solvers.base import StepQP
+from koopmpc.control.solvers.step import StepQP
 
 
 class Group(NamedTuple):
@@ -25,20 +24,17 @@ class Group(NamedTuple):
     next: Int[np.ndarray, " n"]
 
 
-class _Block(NamedTuple):
-    """Rows of the QP from one kind of limit: entries of the plan, limits, the row after each, its ε and the ε's sign.
-
-    `linear` is the slack weight of each row, inf where it is hard. `rates` are the rows and the inputs of the first
-    changes that are limited hard.
-    """
+class _Rows(NamedTuple):
+    """Rows of the QP from one kind of limit, see `StepQP`, and the row of the next stage of each."""
 
     source: Int[np.ndarray, " p"]
+    scale: Float[np.ndarray, " p"]
     low: Float[np.ndarray, " p"]
     high: Float[np.ndarray, " p"]
-    next: Int[np.ndarray, " p"]
-    sign: float
-    slack: Int[np.ndarray, " p"]
     linear: Float[np.ndarray, " p"]
+    quadratic: Float[np.ndarray, " p"]
+    allowance: Float[np.ndarray, " p"]
+    next: Int[np.ndarray, " p"]
 
 
 def groups(tracking: LiftedTracking, horizon: Horizon) -> list[Group]:
@@ -56,57 +52,37 @@ def groups(tracking: LiftedTracking, horizon: Horizon) -> list[Group]:
     return [*result, Group(tracking.outputs, tracking.softness, np.arange(1, N + 1))]
 
 
-def step_qp(maps: Condensed, limits: Sequence[Group], *, soft_rows: bool) -> StepQP:
-    """Return the QP of a condensed horizon under these limits; without `soft_rows` every row is hard.
+def step_qp(maps: Condensed, limits: Sequence[Group]) -> StepQP:
+    """Return the QP of a condensed horizon under these limits.
 
-    Every row is measured by the norm of its row of D.
+    Every row is measured by the norm of its row of D, so that the price of its violation is, too.
     """
     D, unit = maps.deviation, maps.unit
     nw = D.shape[1]
-    sizes = _sizes(D, limits)
-    blocks: list[_Block] = []
-    shifts = [_next(limits[0].next, len(limits[0].bounds.low))]
-    weights: list[tuple[Float[np.ndarray, " _"], ...]] = []
+    parts: list[_Rows] = []
     rate_rows = rate_inputs = np.zeros(0, dtype=np.intp)
-    first, slacks = 0, 0
-    for i, (group, size) in enumerate(zip(limits, sizes, strict=True)):
-        width, N = len(size), len(group.next)
-        bounds = Interval(group.bounds.low / size, group.bounds.high / size)
-        softness = Softness(group.softness.linear * size, group.softness.quadratic * size**2)
-        limited = np.isfinite(bounds.low) | np.isfinite(bounds.high)
-        gives = np.isfinite(softness.linear) & soft_rows
-        soft, hard = np.flatnonzero(limited & gives), np.flatnonzero(limited & ~gives)
+    first = 0
+    for i, (group, size) in enumerate(zip(limits, _sizes(D, limits), strict=True)):
+        picked = np.flatnonzero(np.isfinite(group.bounds.low) | np.isfinite(group.bounds.high))
         if i == 1 and len(limits) == 3:  # the changes of the inputs
-            truly = np.flatnonzero(np.isinf(softness.linear[hard]))
-            rate_rows, rate_inputs = sum(len(b.source) for b in blocks) + truly, hard[truly]
-        blocks += _blocks(group.next, bounds, softness.linear, hard, soft, first, slacks)
-        shifts.append(_next(group.next, len(soft)))
-        of_stage = softness.linear, softness.quadratic, allowance(group.bounds) / size, size
-        weights.append(tuple(np.tile(weight[soft], N) for weight in of_stage))
-        first, slacks = first + width * N, slacks + len(soft) * N
-    source = np.concatenate([block.source for block in blocks])
-    scale = 1 / np.concatenate([np.tile(size, len(g.next)) for g, size in zip(limits, sizes, strict=True)])[source]
-    relaxed = np.zeros((len(source), slacks))
-    row = 0
-    for block in blocks:
-        if block.sign:
-            relaxed[row + np.arange(len(block.source)), block.slack] = block.sign
-        row += len(block.source)
-    linear, quadratic, allowed, slack_unit = (np.concatenate(parts) for parts in zip(*weights, strict=True))
-    free = np.full(slacks, np.inf)
+            hard = np.flatnonzero(np.isinf(group.softness.linear[picked]))
+            rate_rows, rate_inputs = sum(len(part.source) for part in parts) + hard, picked[hard]
+        parts.append(_rows(group, size, picked, first, unit))
+        first += len(size) * len(group.next)
+    columns: list[Any] = [np.concatenate([part[i] for part in parts]) for i in range(len(_Rows._fields))]
+    rows = _Rows(*columns)
     return StepQP(
-        P=block_diag(maps.hessian, np.diag(quadratic / unit)),
-        q=np.concatenate([np.zeros(nw), linear / (2 * unit)]),
-        A=np.block([[D[source] * scale[:, None], relaxed], [np.zeros((slacks, nw)), np.eye(slacks)]]),
-        low=np.concatenate([*(block.low for block in blocks), np.zeros(slacks)]),
-        high=np.concatenate([*(block.high for block in blocks), free]),
-        source=source,
-        scale=scale,
-        shift_primal=_joined(shifts),
-        shift_dual=_joined([*(block.next for block in blocks), *shifts[1:]]),
-        allowance=allowed,
-        slack_unit=slack_unit,
-        most=np.concatenate([*(block.linear / (2 * unit) for block in blocks), free]),
+        P=maps.hessian,
+        q=np.zeros(nw),
+        A=np.multiply(D[rows.source], rows.scale[:, None]),
+        low=rows.low,
+        high=rows.high,
+        softness=Softness(rows.linear, rows.quadratic),
+        source=rows.source,
+        scale=rows.scale,
+        shift_primal=_joined([_next(limits[0].next, len(limits[0].bounds.low))]),
+        shift_dual=_joined([part.next for part in parts]),
+        allowance=rows.allowance,
         rate_rows=rate_rows,
         rate_inputs=rate_inputs,
     )
@@ -119,35 +95,22 @@ def _sizes(deviation: Float[np.ndarray, "nv nw"], limits: Sequence[Group]) -> li
     return [row_sizes(part, len(group.next)) for part, group in zip(parts, limits, strict=True)]
 
 
-def _blocks(
-    following: Int[np.ndarray, " N"],
-    bounds: Interval,
-    linear: Float[np.ndarray, " width"],
-    hard: Int[np.ndarray, " h"],
-    soft: Int[np.ndarray, " s"],
-    first: int,
-    slacks: int,
-) -> Iterator[_Block]:
-    """Yield the hard rows of a group, its soft upper ends, and its soft lower ends.
-
-    The group begins at the entry `first` of a plan, and its slacks after `slacks` others.
-    """
-    N, width = len(following), len(bounds.low)
-    stage = np.arange(N)[:, None]
-    slack_of = np.full(width, -1)
-    slack_of[soft] = np.arange(len(soft))
-    ends = (hard, 0.0), (soft[np.isfinite(bounds.high[soft])], -1.0), (soft[np.isfinite(bounds.low[soft])], 1.0)
-    for picked, sign in ends:
-        none = np.full(len(picked), np.inf)
-        yield _Block(
-            (first + width * stage + picked).ravel(),
-            np.tile(bounds.low[picked] if sign >= 0 else -none, N),
-            np.tile(bounds.high[picked] if sign <= 0 else none, N),
-            _next(following, len(picked)),
-            sign,
-            (slacks + len(soft) * stage + slack_of[picked]).ravel(),
-            np.tile(linear[picked], N),
-        )
+def _rows(
+    group: Group, size: Float[np.ndarray, " width"], picked: Int[np.ndarray, " r"], first: int, unit: float
+) -> _Rows:
+    """Return the limited rows `picked` of all stages of a group that begins at the entry `first` of a plan."""
+    N, size_of = len(group.next), size[picked]
+    (low, high), (linear, quadratic) = group.bounds, group.softness
+    return _Rows(
+        source=(first + len(size) * np.arange(N)[:, None] + picked).ravel(),
+        scale=np.tile(1 / size_of, N),
+        low=np.tile(low[picked] / size_of, N),
+        high=np.tile(high[picked] / size_of, N),
+        linear=np.tile(linear[picked] * size_of / (2 * unit), N),
+        quadratic=np.tile(quadratic[picked] * size_of**2 / (2 * unit), N),
+        allowance=np.tile(allowance(group.bounds)[picked], N),
+        next=_next(group.next, len(picked)),
+    )
 
 
 def _next(following: Int[np.ndarray, " N"], count: int) -> Int[np.ndarray, " p"]:

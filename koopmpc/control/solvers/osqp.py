@@ -22,38 +22,6 @@ from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
 
-_FAR = 1e20  # limits beyond it are none
-_INFEASIBLE = 2  # status of SciPy's linprog
-
-
-def empty(A: Float[np.ndarray, "m n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> bool:
-    """Return whether the simplex method finds that no v satisfies low ≤ A v ≤ high; some 20 ms at 50 × 150.
-
-    It is the HiGHS of SciPy: that of CasADi crashes in a process that has imported CVXPY.
-
-    References
-    ----------
-    Huangfu & Hall, "Parallelizing the dual revised simplex method", Math. Program. Comput. 10, 2018 (HiGHS).
-    """
-    from scipy.optimize import linprog
-
-    below, above = low > -_FAR, high < _FAR
-    found = linprog(
-        np.zeros(A.shape[1]),
-        A_ub=np.vstack([A[above], -A[below]]),
-        b_ub=np.concatenate([high[above], -low[below]]),
-        bounds=(None, None),
-        method="highs",
-    )
-    return found.status == _INFEASIBLE
-
-
-@cache
-def prepare() -> None:
-    """Load what `empty` needs, 0.1 s once in a process, before a loop begins."""
-    empty(np.ones((1, 1)), np.zeros(1), np.ones(1))
-
-
 # sigma: on plans of an unstable plant that saturate for many steps, half the iterations of OSQP's own 1e-6.
 # eps_prim_inf: its 1e-4 calls 5 % of feasible degenerate problems infeasible, and 18 % of badly scaled ones; 1e-7
 # none and 0.6 %. eps_dual_inf: its 1e-4 calls some badly scaled ones unbounded.
@@ -118,7 +86,8 @@ class OSQP(QPSolver):
         OSQP refuses the problem or a setting.
     """
 
-    goes_on = False
+    name = "osqp"
+    exact = False
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         import osqp
@@ -137,7 +106,6 @@ class OSQP(QPSolver):
         self._time_limit = self._solver.get_settings().time_limit
         self._most = self._solver.get_settings().max_iter
         self._first = True
-        prepare()
 
     def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Interval, float]]:
         limits = Interval(self.low, self.high)
@@ -180,13 +148,7 @@ class OSQP(QPSolver):
         status = self._status.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
             status = Status.TIME_LIMIT
-        if status is Status.MAX_ITERATIONS and time_limit is None and self._nothing_fits():
-            status = Status.INFEASIBLE
-        return QPSolution(np.array(solution.x), np.array(solution.y), status, int(info.iter))
-
-    def _nothing_fits(self) -> bool:
-        """Return whether no v meets the limits: OSQP's certificate of that may take longer than its iterations."""
-        return empty(self._qp.A, self.low, self.high)
+        return QPSolution(np.array(solution.x), np.array(solution.y), status, int(info.iter), self.name)
 
     def _allow(self, seconds: float) -> None:
         """Set the time limit of the next solve: OSQP counts the setup, or the last updates, as a part of it."""

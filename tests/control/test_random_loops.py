@@ -1,0 +1,32 @@
+"""Random closed loops: every step has an answer or says why there can be none, and inputs stay inside their limits."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from tests.control.random_loops import Outcome, outcomes_of, table
+
+
+def good(outcomes: list[Outcome]) -> None:
+    assert not [(one.seed, one.error) for one in outcomes if one.error]
+    assert max(one.outside for one in outcomes) <= 0
+    failed = [one.seed for one in outcomes if {"MAX_ITERATIONS", "FAILED", "BAD_MEASUREMENT"} & set(one.statuses)]
+    assert failed == []
+    impossible = [one.seed for one in outcomes if "INFEASIBLE" in one.statuses and not one.hard_states]
+    assert impossible == []
+    assert max(max(one.iterations) for one in outcomes) <= 10_000
+
+
+def test_a_sample_of_random_loops() -> None:
+    outcomes = outcomes_of(range(150))
+    good(outcomes)
+    assert {name for one in outcomes for name in one.solvers} == {"", "osqp", "daqp"}
+    assert np.quantile(np.concatenate([one.iterations for one in outcomes]), 0.99) <= 200
+
+
+@pytest.mark.slow
+def test_ten_thousand_random_loops() -> None:
+    outcomes = outcomes_of(range(10_000), 2)
+    sys.stdout.write("\n" + "\n".join(table(outcomes)) + "\n")
+    good(outcomes)
