@@ -51,7 +51,7 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.data.excitation import Feedback as Feedback
     from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
-    from koopmpc.data.files.folder import Files as Files
+    from koopmpc.data.files.storage import Files as Files
     from koopmpc.data.files.storage import load_episodes as load_episodes
     from koopmpc.data.source import Stream as Stream
     from koopmpc.errors import FitWarning as FitWarning
@@ -125,8 +125,7 @@ else:
             "data.delay": "Delay",
             "data.episodes": "Episode Episodes",
             "data.excitation": "PRBS Chirp Feedback Multisine Noise",
-            "data.files.folder": "Files",
-            "data.files.storage": "load_episodes",
+            "data.files.storage": "Files load_episodes",
             "data.source": "Stream",
             "errors": "FitWarning KoopmpcError",
             "estimate.observer": "LiftedDisturbance",

@@ -13,12 +13,11 @@ from koopmpc import checks
 from koopmpc.bench.page import Page
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.files.folder import Files
+from koopmpc.data.files.storage import Files
 from koopmpc.figures.comparisons import error
 from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import rollout
-from koopmpc.fitting.hold_out import IN_MEMORY, PAST, Divided, divided
-from koopmpc.fitting.repair import noted, shortened
+from koopmpc.fitting.repair import IN_MEMORY, PAST, Divided, divided, noted, shortened
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress

@@ -1,7 +1,7 @@
-"""Repairs of logs, each reported: columns that stand still or repeat others are dropped, angles are unwrapped."""
+"""Logs before a fit: what no model can use is put right and said, and episodes are held out to judge by."""
 
 import warnings
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.source import Changed, Source
+from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.files.storage import Files
+from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
 from koopmpc.synthesis.candidates import jumps
+from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
 
 
 @dataclass(frozen=True)
@@ -149,3 +151,131 @@ def shortened(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
     if alone > _SHOWN:
         short.append(f"{alone - _SHOWN} more files have such notes of their own; load_episodes says them")
     return short
+
+
+IN_MEMORY = 150_000_000  # bytes of files that are read as a whole
+PAST = 2  # steps that a model may look back
+_SHARE = 0.2  # of the episodes that are held out
+_ENOUGH = 12  # held-out episodes from which on bands are finite
+_JUDGED = 10_000  # steps that a report is made of
+
+
+@dataclass(frozen=True, eq=False)
+class Divided:
+    """The data that a model is fitted to, and the held-out episodes that judge it.
+
+    Attributes
+    ----------
+    fitted
+        A source, larger than memory if need be.
+    seen
+        Episodes of it, for what a report says of training data.
+    held_out
+        Episodes that no fit sees.
+    horizon
+        Steps ahead.
+    size
+        What there is, in words.
+    notes
+        What was done to the data, in sentences.
+    """
+
+    fitted: Source | Episodes
+    seen: Episodes
+    held_out: Episodes
+    horizon: int
+    size: str
+    notes: tuple[str, ...]
+
+
+def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory: int) -> Divided:
+    """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
+
+    Raises
+    ------
+    DataError
+        Too few episodes are as long as the horizon.
+    """
+    parts = files.parts()
+    size = sum(file.stat().st_size for file in files.files)
+    told = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_bytes(size)}"
+    if size <= memory or len(parts) < 2:
+        episodes = joined([part.load() for part in parts])
+        repair = needed(episodes)
+        return _in_memory(repair(episodes), horizon, rng, told, repair.notes)
+    repair = needed(sampled(files, _JUDGED)[0])
+    source = repair.source(files)
+    count = max(len(parts) // 10, 1)
+    out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
+    rest = Subset(source, [i for i in range(len(parts)) if i not in out])
+    judged, _ = sampled(Subset(source, sorted(out)), _JUDGED)
+    ahead = usual_horizon(judged, PAST)[0] if horizon is None else horizon
+    held_out = _long(list(judged), ahead + PAST)
+    if len(held_out) < 2:
+        held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + PAST))], ahead + PAST)
+    if len(held_out) < 2:
+        raise DataError(_too_short(len(judged), ahead))
+    seen, _ = sampled(rest, _JUDGED)
+    note = (
+        f"larger than {_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
+        f"{'is' if len(out) == 1 else 'are'} held out, and the fit reads the others one by one"
+    )
+    return Divided(
+        rest,
+        judged.with_episodes(_long(list(seen), ahead + PAST)),
+        judged.with_episodes(held_out),
+        ahead,
+        told,
+        (*repair.notes, note),
+    )
+
+
+def _in_memory(
+    episodes: Episodes, horizon: int | None, rng: np.random.Generator, files: str, repaired: tuple[str, ...]
+) -> Divided:
+    lengths = [len(episode) for episode in episodes]
+    same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
+    number = len(episodes)
+    told = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
+    ahead = usual_horizon(episodes, PAST)[0] if horizon is None else horizon
+    needed = ahead + PAST
+    whole = list(episodes)
+    notes: tuple[str, ...] = ()
+    if len(_long(whole, needed)) < _ENOUGH:
+        block = max(2 * needed, sum(lengths) // (4 * _ENOUGH))
+        whole = [piece for episode in episodes for piece in blocks(episode, block)]
+        if len(whole) > number:
+            notes = (
+                f"too few episodes to hold some out: cut into {len(whole)} blocks of about {block} steps; a held-out "
+                "block lies between those of the fit, so its errors may flatter",
+            )
+    long = [i for i, episode in enumerate(whole) if len(episode) >= needed]
+    if len(long) < 4:
+        raise DataError(_too_short(len(episodes), ahead))
+    count = max(round(_SHARE * len(long)), min(_ENOUGH, len(long) // 3), 2)
+    # blocks in order are held out evenly spread, episodes at random
+    order = [int((i + 0.5) * len(long) / count) for i in range(count)]
+    drawn = order if notes else [int(i) for i in rng.permutation(len(long))[:count]]
+    out = {long[i] for i in drawn}
+    train = episodes.with_episodes([episode for i, episode in enumerate(whole) if i not in out])
+    seen, _ = sampled(Held(episodes.with_episodes(_long(list(train), needed))), _JUDGED)
+    held_out, _ = sampled(Held(episodes.with_episodes([whole[i] for i in sorted(out)])), _JUDGED)
+    return Divided(train, episodes.with_episodes(_long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes))
+
+
+def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:
+    return [episode for episode in episodes if len(episode) >= needed]
+
+
+def _too_short(episodes: int, horizon: int) -> str:
+    return (
+        f"{episodes} episode{'s' * (episodes > 1)} of these lengths give too few of {horizon + PAST} steps, horizon "
+        "and delays, to fit to some and judge by others; pass a shorter --horizon, or more data"
+    )
+
+
+def _bytes(size: int) -> str:
+    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= one:
+            return f"{size / one:.3g} {unit}"
+    return f"{size} B"

@@ -20,8 +20,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import FitReport, Predictor
-from koopmpc.predict.files import load_value
+from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.values import freeze
 
 

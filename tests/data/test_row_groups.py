@@ -46,7 +46,7 @@ def test_a_folder_cuts_its_large_files_and_no_others(tmp_path: Path, monkeypatch
     monkeypatch.setattr("koopmpc.data.files.parquet._GROUP", 64_000)
     for i, one in enumerate(sets):
         one.save(tmp_path / f"{i}.parquet")
-    monkeypatch.setattr("koopmpc.data.files.folder._LARGE", 20_000)
+    monkeypatch.setattr("koopmpc.data.files.storage._LARGE", 20_000)
     source = km.Files(tmp_path)
     parts = source.parts()
     assert [isinstance(part, RowGroup) for part in parts] == [False, True, True, True, True, False]
@@ -79,7 +79,7 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     data = random_episodes(0, [50], 2, 1)
     a, b, c, d, e = (tmp_path / f"{name}.parquet" for name in "abcde")
     data.save(a)
-    monkeypatch.setattr("koopmpc.data.files.folder._LARGE", 0)
+    monkeypatch.setattr("koopmpc.data.files.storage._LARGE", 0)
     pq.write_table(pa.table({"time": [0.0, 0.1, 0.2], "x": [1.0, 2.0, 3.0], "u": [0.0, 1.0, 0.0]}), b)
     assert row_groups(b, 0, None) is None
     assert [len(one) for part in km.Files(b).parts() for one in part.load()] == [2]

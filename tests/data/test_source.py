@@ -42,9 +42,9 @@ def test_small_files_share_a_part_and_large_ones_do_not(tmp_path: Path, monkeypa
     source = km.Files(folder_of(tmp_path, sets()))
     assert [str(part) for part in source.parts()] == [f"{tmp_path}/0.npz and 3 files after it"]
     size = (tmp_path / "0.npz").stat().st_size
-    monkeypatch.setattr("koopmpc.data.files.folder._PART", 2 * size)
+    monkeypatch.setattr("koopmpc.data.files.storage._PART", 2 * size)
     assert [len(part.load()) for part in source.parts()] == [4, 4]
-    monkeypatch.setattr("koopmpc.data.files.folder._PART", 10)
+    monkeypatch.setattr("koopmpc.data.files.storage._PART", 10)
     assert [str(part) for part in source.parts()] == [str(tmp_path / f"{i}.npz") for i in range(4)]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.predict.files import load_value, save_value
+from koopmpc.predict.base import load_value, save_value
 from tests.example_plants import random_episodes
 
 DATA = random_episodes(0, [80, 60], 2, 1)

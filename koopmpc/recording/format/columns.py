@@ -5,16 +5,19 @@ import json
 import struct
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from koopmpc import checks
 from koopmpc.errors import LogError
+from koopmpc.loop.run import Plans, Run, Step, StepRows
 
 _MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
 _FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
@@ -172,3 +175,65 @@ def _whole_messages(path: Path) -> Iterator[tuple[Path, bool]]:
         copy = Path(folder) / "whole.rrd"
         copy.write_bytes(head)
         yield copy, True
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LogBlock(StepRows):
+    """Rows k, k+1, … of a run, and the plans of those steps that have one.
+
+    Attributes
+    ----------
+    k
+        The step of the first row.
+    planned
+        (p,) steps that have a plan.
+    plan_X, plan_U
+        (p, N+1, nx) and (p, N, nu) their plans.
+    """
+
+    k: int
+    planned: Int[np.ndarray, " p"]
+    plan_X: Float[np.ndarray, "p N1 nx_plan"]
+    plan_U: Float[np.ndarray, "p N nu_plan"]
+
+    def cut(self, first: int, last: int) -> "LogBlock":
+        """Return rows first … last − 1, counted from this block's own first row."""
+        p = slice(*np.searchsorted(self.planned, [self.k + first, self.k + last]))
+        plans = (self.planned[p], self.plan_X[p], self.plan_U[p])
+        return _block(self.k + first, self.part(first, last), *plans)
+
+
+def _block(
+    k: int,
+    rows: StepRows,
+    planned: Int[np.ndarray, " p"],
+    plan_X: Float[np.ndarray, "p N1 nx_plan"],
+    plan_U: Float[np.ndarray, "p N nu_plan"],
+) -> LogBlock:
+    return LogBlock(**rows.columns(), k=k, planned=planned, plan_X=plan_X, plan_U=plan_U)
+
+
+def block_of_run(run: Run) -> LogBlock:
+    """Return the whole of `run` as one block."""
+    plans = Plans(np.empty((0, 0, 0)), np.empty((0, 0, 0))) if run.plans is None else run.plans
+    return _block(0, run, np.arange(len(plans.X)), plans.X, plans.U)
+
+
+def block_of_steps(steps: Sequence[Step], nx: int, *, end: bool) -> LogBlock:
+    """Return consecutive steps as a block; with `end`, the state that the last one led to follows."""
+    plans = [step.plan for step in steps if step.plan is not None]
+    whole = Plans.of(plans) or Plans(np.empty((0, 0, 0)), np.empty((0, 0, 0)))
+    planned = np.array([step.k for step in steps if step.plan is not None], dtype=np.int64)
+    return _block(steps[0].k, StepRows.of(steps, nx, end=end), planned, whole.X, whole.U)
+
+
+def blocks(rows: LogBlock, least: int = 100, most: int = 10) -> list[LogBlock]:
+    """Return `rows` as consecutive blocks of at least `least` steps, at most `most` of them.
+
+    The state that the last move led to belongs to the last block.
+    """
+    moves = len(rows.U)
+    size = max(least, -(-moves // most))
+    starts = range(0, moves - size + 1, size) if moves > size else range(1)
+    ends = [*starts[1:], len(rows.X)]
+    return [rows.cut(a, b) for a, b in zip(starts, ends, strict=True)]
