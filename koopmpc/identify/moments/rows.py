@@ -13,7 +13,7 @@ from koopmpc.lifting.state import Constant, State
 
 ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
 
-Table = Float[np.ndarray, "m n"]
+RowBlock = Float[np.ndarray, "m n"]
 
 
 @dataclass(frozen=True, eq=False)
