@@ -13,8 +13,6 @@ from koopmpc.lifting.state import Constant, State
 
 ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
 
-RowBlock = Float[np.ndarray, "m n"]
-
 
 @dataclass(frozen=True, eq=False)
 class RowColumns:
