@@ -101,3 +101,26 @@ def test_a_swing_up_on_given_equations_costs_what_nonlinear_mpc_costs(name: str,
         )
         cost.append(km.metrics(run).cost)
     assert cost[0] <= 1.10 * cost[1]
+
+
+@pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
+def test_a_trajectory_that_comes_with_its_inputs_is_followed_exactly(kind: type) -> None:
+    plant = PLANTS[0]
+    U = np.sin(np.arange(40.0))[:, None]
+    X = plant.rollout([0.1, 0.0], U)
+    mpc = kind(plant, km.Cost(Q=[10.0, 1.0], R=0.1, u_target=U), horizon=10)
+    for _ in range(2):  # a reset begins at the first row again
+        run = km.simulate(plant, mpc, x0=X[0], reference=X, steps=40)
+        assert np.abs(run.X[:30] - X[:30]).max() < 1e-7
+        assert np.abs(run.U[:28] - U[:28]).max() < 1e-6
+
+
+@pytest.mark.parametrize("R_delta", [None, 0.1])
+@pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
+def test_given_inputs_of_zero_are_the_target_zero(kind: type, R_delta: float | None) -> None:
+    inputs = []
+    for target in ("zero", [0.0], np.zeros((5, 1))):
+        mpc = kind(PLANTS[0], km.Cost(Q=[10.0, 1.0], R=0.1, R_delta=R_delta, u_target=target), km.Limits(-2, 2), 10)
+        inputs.append(km.simulate(PLANTS[0], mpc, x0=[0.5, 0.0], reference=[0.3, 0.0], steps=10).U)
+    np.testing.assert_array_equal(inputs[1], inputs[0])
+    np.testing.assert_array_equal(inputs[2], inputs[0])

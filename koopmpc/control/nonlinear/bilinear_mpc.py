@@ -31,6 +31,7 @@ _COPIED = (
     "_planned",
     "_warm",
     "_moved",
+    "_row",
     "_X",
     "_U",
 )  # what a copy takes over, with the plan

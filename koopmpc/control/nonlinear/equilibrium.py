@@ -14,7 +14,7 @@ from koopmpc.control.cost import Cost, StateTracking, root
 from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.problem import LearnedMap
 from koopmpc.control.riccati import one_step
-from koopmpc.control.tail import stationary
+from koopmpc.control.tail import stationary, tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.plants.compiled import Buffered
@@ -209,7 +209,7 @@ class Equilibria:
 class TerminalTargets:
     """Reference row → TerminalTarget.
 
-    The terminal cost is ‖d‖²_P, P the Riccati solution of the linearisation, or Q_N. The distance d is measured in
+    The terminal cost is ‖d‖²_P, P that of the tail along the linearisation, or Q_N. The distance d is measured in
     the tracked outputs as far as they see it, d = J⁺(of(x_N) − of(x_r)) + (I − J⁺J)(x_N − x_r), J = ∂of/∂x: with
     sin θ and cos θ tracked it is the same at every turn of θ, and with of(x) = x it is x_N − x_r. The part of
     of(x_N) − of(x_r) that no small motion changes keeps its weight Q, times the mean size of P over JᵀQJ. With
@@ -283,6 +283,8 @@ class TerminalTargets:
         back, size = (np.linalg.pinv(each, rcond=1e-9) for each in (J, seen))
         step = one_step(at.A, at.B, seen, o.R, o.R_delta)
         P = stationary(step.A, step.B, step.Q, step.R, self._most, step.M).P
+        if self._cost.tail:
+            P = tail_of(tail_stage(at.A, at.B, np.eye(nx), J, Q, o.R, o.R_delta), self._cost.tail).P
         n, S = len(P), root(P)
         M, L, V = (np.zeros((n + nr, columns)) for columns in (nr, nx, len(u)))
         M[:n] = S[:, :nx] @ back

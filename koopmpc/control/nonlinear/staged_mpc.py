@@ -213,6 +213,11 @@ class StagedMPC(MPCBase):
             U, end = given[:-1], end._replace(u=given[-1], m=end.m + end.V @ given[-1])
             self._moved = self._row + 1 < len(self._rows)
             self._row += self._moved
+        trajectory = self._rows is not None and not held[-1]  # no equilibrium is where it goes on
+        if self.cost.Q_N is None and (trajectory or self.cost.tail == 0):
+            M, nr = np.zeros_like(end.M), len(R[-1])
+            M[:nr] = root(self._outputs.Q)
+            end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
         self._track(self._staged(R[1:], U, end))
         return True
 
