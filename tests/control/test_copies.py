@@ -11,8 +11,11 @@ import koopmpc as km
 from tests.control.test_slack import COST, MODEL, A, B, N
 
 LIMITS = km.Limits(-1, 1, du_min=-0.2, du_max=0.2)
+SOFT = km.Limits(-1, 1, x_min=[-np.inf, -0.3], x_max=[np.inf, 0.3])
 MAKERS: dict[str, Callable[[], km.BilinearMPC | km.KoopmanMPC | km.NonlinearMPC]] = {
     "koopman": lambda: km.KoopmanMPC(MODEL, COST, LIMITS, N, estimator=km.LiftedDisturbance(0.2)),
+    "koopman, active set": lambda: km.KoopmanMPC(MODEL, COST, LIMITS, N, solver="daqp"),
+    "koopman, handed over": lambda: km.KoopmanMPC(MODEL, COST, SOFT, N, settings={"max_iter": 5}),
     "bilinear": lambda: km.BilinearMPC(MODEL, COST, LIMITS, N),
     "bilinear, estimated": lambda: km.BilinearMPC(MODEL, COST, LIMITS, N, estimator=km.LiftedDisturbance(0.2)),
     "bilinear, late": lambda: km.BilinearMPC(MODEL, COST, LIMITS, N, latency=1),
@@ -39,4 +42,16 @@ def test_a_copy_in_mid_run_goes_on(name: str) -> None:
     copies = [pickle.loads(pickle.dumps(original)), copy.deepcopy(original), copy.copy(original)]
     expected, _ = moves(original, x, 6)
     for other in copies:
-        assert np.allclose(moves(other, x, 6)[0], expected, atol=1e-6)
+        found, _ = moves(other, x, 6)
+        assert np.allclose(found, expected, atol=1e-6)
+        assert found == expected or not isinstance(original, km.KoopmanMPC)
+
+
+def test_a_new_model_after_a_hand_over_is_controlled_as_by_a_new_controller() -> None:
+    make = MAKERS["koopman, handed over"]
+    mpc, fresh = make(), make()
+    assert mpc([2.0, 0.0], [0.0, 0.0]).solver == "daqp"
+    other = km.LinearPredictor(1.02 * A, B, np.eye(2), MODEL.lifting, 0.1, MODEL.states, MODEL.inputs)
+    mpc.update(other)
+    fresh.update(other)
+    assert np.allclose(mpc([1.9, -0.1], [0.0, 0.0]).u, fresh([1.9, -0.1], [0.0, 0.0]).u, atol=1e-9)

@@ -63,7 +63,8 @@ class KoopmanMPC(MPCBase):
         from the state predicted for then, under the inputs that are still to act; zero moved inside the limits
         acts before the first. `horizon` grows by it: more of the reference is read.
     solver
-        "osqp", an operator-splitting method, or "daqp", an active-set method.
+        Who is asked first: "osqp", an operator-splitting method, which hands over to the other one after 100 iterations
+        unless `settings` say so, or "daqp", an active-set method.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}``.
     time_limit

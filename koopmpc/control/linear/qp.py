@@ -58,7 +58,6 @@ def step_qp(maps: Condensed, limits: Sequence[Group]) -> StepQP:
     Every row is measured by the norm of its row of D, so that the price of its violation is, too.
     """
     D, unit = maps.deviation, maps.unit
-    nw = D.shape[1]
     parts: list[_Rows] = []
     rate_rows = rate_inputs = np.zeros(0, dtype=np.intp)
     first = 0
@@ -73,8 +72,8 @@ def step_qp(maps: Condensed, limits: Sequence[Group]) -> StepQP:
     rows = _Rows(*columns)
     return StepQP(
         P=maps.hessian,
-        q=np.zeros(nw),
-        A=np.multiply(D[rows.source], rows.scale[:, None]),
+        q=np.zeros(len(maps.hessian)),
+        A=D[rows.source] * rows.scale[:, None],
         low=rows.low,
         high=rows.high,
         softness=Softness(rows.linear, rows.quadratic),
