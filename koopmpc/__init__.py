@@ -56,8 +56,8 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.data.source import Stream as Stream
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
+    from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
-    from koopmpc.estimate.observer import LiftedDisturbance as LiftedDisturbance
     from koopmpc.identify import moments as moments
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
     from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
@@ -128,7 +128,7 @@ else:
             "data.files.storage": "Files load_episodes",
             "data.source": "Stream",
             "errors": "FitWarning KoopmpcError",
-            "estimate.observer": "LiftedDisturbance",
+            "estimate.disturbance": "LiftedDisturbance",
             "estimate.kalman": "LiftedKalman",
             "identify.fits.bilinear": "bilinear_edmd",
             "identify.fits.constrained": "constrained_edmd",

@@ -22,7 +22,7 @@ from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import ProblemError
-from koopmpc.estimate.observer import LiftedDisturbance
+from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.plants.dynamics import Dynamics, Plant

@@ -122,7 +122,7 @@ show(lambda: km.metrics([1, 2]))
         "DataError settings is a list, expected a Mapping; pass the solver's own by name, for example "
         '{"max_iter": 100}',
         "DataError estimator is 'kalman'; pass an object, for example km.LiftedDisturbance()",
-        "DataError estimator is <class 'koopmpc.estimate.observer.LiftedDisturbance'>; pass an object, for "
+        "DataError estimator is <class 'koopmpc.estimate.disturbance.LiftedDisturbance'>; pass an object, for "
         "example km.LiftedDisturbance()",
         "DataError predictor is a NoneType, expected a LinearPredictor; it replaces another LinearPredictor",
         "ShapeError applied has shape (2,), expected (1,)",
