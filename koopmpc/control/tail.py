@@ -120,7 +120,9 @@ def _stilled(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     Where the two groups of modes cannot be told apart by their eigenvectors, the others are no longer pushed as much.
     """
     try:
-        T, Z, grows = scipy.linalg.schur(A, output="real", sort=_grows)
+        T, Z, grows = scipy.linalg.schur(
+            A, output="real", sort=lambda real, imaginary: abs(complex(real, imaginary)) > GROWS
+        )
         grown, mixed, rest = T[:grows, :grows], T[:grows, grows:], T[grows:, grows:]
         X = scipy.linalg.solve_sylvester(grown, -rest, -mixed) if len(rest) else mixed  # T [X; 1] = [X; 1] rest
     except np.linalg.LinAlgError:  # eigenvalues within rounding of the bound changed sides when they were sorted
@@ -131,10 +133,6 @@ def _stilled(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
             return Z @ np.block([[still, X @ rest - still @ X], [np.zeros_like(mixed.T), rest]]) @ Z.T
     T, Z = scipy.linalg.schur(A, output="real")
     return Z @ (T / np.maximum(_sizes(T), 1.0)[:, None]) @ Z.T
-
-
-def _grows(real: float, imaginary: float = 0.0) -> bool:
-    return abs(complex(real, imaginary)) > GROWS
 
 
 def _sizes(T: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
