@@ -11,8 +11,8 @@ from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import Gain
-from koopmpc.control.tail import tail_of, tail_stage
 from koopmpc.control.target import given_inputs, reference_rows, targets_of
+from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.buffered import HUGE

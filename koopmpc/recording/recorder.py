@@ -17,7 +17,7 @@ from koopmpc.control.move import Plan
 from koopmpc.errors import DataError
 from koopmpc.loop.run import About, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
-from koopmpc.recording.format.columns import block_of_run, block_of_steps
+from koopmpc.recording.format.rrd import block_of_run, block_of_steps
 from koopmpc.recording.format.writer import Writer
 from koopmpc.recording.viewer import PORT, find_viewer, why_none
 from koopmpc.scene import Scene

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import sleep
 
 from koopmpc.errors import LogError
-from koopmpc.recording.format.columns import check_log
+from koopmpc.recording.format.rrd import check_log
 
 PORT = 9876
 _START = 15.0  # longest wait for a viewer that was opened [s]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.tail import stationary
+from koopmpc.control.terminal_cost import stationary
 from tests.control.models import PRECISE, cvxpy_plan, dense_plan, equilibrium, linear, random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -10,7 +10,7 @@ import koopmpc as km
 from koopmpc.control.cost import state_tracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria, TerminalTargets
 from koopmpc.control.nonlinear.problem import learned_map
-from koopmpc.control.tail import stationary
+from koopmpc.control.terminal_cost import stationary
 from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
 from tests.control.test_nonlinear_mpc import pendulum as hinge
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control.riccati import Stage, one_step, recursion
-from koopmpc.control.tail import _iterate, _leap, stationary
+from koopmpc.control.terminal_cost import _iterate, _leap, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)

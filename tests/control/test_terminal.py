@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.tail import held
+from koopmpc.control.terminal_cost import held
 from tests.bare import shown
 from tests.control.models import Told, linear, random_pair, step_map
 

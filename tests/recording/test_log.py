@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.loop.run import StepRows
-from koopmpc.recording.format.columns import block_of_run, blocks
+from koopmpc.recording.format.rrd import block_of_run, blocks
 from tests.recording.runs import make_run, options
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.figures.plane import eigenfunctions_on, plane_through
-from koopmpc.recording.format.columns import LogColumns, read_columns
+from koopmpc.recording.format.rrd import LogColumns, read_columns
 from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from koopmpc.recording.views.eigenvalues import circle, sequence
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning

@@ -17,8 +17,8 @@ from scipy.linalg import block_diag
 from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking
 from koopmpc.control.riccati import Stage
-from koopmpc.control.tail import tail_of, tail_stage
 from koopmpc.control.target import Targets
+from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor

@@ -12,7 +12,7 @@ from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
-from koopmpc.recording.format.columns import LogColumns, read_columns
+from koopmpc.recording.format.rrd import LogColumns, read_columns
 
 _ENTITIES = (
     "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/slack", "/solver/time_ms",

@@ -24,7 +24,7 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
-from koopmpc.recording.format.columns import LogBlock, blocks
+from koopmpc.recording.format.rrd import LogBlock, blocks
 from koopmpc.recording.views.blueprint import blueprint, input_limits, styles
 from koopmpc.recording.views.eigenvalues import draw_eigenvalues
 from koopmpc.recording.views.scenes import Drawing, Extent, Names, draw, draw_ahead, stages

@@ -9,7 +9,7 @@ import numpy as np
 from koopmpc.loop.run import About
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable
-from koopmpc.recording.format.columns import LogBlock
+from koopmpc.recording.format.rrd import LogBlock
 from koopmpc.recording.views.eigenvalues import eigenvalue_views
 from koopmpc.recording.views.scenes import BACKGROUND, Extent
 from koopmpc.scene import Color
