@@ -69,7 +69,7 @@ class RealTimeIteration:
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
         self._allowance = allowance(Interval(*(end[soft] for end in self._limits)))
-        self.length, self.gap = 1.0, 0.0  # of the last step, and its defects as a share of the range of their state
+        self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
@@ -155,8 +155,13 @@ class RealTimeIteration:
         else:
             self.X[0], X[:], U[:] = x, X_new, U_new
             self.length, gap = length, error if length == 1 else np.abs(self._trial + self.e - X_new).max(axis=0)
-        self.gap = float((gap / (self.X.max(axis=0) - self.X.min(axis=0) + 1e-9 * (1 + np.abs(x)))).max())
+        self._defects = gap
         self.slack = float(found.slacks[found.slacks > self._allowance].max(initial=0.0))
+
+    @property
+    def gap(self) -> float:
+        """The largest defect that the last step has left, as a share of the range of its state in the plan."""
+        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (1 + np.abs(self.X[0])))).max())
 
     def cost(self) -> float:
         """Return what the plan costs, its breaches of soft limits included."""
