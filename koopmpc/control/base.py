@@ -97,13 +97,13 @@ class InitialCondition:
             (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
         measured, observer = numbers(y, "y"), self.observer
-        if self._plain and applied is None and w is None and measured.shape == self._shape:  # y is all that counts
-            observer.observe(measured, last, self._w)
-            self.z[:] = observer.z
-            return
         got = None if applied is None else numbers(applied, "applied")
         if got is not None and got.shape != last.shape:
             raise ShapeError(f"applied has shape {got.shape}, expected {last.shape}")
+        if self._plain and w is None and measured.shape == self._shape:  # y is all that counts
+            observer.observe(measured, last, self._w)
+            self.z[:] = observer.z
+            return
         if measured.shape != self._shape:
             what = "measurement of the estimator" if self._estimated else "state"
             raise ShapeError(f"y has shape {measured.shape}, expected {self._shape}, one value a {what}")
