@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.data.source import Held
 
 
 def some(seed: int, lengths: list[int], nx: int = 2, nu: int = 1, nw: int = 0) -> km.Episodes:
@@ -90,7 +89,7 @@ def test_measured_disturbances_are_no_part_of_the_past() -> None:
 
 def test_a_source_of_points_asks_its_parts_for_the_past() -> None:
     data = some(0, [6, 7])
-    (part,) = km.Delay(2).source(Held(data)).parts()
+    (part,) = km.Delay(2).source(km.Stream([data])).parts()
     assert part.load() == km.Delay(2)(data)
 
 

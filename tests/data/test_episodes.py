@@ -120,8 +120,7 @@ show(lambda: km.edmd([X], km.State()))
 show(lambda: km.edmd(X, km.State()))
 show(lambda: km.dmd(X))
 show(lambda: km.dmdc(X))
-from koopmpc.identify.fits.bilinear import bilinear_edmd
-show(lambda: bilinear_edmd(X, km.State()))
+show(lambda: km.bilinear_edmd(X, km.State()))
 """
     )
     episodes = "; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, Files(folder) or Stream(episodes)"

@@ -13,6 +13,13 @@ def turning(radius: float = 0.95, angle: float = 0.3) -> km.LinearPredictor:
     return km.LinearPredictor(A, [[0.0], [1.0]], np.eye(2), km.State(), DT, STATES, INPUTS)
 
 
+def three_states() -> km.LinearPredictor:
+    """A turn of (a, b) by 0.3 rad a step, and c halved."""
+    A = np.zeros((3, 3))
+    A[:2, :2], A[2, 2] = turning(0.9).A, 0.5
+    return km.LinearPredictor(A, np.ones((3, 1)), np.eye(3), km.State(), DT, ("a [m]", "b [m/s]", "c [A]"), ["u"])
+
+
 def episodes(count: int = 12, steps: int = 30, noise: float = 0.0) -> km.Episodes:
     rng, model = np.random.default_rng(4), turning()
     made = []

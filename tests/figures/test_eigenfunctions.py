@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 import koopmpc as km
-from tests.figures.models import STATES, episodes, turning
+from tests.figures.models import STATES, turning
 
 SQUARE = [(-1, 1), (-2, 2)]
 
@@ -55,9 +55,28 @@ def test_a_picture_of_shades_keeps_its_colours_and_its_labels_stay_inside(tmp_pa
         assert frame.x0 < text.get_window_extent().x0 < text.get_window_extent().x1 < frame.x1
 
 
-def test_episodes_give_the_ranges() -> None:
-    data = episodes(3)
-    X = np.concatenate([episode.X for episode in data])
-    axes = km.plot.eigenfunctions(turning(), 1, (1, 0), data, points=9).axes[0]
+def mixed() -> km.LinearPredictor:
+    """Its one real eigenfunction is c + a b + 2, by the product's and the Constant's eigenvalue."""
+    lifting = km.Expressions(lambda x: [x[2] + x[0] * x[1] + 2], ["mix"])
+    return km.LinearPredictor(
+        [[0.5]], np.zeros((1, 0)), np.ones((3, 1)), lifting, 0.1, ["a [m]", "b [m/s]", "c [A]"], []
+    )
+
+
+def test_the_other_states_are_held_where_they_are_asked_for() -> None:
+    axes = km.plot.eigenfunctions(mixed(), 0, ("c", 0), [(-1, 1), (2, 3)], at=[7, 8, 9], points=3).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("c [A]", "a [m]")
+    c, a = np.tile([-1.0, 0.0, 1.0], 3), np.repeat([2.0, 2.5, 3.0], 3)
+    phi = c + 8 * a + 2
+    assert _mesh(axes) == pytest.approx(phi / phi.max())
+
+
+def test_episodes_give_the_ranges_and_the_median_of_the_other_states() -> None:
+    X = np.random.default_rng(0).normal(size=(51, 3))
+    data = km.Episodes([km.Episode(X=X[:20]), km.Episode(X=X[20:])], 0.1, ["a [m]", "b [m/s]", "c [A]"])
+    axes = km.plot.eigenfunctions(mixed(), 0, (1, 0), data, points=9).axes[0]
     assert axes.get_xlim() == pytest.approx((X[:, 1].min(), X[:, 1].max()))
     assert axes.get_ylim() == pytest.approx((X[:, 0].min(), X[:, 0].max()))
+    b, a = np.meshgrid(*(np.linspace(X[:, i].min(), X[:, i].max(), 9) for i in (1, 0)))
+    phi = (np.median(X[:, 2]) + a * b + 2).ravel()
+    assert _mesh(axes) == pytest.approx(phi / np.abs(phi).max())

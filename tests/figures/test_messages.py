@@ -5,18 +5,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import koopmpc as km
-from koopmpc.figures.plane import eigenfunctions_on, plane_through
-from koopmpc.figures.style import figure, save
-from tests.figures.models import episodes, turning
+from tests.figures.models import episodes, three_states, turning
 from tests.figures.test_eigenfunctions import SQUARE
-from tests.figures.test_plane import NAMES, three_states
 from tests.figures.test_spectrum import diagonal
 
 DATA, SHAPE = km.errors.DataError, km.errors.ShapeError
 MODEL, EPISODES = turning(), episodes(12)
-CUBE, PLANE = three_states(), plane_through(NAMES, (0, 1), SQUARE)
+CUBE = three_states()
+
+
+def planes(which: Any, axes: Any, over: Any, at: Any = None) -> Any:
+    return km.plot.eigenfunctions(CUBE, which, axes, over, at=at, points=5)
+
+
 MISTAKES = [
     (
         DATA,
@@ -53,21 +57,21 @@ MISTAKES = [
     (
         DATA,
         r"the plane is asked for state 'd'; the states are a \[m\], b",
-        lambda: plane_through(NAMES, ("a", "d"), SQUARE),
+        lambda: planes(0, ("a", "d"), SQUARE),
     ),
-    (DATA, r"asked for b \[m/s\] twice; name two states", lambda: plane_through(NAMES, ("b", 1), SQUARE)),
+    (DATA, r"asked for b \[m/s\] twice; name two states", lambda: planes(0, ("b", 1), SQUARE)),
     (
         DATA,
         r"the range of a \[m\] is 1 to -1; pass \(low, high\)",
-        lambda: plane_through(NAMES, (0, 1), [(1, -1), (0, 1)]),
+        lambda: planes(0, (0, 1), [(1, -1), (0, 1)]),
     ),
-    (SHAPE, r"at has shape \(2,\), expected \(3,\)", lambda: plane_through(NAMES, (0, 1), SQUARE, [0, 0])),
-    (DATA, r"there is no eigenfunction 3; the predictor has 0 … 2", lambda: eigenfunctions_on(CUBE, 3, PLANE)),
-    (DATA, "which names no eigenfunction", lambda: eigenfunctions_on(CUBE, [], PLANE)),
+    (SHAPE, r"at has shape \(2,\), expected \(3,\)", lambda: planes(0, (0, 1), SQUARE, [0, 0])),
+    (DATA, r"there is no eigenfunction 3; the predictor has 0 … 2", lambda: planes(3, (0, 1), SQUARE)),
+    (DATA, "which names no eigenfunction", lambda: planes([], (0, 1), SQUARE)),
     (
         DATA,
         r"eigenfunction 2 is 0 on all of the plane; hold the other states",
-        lambda: eigenfunctions_on(CUBE, [0, 2], PLANE),
+        lambda: planes([0, 2], (0, 1), SQUARE),
     ),
     (
         DATA,
@@ -91,7 +95,6 @@ MISTAKES = [
         "the residuals are those of another predictor",
         lambda: km.plot.spectrum(turning(0.5), km.validate.residual_dmd(turning(), EPISODES)),
     ),
-    (DATA, "height is -1 in; it must be above zero", lambda: figure(height=-1.0)),
 ]
 
 
@@ -103,7 +106,7 @@ def test_a_mistake_says_what_was_got_and_what_to_do(error: Any, text: str, mista
 
 def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(DATA, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
-        save(figure(2, 1)[0], tmp_path / "a.gif")
+        km.plot.save(Figure(), tmp_path / "a.gif")
     (tmp_path / "file").write_text("")
     with pytest.raises(km.errors.LogError, match=r"cannot be written: .*; pass another path"):
-        save(figure(2, 1)[0], tmp_path / "file" / "a.png")
+        km.plot.save(Figure(), tmp_path / "file" / "a.png")

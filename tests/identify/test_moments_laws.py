@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.solve import solve
 from tests.identify.plants import random_episodes
 
 LIFTING = km.Constant() + km.State() + km.Monomials(2)
@@ -15,8 +14,10 @@ ROUTES = pytest.mark.parametrize("route", ["gram", "qr"])
 
 
 def coefficients(episodes: km.Episodes | km.Stream, lifting: km.Lifting, route: str) -> np.ndarray:
+    """Return K of numpy.linalg.lstsq on the few rows that stand for all, columns of unit norm."""
     m = km.moments.second_moments(episodes, lifting, route=route)
-    return solve(m.rows(m.columns.regressors, m.columns.targets)).K[:, : m.nz]
+    few = m.rows(m.columns.regressors, m.columns.targets)
+    return unit_norm_least_squares(few.P, few.T[:, : m.nz])
 
 
 def rows_of(episodes: km.Episodes, lifting: km.Lifting) -> np.ndarray:
@@ -29,7 +30,10 @@ def least_squares(episodes: km.Episodes, lifting: km.Lifting) -> np.ndarray:
     """Return K of numpy.linalg.lstsq on the rows themselves, columns of unit norm."""
     bound = lifting.bind(episodes.states)
     D = rows_of(episodes, bound)
-    P, T = D[:, : bound.nz + episodes.nu], D[:, bound.nz + episodes.nu :]
+    return unit_norm_least_squares(D[:, : bound.nz + episodes.nu], D[:, bound.nz + episodes.nu :])
+
+
+def unit_norm_least_squares(P: np.ndarray, T: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(P, axis=0)
     return np.linalg.lstsq(P / size, T, rcond=None)[0] / size[:, None]
 

@@ -2,18 +2,24 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import pade
+from scipy.special import factorial
 
 import koopmpc as km
-from koopmpc.plants.dynamics import right_side
-from koopmpc.plants.integrators import gauss_legendre
 from tests.example_plants import CartPole, Pendulum, Spring, energy
 
 X0, TORQUE, END = [1.0, 0.5], 0.7, 2.0
 
 
-def exact(dynamics=None, x0=X0, u=TORQUE, end=END):
-    """x(end) by another code: Dormand & Prince's order 8 at rtol 1e-13."""
-    f = right_side(dynamics or Pendulum(damping=0.3))
+def right_side(dynamics):
+    """f of ẋ = f(x, u), traced here."""
+    x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    return ca.Function("f", [x, u], [dynamics.rhs(x, u)])
+
+
+def exact():
+    """x(END) by another code: Dormand & Prince's order 8 at rtol 1e-13."""
+    f, x0, u, end = right_side(Pendulum(damping=0.3)), X0, TORQUE, END
     flow = solve_ivp(lambda t, x: np.asarray(f(x, u)).ravel(), (0, end), x0, method="DOP853", rtol=1e-13, atol=1e-14)
     return flow.y[:, -1]
 
@@ -63,20 +69,27 @@ def test_implicit_midpoint_has_its_own_equation():
 
 
 @pytest.mark.parametrize("stages", [1, 2, 3, 5, 8])
-def test_gauss_legendre_meets_the_order_conditions(stages):
-    a, b = gauss_legendre(stages)
-    c = a.sum(axis=1)
-    for k in range(1, 2 * stages + 1):
-        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-13)  # B(2s)
-    for k in range(1, stages + 1):
-        assert a @ c ** (k - 1) == pytest.approx(c**k / k, rel=1e-12, abs=1e-14)  # C(s)
+def test_collocation_integrates_polynomials_below_twice_its_stages_exactly(stages):
+    """x_k' = (k + 1) s^k with s' = 1, from 0 to 1: Gauss–Legendre is exact for k < 2 stages, and no further."""
+    most = 2 * stages
+    s, u = ca.SX.sym("s", most + 2), ca.SX.sym("u", 0)
+    f = ca.Function("f", [s, u], [ca.vertcat(1, *((k + 1) * s[0] ** k for k in range(most + 1)))])
+    x_next = km.StepMap(km.Collocation(stages).step(f, 1.0), 1.0)(np.zeros(most + 2), [])
+    assert x_next[: most + 1] == pytest.approx(np.ones(most + 1), rel=1e-11)
+    assert abs(x_next[-1] - 1) > 1e-12
 
 
-@pytest.mark.parametrize("integrator", [km.ImplicitMidpoint(), km.Collocation(2), km.Collocation(4)], ids=repr)
-def test_gauss_methods_turn_a_linear_oscillator_by_its_pade_approximant(integrator):
-    plant = km.discretize(Spring(), 0.5, integrator)
-    A = plant.linearize([0.0, 0.0], []).A
+@pytest.mark.parametrize(
+    ("integrator", "stages"), [(km.ImplicitMidpoint(), 1), (km.Collocation(2), 2), (km.Collocation(4), 4)]
+)
+def test_gauss_methods_turn_a_linear_oscillator_by_its_pade_approximant(integrator, stages):
+    A = km.discretize(Spring(), 0.5, integrator).linearize([0.0, 0.0], []).A
     assert pytest.approx(np.eye(2), abs=1e-13) == A.T @ A  # on the circle: no damping at all
+    p, q = pade(1 / factorial(np.arange(2 * stages + 1)), stages)  # of exp, of degrees (stages, stages)
+    step = 0.5 * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    values, V = np.linalg.eig(step)
+    exact = (V * (p(values) / q(values))) @ np.linalg.inv(V)
+    assert pytest.approx(exact.real, abs=1e-13) == A
 
 
 def test_implicit_methods_take_stiff_plants_at_large_steps():

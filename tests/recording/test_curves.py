@@ -1,7 +1,9 @@
 """record_curves: what is written can be read, and what would end the viewer is not written."""
 
 import numpy as np
+import pytest
 
+import koopmpc as km
 from koopmpc.recording.views.curves import Curves, record_curves
 
 
@@ -31,3 +33,20 @@ def test_curves_come_back_and_gaps_stay_gaps(tmp_path):
     assert flat["/one_two/v_m_s/0_truth"] == truth[:, 1].tolist()
     assert "/one_two/v_m_s/1_model_a" not in flat
     assert flat["/page"] == ["# U^T"]
+
+
+TAB = Curves("one", 0.1, ("x",), {"truth": np.zeros((3, 1))})
+WIDE = Curves("one", 0.1, ("x", "y"), {"truth": np.zeros((3, 1))})
+
+
+@pytest.mark.parametrize(
+    ("error", "text", "tabs"),
+    [
+        (km.errors.DataError, r"there is no curve to record", []),
+        (km.errors.DataError, r"two tabs are called 'one'", [TAB, TAB]),
+        (km.errors.ShapeError, r"truth has shape \(3, 1\), expected \(any, 2\)", [WIDE]),
+    ],
+)
+def test_curves_that_cannot_be_drawn_are_named(tmp_path, error, text, tabs):
+    with pytest.raises(error, match=text):
+        record_curves(tabs, tmp_path / "c.rrd", application="koopmpc-test", page="")

@@ -3,28 +3,19 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.recording.viewer import screenshot
-from koopmpc.recording.views.curves import Curves, record_curves
 from tests.figures.models import turning
 from tests.recording.runs import about, make_run, steps_of
 from tests.recording.test_model import BILINEAR, DATA, DEFECTIVE
 
 RUN = make_run()
-TAB = Curves("one", 0.1, ("x",), {"truth": np.zeros((3, 1))})
-WIDE = Curves("one", 0.1, ("x", "y"), {"truth": np.zeros((3, 1))})
 
 
 def recorded(path: Path, **more: Any) -> None:
     with km.Recorder(path, **(about(RUN) | more)) as recorder:
         recorder(steps_of(RUN)[0])
-
-
-def curves(*tabs: Curves, path: Path) -> None:
-    record_curves(tabs, path, application="koopmpc-test", page="")
 
 
 def model(predictor: Any, path: Path, **more: Any) -> None:
@@ -41,7 +32,7 @@ def notes(folder: Path) -> Path:
     return folder / "notes.rrd"
 
 
-DATA_ERROR, SHAPE, LOG = km.errors.DataError, km.errors.ShapeError, km.errors.LogError
+DATA_ERROR, LOG = km.errors.DataError, km.errors.LogError
 MISTAKES = [
     (LOG, r"is a folder; pass the path of a file in it", lambda f: km.record(RUN, f)),
     (LOG, r"file/run\.rrd cannot be written: .+; pass another path", lambda f: km.record(RUN, below_a_file(f))),
@@ -60,12 +51,8 @@ MISTAKES = [
     (LOG, r"nowhere\.rrd does not exist; pass the \.rrd of a run", lambda f: km.view([f / "nowhere.rrd"])),
     (LOG, r"notes\.rrd is no log of koopmpc: it does not start as", lambda f: km.view(notes(f))),
     (LOG, r"no log to open; pass the \.rrd of a run", lambda f: km.view([])),
-    (LOG, r"is a folder; pass the \.rrd of a run", lambda f: screenshot(f, "picture.png", time=0.0)),
+    (LOG, r"is a folder; pass the \.rrd of a run", lambda f: km.view(f)),
     (LOG, r"notes\.rrd is no log of koopmpc", lambda f: km.load_episodes(notes(f))),
-    (DATA_ERROR, r"there is no curve to record", lambda f: curves(path=f / "c.rrd")),
-    (DATA_ERROR, r"two tabs are called 'one'", lambda f: curves(TAB, TAB, path=f / "c.rrd")),
-    (SHAPE, r"truth has shape \(3, 1\), expected \(any, 2\)", lambda f: curves(WIDE, path=f / "c.rrd")),
-    (LOG, r"is a folder", lambda f: curves(TAB, path=f)),
     (DATA_ERROR, r"episode 0 has 30 steps, the horizon is 31", lambda f: model(turning(), f / "a.rrd", horizon=31)),
     (
         DATA_ERROR,
