@@ -29,10 +29,10 @@ def _every_qp_meets_kkt():
         yield
         return
     import koopmpc.control.target
-    from koopmpc.control.linear import koopman_mpc
+    from koopmpc.control import solvers
     from tests.control.kkt import CheckedDAQP, CheckedOSQP
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(koopman_mpc.SOLVERS, "osqp", CheckedOSQP)
+        patch.setitem(solvers.SOLVERS, "osqp", CheckedOSQP)
         patch.setattr(koopmpc.control.target, "DAQP", CheckedDAQP)
         yield

@@ -9,8 +9,9 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking, root
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QP, QPSolver
+from koopmpc.control.solvers.base import QPSolver
 from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.solvers.qp import QP
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor

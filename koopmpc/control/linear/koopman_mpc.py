@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from time import perf_counter
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -16,21 +16,14 @@ from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan_map import PlanMap
 from koopmpc.control.move import Move, Plan, Status
-from koopmpc.control.solvers.base import QPSolver
-from koopmpc.control.solvers.daqp import DAQP
-from koopmpc.control.solvers.osqp import OSQP
-from koopmpc.control.solvers.step import Choice, StepSolver
+from koopmpc.control.solvers import SOLVERS, SolverName
+from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
-SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP}
-# Total time of a step, measured on random closed loops: where OSQP has not converged by then it rarely does soon.
-BOUND: Mapping[str, Any] = {"max_iter": 100}
-# DAQP is exact to rounding in either, and needs a Hessian whose condition number does not grow with the horizon.
-COORDINATES: Mapping[str, Coordinates] = {"osqp": "auto", "daqp": "riccati"}
 _VIEWS = ("_met", "_met_low", "_met_high")
 
 
@@ -98,7 +91,7 @@ class KoopmanMPC(MPCBase):
         estimator: Estimator | None = None,
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
-        solver: Literal["osqp", "daqp"] = "osqp",
+        solver: SolverName = "osqp",
         settings: Mapping[str, Any] | None = None,
         time_limit: float | None = None,
     ) -> None:
@@ -118,12 +111,12 @@ class KoopmanMPC(MPCBase):
             track,
             self._blocks,
             disturbed=self._disturbed,
-            coordinates=self._wanted or COORDINATES[solver],
+            coordinates=self._wanted or SOLVERS[solver].coordinates,
         )
-        own = settings or {}
-        bounded = [Choice(SOLVERS["osqp"], {**BOUND, **own})] if solver == "osqp" else []
-        exact = Choice(SOLVERS["daqp"], {} if bounded else own)
-        self._qps = StepSolver(self._map.qp, [*bounded, exact, Choice(SOLVERS["osqp"], {}, late=True)])
+        asked = SOLVERS[solver]
+        exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
+        choices = [Choice(asked, {**asked.impatient, **(settings or {})}), *exact]
+        self._qps = StepSolver(self._map.qp, [*choices, Choice(SOLVERS["osqp"], {}, late=True)])
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.tracked)))

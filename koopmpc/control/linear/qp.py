@@ -10,7 +10,7 @@ from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.limits import Interval, Softness, allowance
 from koopmpc.control.linear.condense import Condensed, row_sizes
 from koopmpc.control.linear.horizon import Horizon
-from koopmpc.control.solvers.step import StepQP
+from koopmpc.control.solvers.qp import StepQP
 
 
 class Group(NamedTuple):

@@ -1,66 +1,21 @@
-"""One QP in, one solution out: the record of a QP, and what all solvers share."""
+"""Who solves the QP of a step: what all solvers share, and which of them are asked one after the other."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-import scipy.sparse
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.limits import Softness
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
+from koopmpc.control.solvers.qp import INFINITY, QP, QPSolution, StepQP
 from koopmpc.errors import DataError, ShapeError
 
-INFINITY = 1e30  # what OSQP and DAQP take for no limit
 _BELOW_ROUNDING = 1e26  # ‖by‖² up to which 1e30 less an entry of it is 1e30
-
-
-@dataclass(frozen=True)
-class QP:
-    """½ vᵀP v + qᵀv → min, low ≤ A v ≤ high; P ⪰ 0 dense, ±inf where there is no limit.
-
-    Where there is a `softness`, a row whose linear price is finite may be broken by ε ≥ 0 at linear ε + quadratic ε².
-    A solver that is not `exact` keeps such rows, too; its answer is that of the QP where no multiplier is above the
-    linear price.
-    """
-
-    P: Float[np.ndarray, "n n"]
-    q: Float[np.ndarray, " n"]
-    A: Float[np.ndarray, "m n"]
-    low: Float[np.ndarray, " m"]
-    high: Float[np.ndarray, " m"]
-    softness: Softness | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("P", "q", "A"):
-            checks.array(getattr(self, name), f"the QP's {name}")
-        for name in ("low", "high"):
-            checks.array(getattr(self, name), f"the QP's {name}", infinite=True)
-        m, n = self.A.shape
-        if self.P.shape != (n, n) or self.q.shape != (n,) or not self.low.shape == self.high.shape == (m,):
-            raise ShapeError(
-                f"the QP has A {self.A.shape}, P {self.P.shape}, q {self.q.shape}, low {self.low.shape} and"
-                f" high {self.high.shape}; pass A (m, n), P (n, n), q (n,), low and high (m,)"
-            )
-        checks.crossed(self.low, self.high, "the QP's")
-
-    def sparse(self) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csc_matrix]:
-        """Return the upper triangle of P, and A, in compressed columns."""
-        return scipy.sparse.csc_matrix(np.triu(self.P)), scipy.sparse.csc_matrix(self.A)
-
-
-@dataclass(slots=True)
-class QPSolution:
-    """Minimiser v, multipliers y of low ≤ A v ≤ high (positive at the upper end), how the solve ended, and in whom."""
-
-    v: Float[np.ndarray, " n"]
-    y: Float[np.ndarray, " m"]
-    status: Status
-    iterations: int
-    solver: str
+_AFTER = 5e-5  # what a step still has to do after its solve [s]
 
 
 class QPSolver(ABC):
@@ -72,14 +27,41 @@ class QPSolver(ABC):
     name: ClassVar[str]
     exact: ClassVar[bool]
     """Whether it knows soft rows, and its INFEASIBLE is certain."""
+    impatient: ClassVar[Mapping[str, Any]] = {}
+    """The settings with which it is asked first, while another one may still take over."""
+    coordinates: ClassVar[Literal["auto", "riccati", "plain"]] = "riccati"
+    """The coordinates of the condensed QP that suit it: in "riccati" the Hessian is the identity; see `condense`."""
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._settings = dict(settings or {})
         self._hold(qp)
+        self._setup()
+
+    @abstractmethod
+    def _setup(self) -> None:
+        """Set up the QP that is held in the solver, with the limits `low` and `high`."""
 
     def _hold(self, qp: QP) -> None:
-        """Make this the problem, its limits in arrays of their own, cut to ±INFINITY."""
-        m = len(qp.low)
+        """Make this the problem, its limits in arrays of their own, cut to ±INFINITY.
+
+        Raises
+        ------
+        ShapeError
+            The parts of the QP do not fit together.
+        DataError
+            It holds NaN, or its limits cross.
+        """
+        for name in ("P", "q", "A"):
+            checks.array(getattr(qp, name), f"the QP's {name}")
+        for name in ("low", "high"):
+            checks.array(getattr(qp, name), f"the QP's {name}", infinite=True)
+        m, n = qp.A.shape
+        if qp.P.shape != (n, n) or qp.q.shape != (n,) or not qp.low.shape == qp.high.shape == (m,):
+            raise ShapeError(
+                f"the QP has A {qp.A.shape}, P {qp.P.shape}, q {qp.q.shape}, low {qp.low.shape} and"
+                f" high {qp.high.shape}; pass A (m, n), P (n, n), q (n,), low and high (m,)"
+            )
+        checks.crossed(qp.low, qp.high, "the QP's")
         self._qp = qp
         self._own = np.stack([np.maximum(qp.low, -INFINITY), np.minimum(qp.high, INFINITY)])
         self._now, self._spare = self._own.copy(), np.empty((2, m))
@@ -147,3 +129,152 @@ class QPSolver(ABC):
     @abstractmethod
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
         """Solve within the limits `low` and `high`."""
+
+
+class Choice(NamedTuple):
+    """A solver and its own settings; a `late` one is set up when it is first needed."""
+
+    solver: type[QPSolver]
+    settings: Mapping[str, Any]
+    late: bool = False
+
+
+class StepSolver:
+    """The QP of a step, by the first of some solvers that has an answer, started from the last one moved on by a step.
+
+    After a step that another than the first had to finish, that one is asked first, until a plan is free of limits:
+    where a first-order method has met its bound it will in the next step, too, and an active-set method then needs few
+    iterations.
+
+    Parameters
+    ----------
+    qp
+        The QP; its limits move with the plan.
+    choices
+        The solvers in the order in which they are asked.
+    """
+
+    def __init__(self, qp: StepQP, choices: Sequence[Choice]) -> None:
+        self._choices = choices
+        self._solvers = [None if choice.late else choice.solver(qp, choice.settings) for choice in choices]
+        self._turn = 0
+        self._last: QPSolution | None = None
+        self._hold(qp)
+
+    def _hold(self, qp: StepQP) -> None:
+        """Make this the QP; its rows are often those of the plan, one after the other."""
+        self.qp = qp
+        m, n = qp.A.shape
+        first = int(qp.source[0]) if m else 0
+        self._rows = slice(first, first + m) if qp.source.tolist() == list(range(first, first + m)) else qp.source
+        self._soft = bool(np.isfinite(qp.softness.linear).any())
+        self._moved, self._cold = np.zeros(m), (np.zeros(n), np.zeros(m))
+
+    def update(self, qp: StepQP) -> None:
+        """Go on with new matrices of the same size; the warm start is kept."""
+        for solver in self._solvers:
+            if solver is not None:
+                solver.update(qp)
+        self._hold(qp)
+
+    def cool(self) -> None:
+        """Forget the last answer."""
+        self._last = None
+
+    def rest(self) -> None:
+        """Forget the last answer, and who had to find it: the plan is free of limits."""
+        self._last, self._turn = None, 0
+
+    def reset(self) -> None:
+        """Forget all earlier solves, so that a run repeats to the bit."""
+        self.rest()
+        for solver in self._solvers:
+            if solver is not None:
+                solver.reset()
+
+    def solve(
+        self, plan: Float[np.ndarray, " nv"], room: Interval | None, deadline: float | None
+    ) -> tuple[QPSolution, float]:
+        """Return the least deviation w from the plan, and how far a soft limit gave way, 0 where none did.
+
+        Parameters
+        ----------
+        room
+            How far each input is from its limits, lower and upper, where a hard rate limits it: where the two
+            exclude each other the input limit wins.
+        deadline
+            The time by `perf_counter` at which the step must have ended; None for none.
+        """
+        qp, moved, limits, conflict = self.qp, self._moved, None, 0.0
+        np.multiply(plan[self._rows], qp.scale, out=moved)
+        if room is not None:
+            limits, conflict = self._widened(room)
+        found, answers = self._ask(self._turn, moved, limits, deadline)
+        iterations = found.iterations
+        for i in [] if answers else [i for i in range(len(self._solvers)) if i != self._turn]:
+            if deadline is not None and perf_counter() >= deadline:
+                found.status = Status.TIME_LIMIT
+                break
+            found, answers = self._ask(i, moved, limits, deadline)
+            iterations += found.iterations
+            if answers:
+                self._turn = i
+                break
+            if found.status is Status.OPTIMAL:  # it keeps a row that has to give way
+                found.status = Status.FAILED
+        found.iterations = iterations
+        self._last = found if found.status is Status.OPTIMAL else None
+        if self._last is not None and self._soft:
+            conflict = max(conflict, self._gave_way(found, moved, limits))
+        return found, conflict
+
+    def _ask(
+        self, i: int, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
+    ) -> tuple[QPSolution, bool]:
+        """Return what solver i finds, and whether it is the answer; one that is not exact has half of the time."""
+        solver = self._solvers[i]
+        if solver is None:
+            solver = self._solvers[i] = self._choices[i].solver(self.qp, self._choices[i].settings)
+        if limits is None:
+            solver.shift(moved)
+        else:
+            solver.set_bounds(limits.low - moved, limits.high - moved)
+        start, last = self._cold, self._last
+        if last is not None:
+            start = np.append(last.v, 0.0)[self.qp.shift_primal], np.append(last.y, 0.0)[self.qp.shift_dual]
+        left = None
+        if deadline is not None:
+            left = deadline - perf_counter()
+            left = left / 2 if i == 0 and not solver.exact else left
+            left -= min(_AFTER, left / 2)
+        found = solver.solve(*start, left)
+        if solver.exact:
+            return found, found.status is Status.OPTIMAL or found.status is Status.INFEASIBLE
+        solved = found.status is Status.OPTIMAL
+        return found, solved and (not self._soft or bool(np.all(np.abs(found.y) <= self.qp.softness.linear)))
+
+    def _gave_way(self, found: QPSolution, moved: Float[np.ndarray, " m"], limits: Interval | None) -> float:
+        """Return the largest violation of a soft row above its allowance, in the unit of its limit."""
+        qp = self.qp
+        pushed = np.abs(found.y) >= (1 - 1e-9) * qp.softness.linear
+        if not pushed.any():
+            return 0.0
+        low, high = (qp.low, qp.high) if limits is None else limits
+        rows = np.flatnonzero(pushed)
+        value = qp.A[rows] @ found.v + moved[rows]
+        past = np.maximum(value - high[rows], low[rows] - value) / qp.scale[rows]
+        return float(past[past > qp.allowance[rows]].max(initial=0.0))
+
+    def _widened(self, room: Interval) -> tuple[Interval, float]:
+        """Return the limits with the first rates as wide as the input limits need, and by how much, in their unit."""
+        qp = self.qp
+        low, high = qp.low.copy(), qp.high.copy()
+        rows, which = qp.rate_rows, qp.rate_inputs
+        scale = qp.scale[rows]
+        lowest = np.minimum(low[rows], room.high[which] * scale)
+        highest = np.maximum(high[rows], room.low[which] * scale)
+        below, above = lowest < low[rows], highest > high[rows]  # never where there is no limit
+        past = np.where(below, low[rows], 0.0) - np.where(below, lowest, 0.0)
+        past += np.where(above, highest, 0.0) - np.where(above, high[rows], 0.0)
+        low[rows], high[rows] = lowest, highest
+        return Interval(low, high), float((past / scale)[past > 1e-9].max(initial=0.0))

@@ -23,7 +23,8 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver
+from koopmpc.control.solvers.base import QPSolver
+from koopmpc.control.solvers.qp import INFINITY, QP, QPSolution
 from koopmpc.errors import DataError
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
@@ -61,22 +62,24 @@ class DAQP(QPSolver):
     """
 
     name = "daqp"
-    exact = True
+    exact = True  # to rounding in any coordinates, but its time grows with cond(H)
 
-    def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
-        super().__init__(qp, settings)
+    def _setup(self) -> None:
         self._model = _model(self._settings)
         known = self._model.settings
         self._time_limit = self._allowed = known["time_limit"]
         self._most = self._few = known["iter_limit"]
         self._pace = 1e-9  # how long an iteration takes [s], once it is known
         self._scale()
-        free = np.full(len(qp.low), INFINITY)
+        free = np.full(len(self.low), INFINITY)
         flag, _ = self._model.setup(self._H, self._f, self._M, free, -free, self._sense)
         if flag < 0:
             raise DataError(f"DAQP refuses the problem, exit flag {flag}; pass a convex QP, P ⪰ 0")
         self._mixed = self._unmet = self._soft and not self._sense.all()
-        self._kept: DAQP | None = None  # the hard rows alone
+        self._hard: DAQP | None = None  # the hard rows alone
+        if self._mixed:
+            hard, qp = self._sense != _SOFT, self._qp
+            self._hard = DAQP(QP(qp.P, qp.q, qp.A[hard], qp.low[hard], qp.high[hard]), self._settings)
         if self._soft:
             linear, rho = (np.where(self._sense == _SOFT, part, 0.0) for part in (self._linear, 1 / self._curved))
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
@@ -131,11 +134,11 @@ class DAQP(QPSolver):
         Where soft rows are far outside, DAQP moves through all of these before it finds that out; it is asked at once
         where it was so in the last solve.
         """
-        hard, qp = self._sense != _SOFT, self._qp
-        if self._kept is None:
-            self._kept = DAQP(QP(qp.P, qp.q, qp.A[hard], qp.low[hard], qp.high[hard]), self._settings)
-        self._kept.set_bounds(self.low[hard], self.high[hard])
-        found = self._kept.solve(np.zeros_like(qp.q), np.zeros(int(hard.sum())), time_limit)
+        if self._hard is None:
+            return False
+        own, rows = self._hard, self._sense != _SOFT
+        own.low[:], own.high[:] = self.low[rows], self.high[rows]
+        found = own.solve(np.zeros_like(self._qp.q), np.zeros(len(own.low)), time_limit)
         self._unmet = found.status is Status.INFEASIBLE
         return self._unmet
 

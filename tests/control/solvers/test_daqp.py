@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.solvers.qp import QP
 from tests.bare import shown
 from tests.control.solvers.random_qps import exactness, random_qp
 
@@ -127,7 +127,7 @@ def test_settings_that_daqp_would_swallow():
         box(time_limit=np.nan)
     (line,) = shown(
         """
-from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.qp import QP
 from koopmpc.control.solvers.daqp import DAQP
 one = np.ones(1)
 show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5}))

@@ -4,8 +4,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.osqp import OSQP
+from koopmpc.control.solvers.qp import QP
 from tests.bare import shown
 from tests.control.kkt import meets_kkt
 
@@ -79,20 +79,21 @@ def test_what_osqp_would_swallow_is_refused():
 def test_a_qp_that_does_not_fit_is_refused():
     eye, one = np.eye(2), np.ones(2)
     with pytest.raises(km.errors.DataError, match=r"the QP's q holds 1 NaN or inf, the first at \(1,\)"):
-        QP(eye, np.array([0, np.nan]), eye, -one, one)
+        OSQP(QP(eye, np.array([0, np.nan]), eye, -one, one))
     with pytest.raises(km.errors.DataError, match=r"the QP's low holds NaN; use ±inf"):
-        QP(eye, one, eye, np.array([0, np.nan]), one)
+        OSQP(QP(eye, one, eye, np.array([0, np.nan]), one))
     with pytest.raises(km.errors.DataError, match=r"the QP's limits cross at index 0: lower 1 is above upper -1"):
-        QP(eye, one, eye, one, -one)
+        OSQP(QP(eye, one, eye, one, -one))
     lines = shown(
         """
-from koopmpc.control.solvers.base import QP
+from koopmpc.control.solvers.osqp import OSQP
+from koopmpc.control.solvers.qp import QP
 eye, one = np.eye(2), np.ones(2)
-show(lambda: QP(eye, one[:1], eye, -one, one))
-show(lambda: QP(np.eye(3), one, eye, -one, one))
-show(lambda: QP(eye, one, np.ones((2, 3)), -one, one))
-show(lambda: QP(eye, one, eye, -one[:1], one))
-show(lambda: QP(eye, one, eye, -one, np.ones(3)))
+show(lambda: OSQP(QP(eye, one[:1], eye, -one, one)))
+show(lambda: OSQP(QP(np.eye(3), one, eye, -one, one)))
+show(lambda: OSQP(QP(eye, one, np.ones((2, 3)), -one, one)))
+show(lambda: OSQP(QP(eye, one, eye, -one[:1], one)))
+show(lambda: OSQP(QP(eye, one, eye, -one, np.ones(3))))
 """
     )
     got = ["q (1,)", "P (3, 3)", "A (2, 3)", "low (1,)", "high (3,)"]
