@@ -1,15 +1,16 @@
 """The quadratic Cost that every controller and every metric shares, and what of a model it and the Limits read."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.limits import Interval, Limits, SizedLimits, Softness
+from koopmpc.control.limits import Interval, Limits, Softness
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.state import State
@@ -128,7 +129,8 @@ class Tracking(Generic[Read]):
     Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
     `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. R_delta and
     `rates` are None where the change of the inputs is free, and `with_rates` says whether it counts. `hard_rates` are
-    those of `SizedLimits`.
+    those of `SizedLimits`. `given` are the rows of a u_target that is given as numbers, None for one by name. `Q_root`
+    and `R_root` are S with SᵀS = Q and R.
     """
 
     tracked: Read
@@ -143,6 +145,9 @@ class Tracking(Generic[Read]):
     outputs: Interval
     softness: Softness
     with_rates: bool
+    given: Float[np.ndarray, "T nu"] | None
+    Q_root: Float[np.ndarray, "nr nr"]
+    R_root: Float[np.ndarray, "nu nu"]
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
@@ -162,8 +167,8 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> L
     C, G, nx = observed(predictor, cost.of), predictor.C, predictor.nx
     if limits.of is not None:
         G = np.vstack([G, observed(predictor, limits.of)])
-    given = limits.sized(nx, len(G) - nx, predictor.nu)
-    return _tracking(C, np.ascontiguousarray(G[given.rows.kept]), cost, len(C), given)
+    sizes = nx, len(G) - nx, predictor.nu
+    return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), sizes)
 
 
 def state_tracking(
@@ -178,30 +183,64 @@ def state_tracking(
     x, of = point[:nx], cost.of.bind(states)
     bound = None if limits.of is None else limits.of.bind(states)
     values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    given = limits.sized(nx, 0 if bound is None else bound.nz, nu)
-    kept = np.flatnonzero(given.rows.kept).tolist()
-    tracked = ca.Function("tracked", [point], [ca.densify(of.symbolic(x))])
-    limited = ca.Function("limited", [point], [ca.densify(values[kept, 0])])
-    return _tracking(tracked, limited, cost, of.nz, given)
+    sizes = nx, 0 if bound is None else bound.nz, nu
+    return _tracking(
+        ca.Function("tracked", [point], [ca.densify(of.symbolic(x))]),
+        lambda kept: ca.Function("limited", [point], [ca.densify(values[np.flatnonzero(kept).tolist(), 0])]),
+        cost,
+        limits,
+        of.nz,
+        sizes,
+    )
 
 
-def _tracking(tracked: Read, limited: Read, cost: Cost, nr: int, given: SizedLimits) -> Tracking[Read]:
-    """Return the record of these maps with the limits, and the weights of `nr` tracked outputs."""
-    nu = len(given.inputs.low)
-    (Q, R), R_delta = cost.matrices(nr, nu), cost.rate(nu)
+def _tracking(
+    tracked: Read,
+    limited: Callable[[Bool[np.ndarray, " n"]], Read],
+    cost: Cost,
+    limits: Limits,
+    nr: int,
+    sizes: tuple[int, int, int],
+) -> Tracking[Read]:
+    """Return the weights and limits of nr tracked outputs, `sizes` those of the state, of the observables and of u.
+
+    `limited` makes the map of those outputs that have a limit.
+
+    Raises
+    ------
+    DataError
+        A row of u_target is outside the limits of the inputs.
+    """
+    nu = sizes[2]
+    (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
+    Q_root, R_root = root(Q), root(R)
+    sized = limits.sized(*sizes)
+    low, high = sized.inputs
+    if rows is not None:
+        reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
+        outside = np.argwhere((rows < low - reach) | (rows > high + reach))
+        if len(outside):
+            k, i = outside[0]
+            raise DataError(
+                f"u_target is {rows[k, i]:g} for input {i} in row {k}, outside its limits {low[i]:g} … {high[i]:g};"
+                " pass inputs that the limits allow"
+            )
     return Tracking(
         tracked,
-        limited,
+        limited(sized.rows.kept),
         Q,
         R,
         R_delta,
-        given.inputs,
-        given.rates,
-        given.hard_rates,
-        given.rate_softness,
-        given.rows.box,
-        given.rows.softness,
-        with_rates=R_delta is not None or given.rates is not None,
+        sized.inputs,
+        sized.rates,
+        sized.hard_rates,
+        sized.rate_softness,
+        sized.rows.box,
+        sized.rows.softness,
+        R_delta is not None or sized.rates is not None,
+        rows,
+        Q_root,
+        R_root,
     )
 
 

@@ -24,10 +24,14 @@ class Interval(NamedTuple):
 
 
 class Softness(NamedTuple):
-    """linear ε + quadratic ε² is what a row's violation ε costs; linear = inf is a hard row."""
+    """linear ε + quadratic ε² is what a row's violation ε costs; linear = inf is a hard row.
+
+    A violation above its `allowance`, 1e-4 (1 + |limit|), is reported.
+    """
 
     linear: Float[np.ndarray, " n"]
     quadratic: Float[np.ndarray, " n"]
+    allowance: Float[np.ndarray, " n"]
 
 
 class LimitRows(NamedTuple):
@@ -124,13 +128,17 @@ class Limits(Value):
 
     def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
-        low = -np.asarray(self.du_max) if self.du_min is None and self.du_max is not None else self.du_min
-        box = _box(low, self.du_max, "du_min", "du_max", nu)
+        box = self._rates(nu)
         return box if (np.isfinite(box.low) | np.isfinite(box.high)).any() else None
+
+    def _rates(self, nu: int) -> Interval:
+        low = -np.asarray(self.du_max) if self.du_min is None and self.du_max is not None else self.du_min
+        return _box(low, self.du_max, "du_min", "du_max", nu)
 
     def rate_softness(self, nu: int) -> Softness:
         """Return how soft the rate limits of each input are."""
-        return _softness(self.du_slack, "du_slack", nu, "one an input")
+        linear, quadratic = _prices(self.du_slack, "du_slack", nu, "one an input")
+        return Softness(linear, quadratic, allowance(self._rates(nu)))
 
     def sized(self, nx: int, ny: int, nu: int) -> SizedLimits:
         """Return all limits of a model with `nx` states, `ny` observables `of` (0 without one) and `nu` inputs."""
@@ -154,11 +162,12 @@ class Limits(Value):
         (x_low, x_high), (y_low, y_high) = self.states(nx), self.outputs(ny) if ny else _NONE
         low, high = np.concatenate([x_low, y_low]), np.concatenate([x_high, y_high])
         mine = np.repeat([_given(self.x_min, self.x_max), _given(self.y_min, self.y_max)], [nx, ny])
-        given = _softness(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
+        given = _prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
         linear, quadratic = np.full(nx + ny, np.inf), np.zeros(nx + ny)
         linear[mine], quadratic[mine] = given
         kept = np.isfinite(low) | np.isfinite(high)
-        return LimitRows(kept, Interval(low[kept], high[kept]), Softness(linear[kept], quadratic[kept]))
+        box = Interval(low[kept], high[kept])
+        return LimitRows(kept, box, Softness(linear[kept], quadratic[kept], allowance(box)))
 
 
 _NONE = Interval(np.zeros(0), np.zeros(0))
@@ -167,11 +176,6 @@ _NONE = Interval(np.zeros(0), np.zeros(0))
 def allowance(box: Interval) -> Float[np.ndarray, " n"]:
     """Return the slack of each row up to which its limit counts as kept: 1e-4 (1 + |limit|)."""
     return SOFTENED * (1 + np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)))
-
-
-def softened(slacks: Float[np.ndarray, "N ng"], outputs: Interval) -> float:
-    """Return the largest slack of a soft limit that gives way by more than 1e-4 (1 + |limit|); 0 where none does."""
-    return float(slacks[slacks > allowance(outputs)].max(initial=0.0)) if slacks.size else 0.0
 
 
 def beyond(value: Float[np.ndarray, " n"], box: Interval) -> float:
@@ -205,9 +209,12 @@ def _weights(slack: Slack, name: str) -> Slack:
     return (linear if linear.ndim else float(linear)), (quadratic if quadratic.ndim else float(quadratic))
 
 
-def _softness(slack: Slack | None, name: str, n: int, what: str) -> Softness:
+def _prices(
+    slack: Slack | None, name: str, n: int, what: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the linear and quadratic price of n rows."""
     if slack is None:
-        return Softness(np.full(n, np.inf), np.zeros(n))
+        return np.full(n, np.inf), np.zeros(n)
     parts = [checks.array(weight, name, infinite=True) for weight in slack]
     for part in parts:
         if part.ndim and part.shape != (n,):
@@ -216,7 +223,7 @@ def _softness(slack: Slack | None, name: str, n: int, what: str) -> Softness:
     free = np.flatnonzero(linear + quadratic == 0)
     if free.size:
         raise DataError(f"{name} has both weights zero at index {int(free[0])}; a limit that costs nothing is none")
-    return Softness(linear, quadratic)
+    return linear, quadratic
 
 
 def _require_room(

@@ -11,7 +11,7 @@ from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import Gain
-from koopmpc.control.target import given_inputs, reference_rows, targets_of
+from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import Measured
@@ -56,7 +56,7 @@ class LQR:
         self.gain, self._v = Gain(rest.K, rest.P), rest.v  # the feedforward of [w; r; u_r]
         self._K, self._K_rate = np.split(rest.K, [predictor.nz], axis=1)  # the second is of u_{k−1}
         self._targets, self._inputs, self._nr = targets_of(predictor, cost, track), track.inputs, len(C)
-        self._given_rows = given_inputs(cost, track.inputs)
+        self._given_rows = track.given
         self._rates = track.rates
         self._observer = Measured(predictor)
         self._reference_key: tuple[bytes, int] | None = None

@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, LiftedTracking, root
+from koopmpc.control.cost import Cost, LiftedTracking
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.qp import QP
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.errors import ShapeError
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -103,14 +103,14 @@ def targets_of(predictor: LinearPredictor, cost: Cost, tracking: LiftedTracking)
     """Return the equilibria of a predictor under a cost and limits."""
     track, hold = tracking, isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
     A, B, constant = predictor.A, predictor.B, predictor.lifting.constant_index
-    return targets(A, B, track.tracked, track.Q, track.inputs, track.limited, track.outputs, constant, hold=hold)
+    return targets(A, B, track.tracked, track.Q_root, track.inputs, track.limited, track.outputs, constant, hold=hold)
 
 
 def targets(
     A: Float[np.ndarray, "nz nz"],
     B: Float[np.ndarray, "nz nu"],
     C: Float[np.ndarray, "nr nz"],
-    Q: Float[np.ndarray, "nr nr"],
+    Q_root: Float[np.ndarray, "nr nr"],
     inputs: Interval,
     G: Float[np.ndarray, "ng nz"],
     outputs: Interval,
@@ -122,6 +122,8 @@ def targets(
 
     Parameters
     ----------
+    Q_root
+        S with SᵀS = Q.
     constant
         Index of the Constant observable, pinned to 1.
     hold
@@ -142,9 +144,8 @@ def targets(
     if constant is not None:
         base[constant] = 1.0
     z0, u0, Z, W = base[:nz], base[nz:], span[:nz], span[nz:]
-    S = root(Q)
-    weighted = S @ C @ Z
-    back = np.linalg.pinv(weighted, rcond=TOLERANCE) @ S
+    weighted = Q_root @ C @ Z
+    back = np.linalg.pinv(weighted, rcond=TOLERANCE) @ Q_root
     rows, values = np.vstack([W, G @ Z]), np.concatenate([u0, G @ z0])
     rows_disturbance = np.vstack([pushed[nz:], G @ pushed[:nz]])
     return Targets(
@@ -164,30 +165,6 @@ def targets(
         weighted=weighted,
         from_disturbance=-back @ C @ pushed[:nz],
     )
-
-
-def given_inputs(cost: Cost, inputs: Interval) -> Float[np.ndarray, "T nu"] | None:
-    """Return the rows of a u_target that is given as numbers, None for one by name.
-
-    Raises
-    ------
-    ShapeError
-        The rows have another number of inputs.
-    DataError
-        A row is outside the limits of the inputs.
-    """
-    rows = cost.given_inputs(len(inputs.low))
-    if rows is None:
-        return None
-    reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
-    outside = np.argwhere((rows < inputs.low - reach) | (rows > inputs.high + reach))
-    if len(outside):
-        k, i = outside[0]
-        raise DataError(
-            f"u_target is {rows[k, i]:g} for input {i} in row {k}, outside its limits {inputs.low[i]:g} …"
-            f" {inputs.high[i]:g}; pass inputs that the limits allow"
-        )
-    return rows
 
 
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:

@@ -155,11 +155,11 @@ def _written_down(kind, mpc, limits, pair, weights, scale, hard_rates):
     ]
     soft_rates, price = limits.rate_softness(nu), limits.rows(nx, 0)
     prices = [np.full(nx, fill) for fill in (np.inf, 0.0)]
-    for whole, part in zip(prices, price.softness, strict=True):
+    for whole, part in zip(prices, price.softness[:2], strict=True):
         whole[price.kept] = part
     linear, quadratic = (
         np.concatenate([np.full(N * nu, fill), np.tile(rate, N), np.tile(state, N)])
-        for fill, rate, state in zip((np.inf, 0.0), soft_rates, prices, strict=True)
+        for fill, rate, state in zip((np.inf, 0.0), soft_rates[:2], prices, strict=True)
     )
     rows = Rows(np.vstack([np.eye(N * nu), change, forced]), *ends, linear, quadratic)
     half = np.linalg.cholesky(H)

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.limits import softened
 from tests.bare import shown
 
 
@@ -83,10 +82,15 @@ def test_limits_that_make_no_sense():
 
 
 def test_a_slack_is_reported_above_its_tolerance():
-    box = km.Limits(x_min=-1, x_max=9).states(2)
-    assert softened(np.zeros((3, 0)), box) == 0
-    assert softened(np.full((3, 2), 0.9e-3), box) == 0
-    assert softened(np.array([[0, 0], [0, 1.1e-3]]), box) == 1.1e-3
+    """The tolerance is 1e-4 (1 + |limit|), and the state stays where it is: no input may push it down."""
+    model = km.LinearPredictor([[1.0]], [[1.0]], [[1.0]], km.State(), 0.1, ("x",), ("u",))
+    cost, limits = km.Cost(Q=1, R=1), km.Limits(u_min=0, u_max=1, x_min=-1, x_max=9)
+    for make in (km.KoopmanMPC, km.BilinearMPC, km.NonlinearMPC):
+        mpc = make(model, cost, limits, 3)
+        assert mpc([9 + 0.9e-3], [9]).slack == 0
+        above = mpc([9 + 1.1e-3], [9])
+        assert above.status is km.Status.SOFTENED
+        assert above.slack == pytest.approx(1.1e-3, rel=1e-3)
 
 
 def test_choices_of_a_name():

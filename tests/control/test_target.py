@@ -34,7 +34,7 @@ def test_without_limits_it_is_the_nearest_equilibrium(seed, nz, nu, constant):
     rng, A, B, C, Q, pinned = system(seed, nz, nu, constant)
     nothing = np.zeros((0, len(A)))
     free, no = Interval(np.full(nu, -np.inf), np.full(nu, np.inf)), Interval(np.zeros(0), np.zeros(0))
-    found = targets(A, B, C, Q, free, nothing, no, pinned, hold=True)
+    found = targets(A, B, C, np.linalg.cholesky(Q).T, free, nothing, no, pinned, hold=True)
     R = rng.normal(size=(3, len(C)))
     for r, alpha in zip(R, found.coordinates(R), strict=True):
         z, u = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha
@@ -42,7 +42,7 @@ def test_without_limits_it_is_the_nearest_equilibrium(seed, nz, nu, constant):
         other, _ = equilibrium(A, B, C, Q, r, pinned)
         distance = lambda v, r=r: (C @ v - r) @ Q @ (C @ v - r)  # noqa: E731
         assert distance(z) <= distance(other) * (1 + 1e-6) + 1e-9 * np.trace(Q)
-    at_zero = targets(A, B, C, Q, free, nothing, no, pinned, hold=False)
+    at_zero = targets(A, B, C, np.linalg.cholesky(Q).T, free, nothing, no, pinned, hold=False)
     assert not at_zero.u0.any()
     assert not at_zero.W.any()
     np.testing.assert_array_equal(at_zero.coordinates(R), found.coordinates(R))
@@ -55,7 +55,7 @@ def test_with_limits_it_is_the_nearest_inside_them(seed, nz, nu, size):
     G = rng.normal(size=(int(rng.integers(0, 3)), nz))
     inputs = Interval(-(high := rng.uniform(0.1, 1, nu)), high)
     outputs = Interval(-(high := rng.uniform(0.1, 2, len(G))), high)
-    found = targets(A, B, C, Q, inputs, G, outputs, None, hold=True)
+    found = targets(A, B, C, np.linalg.cholesky(Q).T, inputs, G, outputs, None, hold=True)
     r = size * rng.normal(size=len(C))
     alpha = found.coordinates(r[None])[0]
     z, u = found.z0 + found.Z @ alpha, found.u0 + found.W @ alpha

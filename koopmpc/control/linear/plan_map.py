@@ -9,7 +9,7 @@ from koopmpc.control.linear.condense import Coordinates, condense, scaled
 from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
 from koopmpc.control.linear.qp import groups, step_qp
 from koopmpc.control.riccati import recursion
-from koopmpc.control.target import given_inputs, margin, targets_of
+from koopmpc.control.target import margin, targets_of
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -49,8 +49,7 @@ class PlanMap:
     ) -> None:
         self.track = track
         self.targets = found = targets_of(predictor, cost, track)
-        given = given_inputs(cost, track.inputs)
-        self._given, self.given_rows = given, 0 if given is None else len(given)
+        self._given, self.given_rows = track.given, 0 if track.given is None else len(track.given)
         horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
         end = terminal_of(predictor, cost, horizon, found)
         law = recursion(stages(horizon, found), end.P, end.p)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.control.cost import LiftedTracking
-from koopmpc.control.limits import Interval, Softness, allowance
+from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.linear.condense import Condensed, row_sizes
 from koopmpc.control.linear.horizon import Horizon
 from koopmpc.control.solvers.qp import StepQP
@@ -45,7 +45,7 @@ def groups(tracking: LiftedTracking, horizon: Horizon) -> list[Group]:
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
     starts = np.cumsum([0, *horizon.blocks[:-1]])
     held = np.append(np.repeat(np.arange(moves), horizon.blocks), moves)[starts + 1]
-    hard = Softness(np.full(nu, np.inf), np.zeros(nu))
+    hard = Softness(np.full(nu, np.inf), np.zeros(nu), np.zeros(nu))
     result = [Group(tracking.inputs, hard, held)]
     if tracking.rates is not None:
         result.append(Group(tracking.rates, tracking.rate_softness, held))
@@ -76,12 +76,11 @@ def step_qp(maps: Condensed, limits: Sequence[Group]) -> StepQP:
         A=D[rows.source] * rows.scale[:, None],
         low=rows.low,
         high=rows.high,
-        softness=Softness(rows.linear, rows.quadratic),
+        softness=Softness(rows.linear, rows.quadratic, rows.allowance),
         source=rows.source,
         scale=rows.scale,
         shift_primal=_joined([_next(limits[0].next, len(limits[0].bounds.low))]),
         shift_dual=_joined([part.next for part in parts]),
-        allowance=rows.allowance,
         rate_rows=rate_rows,
         rate_inputs=rate_inputs,
     )
@@ -99,7 +98,7 @@ def _rows(
 ) -> _Rows:
     """Return the limited rows `picked` of all stages of a group that begins at the entry `first` of a plan."""
     N, size_of = len(group.next), size[picked]
-    (low, high), (linear, quadratic) = group.bounds, group.softness
+    (low, high), (linear, quadratic, allowance) = group.bounds, group.softness
     return _Rows(
         source=(first + len(size) * np.arange(N)[:, None] + picked).ravel(),
         scale=np.tile(1 / size_of, N),
@@ -107,7 +106,7 @@ def _rows(
         high=np.tile(high[picked] / size_of, N),
         linear=np.tile(linear[picked] * size_of / (2 * unit), N),
         quadratic=np.tile(quadratic[picked] * size_of**2 / (2 * unit), N),
-        allowance=np.tile(allowance(group.bounds)[picked], N),
+        allowance=np.tile(allowance[picked], N),
         next=_next(group.next, len(picked)),
     )
 

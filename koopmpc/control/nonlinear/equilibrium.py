@@ -85,7 +85,7 @@ class Equilibria:
         f = ca.mtimes([(of - r).T, ca.DM(o.Q), of - r]) + least * (ca.sumsqr(u) + ca.sumsqr(x))
         nlp = {"x": ca.vertcat(x, u), "p": ca.vertcat(r, theta, e), "f": f, "g": ca.vertcat(F + e - x, g)}
         self._solver = ca.nlpsol("equilibrium", "ipopt", nlp, _QUIET)
-        self._weight, self._small = root(o.Q), np.sqrt(1e-6 * least)
+        self._weight, self._small = o.Q_root, np.sqrt(1e-6 * least)
         self._low, self._high = (np.concatenate([o.inputs[i], o.outputs[i]]) for i in (0, 1))
 
     def __reduce__(self) -> tuple[type["Equilibria"], tuple[LearnedMap, Cost, StateTracking]]:
@@ -291,7 +291,7 @@ class TerminalTargets:
         L[:n] = S[:, :nx] @ (np.eye(nx) - back @ J)
         V[:n, : n - nx] = S[:, nx:]
         mean = float((P[:nx, :nx] * size).sum()) / max(np.linalg.matrix_rank(seen), 1)
-        M[n:] = np.sqrt(max(mean, 1.0)) * root(Q) @ (np.eye(nr) - J @ back)
+        M[n:] = np.sqrt(max(mean, 1.0)) * o.Q_root @ (np.eye(nr) - J @ back)
         return TerminalTarget(found, u, M, L, V, M @ at.of + L @ found.x + V @ u, slope)
 
 

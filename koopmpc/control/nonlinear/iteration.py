@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Interval, allowance
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
@@ -68,7 +68,7 @@ class RealTimeIteration:
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
-        self._allowance = allowance(Interval(*(end[soft] for end in self._limits)))
+        self._allowance = problem.softness.allowance[soft - nu]
         self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))

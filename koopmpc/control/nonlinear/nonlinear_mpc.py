@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Interval, Limits, softened
+from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver, Shooting, Start
@@ -114,7 +114,7 @@ class NonlinearMPC(StagedMPC):
         good = [found for found in solved if found.status is Status.OPTIMAL]
         found = min(good, key=lambda each: each.cost) if good else solved[0]
         self._next = found.start
-        slack = softened(found.slacks, self._shooting.soft)
+        slack = float(found.slacks[found.slacks > self._shooting.allowance].max(initial=0.0))
         status = Status.SOFTENED if good and slack else found.status
         return StagePlan(np.vstack([s, found.X]), found.U, status, iterations, slack)
 

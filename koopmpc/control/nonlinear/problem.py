@@ -220,7 +220,7 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
     after = ca.Function("F", [sym, v, theta], [ca.vertcat(F(sym[:nx], u, theta), u, v[soft.tolist(), 0])])
     s = ca.SX.sym("s", ns)
     x, last = s[:nx], s[nx : nx + nu]
-    hard = np.full(nu, np.inf), np.zeros(nu)
+    hard = np.full(nu, np.inf), np.zeros(nu), np.zeros(nu)
     return StagedProblem(
         after.expand("F") if F.is_a("SXFunction") else after,
         ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
@@ -229,7 +229,7 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
         np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
         Interval(low, high),
         Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.outputs[i]]) for i in (0, 1))),
-        Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1))),
+        Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1, 2))),
         free,
         held_from,
         True,

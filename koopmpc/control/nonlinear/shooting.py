@@ -99,10 +99,10 @@ class Shooting:
         x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
         F, smooth = ca.Function("F", [x, u], [p.F(x, u, ca.DM(theta))]), p.F.is_a("SXFunction")
         F = F.expand() if smooth else F
-        linear, quadratic = p.softness
+        linear, quadratic, allowance = p.softness
         soft = np.flatnonzero(np.isfinite(linear))
         ns = len(soft)
-        self.soft = Interval(*(end[soft] for end in p.box))
+        self.allowance = allowance[soft]
         W = ca.MX.sym("W", nu + nx + ns, N)
         U, X, E = W[:nu, :], W[nu : nu + nx, :], W[nu + nx :, :]
         x0, r, u_r, e = (ca.MX.sym("p", *size) for size in ((nx, 1), (nr, N), (nu, N), (moved, N)))

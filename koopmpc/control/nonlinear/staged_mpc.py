@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, root, state_tracking
+from koopmpc.control.cost import Cost, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.move import Move, Plan, Status
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
-from koopmpc.control.target import given_inputs, reference_rows
+from koopmpc.control.target import reference_rows
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.buffered import HUGE
 from koopmpc.plants.step_map import StepMap
@@ -70,8 +70,7 @@ class StagedMPC(MPCBase):
         self._outputs = o = state_tracking(model.states, given.nu, self.cost, self.limits, given.nx)
         self._problem = staged_problem(given.F, o, self._blocks)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
-        self._rows, self._row = given_inputs(self.cost, o.inputs), 0  # of a given u_target, and the next call's
-        self._R_root = root(o.R)
+        self._row = 0  # of a u_target that is given in rows, for the next call
         self._disturbed = estimator is not None or given.nw > 0
         self._begin(given, o, estimator, with_rates=self._problem.with_rates)
 
@@ -207,16 +206,17 @@ class StagedMPC(MPCBase):
             U = np.clip(U + slopes @ e, *self._outputs.inputs)
             U[held] = end.u
         self._moved = False
-        if self._rows is not None:  # row k of a given u_target counts at the k-th step
+        rows = self._outputs.given
+        if rows is not None:  # row k of a given u_target counts at the k-th step
             ahead = np.arange(self._N + 1) + self._row + self._latency
-            given = self._rows[np.minimum(ahead, len(self._rows) - 1)]
+            given = rows[np.minimum(ahead, len(rows) - 1)]
             U, end = given[:-1], end._replace(u=given[-1], m=end.m + end.V @ given[-1])
-            self._moved = self._row + 1 < len(self._rows)
+            self._moved = self._row + 1 < len(rows)
             self._row += self._moved
-        trajectory = self._rows is not None and not held[-1]  # no equilibrium is where it goes on
+        trajectory = rows is not None and not held[-1]  # no equilibrium is where it goes on
         if self.cost.Q_N is None and (trajectory or self.cost.tail == 0):
             M, nr = np.zeros_like(end.M), len(R[-1])
-            M[:nr] = root(self._outputs.Q)
+            M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
         self._track(self._staged(R[1:], U, end))
         return True
@@ -232,7 +232,7 @@ class StagedMPC(MPCBase):
         M_s, L_s, m_s = np.zeros((ns + nr + nu, nr + nu)), np.zeros((ns + nr + nu, ns)), np.zeros(ns + nr + nu)
         last = slice(nx, nx + nu)
         M_s[:n, :nr], L_s[:n, :nx], L_s[:n, last], m_s[:n] = M, L, V, m
-        L_s[n : n + nu, last], m_s[n : n + nu] = self._R_root, self._R_root @ U[-1]
+        L_s[n : n + nu, last], m_s[n : n + nu] = self._outputs.R_root, self._outputs.R_root @ U[-1]
         return StageTargets(np.hstack([R, U]), np.zeros_like(U), M_s, L_s, m_s)
 
     def _first_stage(

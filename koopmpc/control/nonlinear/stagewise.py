@@ -119,7 +119,7 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
     cost += ca.dot(missed, ca.DM(problem.Q) @ missed)
     if len(problem.box.low):
         soft = np.isfinite(problem.softness.linear)
-        linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness)
+        linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness[:2])
         g = problem.limited.map(N)(X[:, 1:])
         over = ca.fmax(ca.fmax(ca.DM(problem.box.low) - g, g - ca.DM(problem.box.high)), 0)
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))

@@ -263,7 +263,7 @@ class StepSolver:
         rows = np.flatnonzero(pushed)
         value = qp.A[rows] @ found.v + moved[rows]
         past = np.maximum(value - high[rows], low[rows] - value) / qp.scale[rows]
-        return float(past[past > qp.allowance[rows]].max(initial=0.0))
+        return float(past[past > qp.softness.allowance[rows]].max(initial=0.0))
 
     def _widened(self, room: Interval) -> tuple[Interval, float]:
         """Return the limits with the first rates as wide as the input limits need, and by how much, in their unit."""

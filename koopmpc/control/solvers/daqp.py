@@ -165,7 +165,7 @@ class DAQP(QPSolver):
         self._columns, self._rows, self._multipliers = columns, rows, rows * unit
         softness = self._qp.softness
         none = np.full(len(rows), np.inf)
-        linear, quadratic = (none, none) if softness is None else softness
+        linear, quadratic = (none, none) if softness is None else softness[:2]
         self._linear = linear / self._multipliers
         self._curved = np.maximum(2 * quadratic / (self._multipliers * rows), _CURVED * self._linear)
         self._sense = np.where(np.isfinite(linear), _SOFT, 0).astype(np.intc)

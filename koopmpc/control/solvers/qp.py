@@ -34,8 +34,8 @@ class StepQP(QP):
 
     It is the cost unit · wᵀH w, and the price of slacks, divided by 2 unit. The rows limit the entries `source` of the
     plan times `scale`: their limits move by that product. `shift_primal` and `shift_dual` tell where the next stage's
-    entry stands; one past the end stands for zero. A violation above its `allowance`, in the unit of its limit, is
-    reported. `rate_rows` limit the first change of the inputs `rate_inputs`, hard.
+    entry stands; one past the end stands for zero. The `allowance` of a soft row is in the unit of its limit.
+    `rate_rows` limit the first change of the inputs `rate_inputs`, hard.
     """
 
     softness: Softness = field(kw_only=True)
@@ -43,7 +43,6 @@ class StepQP(QP):
     scale: Float[np.ndarray, " m"]
     shift_primal: Int[np.ndarray, " n"]
     shift_dual: Int[np.ndarray, " m"]
-    allowance: Float[np.ndarray, " m"]
     rate_rows: Int[np.ndarray, " r"]
     rate_inputs: Int[np.ndarray, " r"]
 
