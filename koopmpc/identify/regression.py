@@ -8,6 +8,7 @@ from typing import NamedTuple, Unpack
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
+from scipy.linalg import qr
 
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
@@ -15,11 +16,13 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.solve import RegressionRows, root, scaled_rank
+from koopmpc.identify.solve import RegressionRows, norms, scaled_rank
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import LinearPredictor
+
+_HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +231,20 @@ def scale_of(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz 
     Z = regression.rows.P[:, : regression.lifting.nz]
     if lifting is not regression.lifting and isinstance(lifting, Projected):
         Z = Z @ lifting.basis
-    return root(Z, regression.rows.samples)
+    return scale_factor(Z, regression.rows.samples)
+
+
+def scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:
+    """Return the upper triangular R with RᵀR = PᵀP / M, and a diagonal above 0, so that P R⁻¹ has orthogonal columns.
+
+    Columns that depend on others leave it invertible: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
+    together lose half of the digits at most. A column of zeros is one of its own unit, 1.
+    """
+    size = norms(P)
+    live = size > 0
+    size = np.where(live, size, np.sqrt(samples))
+    R = np.asarray(qr(np.vstack([P / size, np.diag(np.where(live, _HALF, 1.0))]), mode="r")[0])[: len(size)]
+    return np.ascontiguousarray(np.where(R.diagonal() < 0, -1.0, 1.0)[:, None] * R * (size / np.sqrt(samples)))
 
 
 def growth(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:

@@ -16,7 +16,6 @@ Ridge = float | Literal["gcv"]
 
 _CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
 _ILL_CONDITIONED = 1e10
-_HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits
 _NAMED = 3  # dependent columns that a message names
 
 
@@ -76,19 +75,6 @@ class Solution:
 def norms(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
     """Return the Euclidean norm of each column."""
     return np.sqrt(np.einsum("ij,ij->j", P, P))
-
-
-def root(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:
-    """Return the upper triangular R with RᵀR = PᵀP / M, and a diagonal above 0, so that P R⁻¹ has orthogonal columns.
-
-    Columns that depend on others leave it invertible: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
-    together lose half of the digits at most. A column of zeros is one of its own unit, 1.
-    """
-    size = norms(P)
-    live = size > 0
-    size = np.where(live, size, np.sqrt(samples))
-    R = np.asarray(qr(np.vstack([P / size, np.diag(np.where(live, _HALF, 1.0))]), mode="r")[0])[: len(size)]
-    return np.ascontiguousarray(np.where(R.diagonal() < 0, -1.0, 1.0)[:, None] * R * (size / np.sqrt(samples)))
 
 
 def unit(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:

@@ -45,13 +45,13 @@ def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[object]]) ->
     return "\n".join("| " + " | ".join(str(cell).replace("|", r"\|") for cell in line) + " |" for line in lines)
 
 
-def labelled(pairs: Iterable[tuple[str, str]], indent: int = 0) -> Table:
+def labelled(pairs: Iterable[tuple[str, str]]) -> Table:
     """Return lines of text, each behind its label and broken beside it; an empty label continues the one before."""
     made = Table.grid(padding=(0, 2, 0, 0), pad_edge=False)
     made.add_column(no_wrap=True)
     made.add_column()
     for label, text in pairs:
-        made.add_row(" " * indent + label, text)
+        made.add_row(label, text)
     return made
 
 

@@ -14,8 +14,8 @@ from koopmpc.errors import DataError, ObservableError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.rank import Rank, leading, lost
-from koopmpc.identify.regression import FitResult, fit_report, regression_of
-from koopmpc.identify.solve import RegressionRows, Ridge, doubts, ridge_of, root, rule, solve
+from koopmpc.identify.regression import FitResult, fit_report, regression_of, scale_factor
+from koopmpc.identify.solve import RegressionRows, Ridge, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.predict.predictors import BilinearPredictor
@@ -107,7 +107,7 @@ def bilinear_edmd(
     K = (solution.K + start) @ basis
     N = np.zeros((nu, r, r))
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
-    scale = root(P[:, :r], given.samples)
+    scale = scale_factor(P[:, :r], given.samples)
     regression = replace(regression, rows=RegressionRows(P, given.T, given.rest, given.samples))
     solved = rule(regression.rows, ridge, solution.ridge)
     result = FitResult(

@@ -5,7 +5,7 @@ from jaxtyping import Complex, Float, Int
 from scipy.linalg import sqrtm
 
 from koopmpc.errors import DataError
-from koopmpc.identify.solve import RegressionRows, Solution, solve
+from koopmpc.identify.solve import RegressionRows, Solution, orthonormal, solve
 from koopmpc.predict.base import eigen
 
 
@@ -43,7 +43,7 @@ def denoised(
             f"signal; pass a rank below {max(most, 1)}, or collect more"
         )
     noisy = np.setdiff1d(np.arange(nz), exact)
-    E = _basis(rows.P[:, exact])
+    E = orthonormal(rows.P[:, exact], float(np.finfo(float).eps * len(rows.P)))
     D = np.hstack([rows.P[:, noisy], rows.T[:, noisy]])
     if scaled:
         size = np.sqrt(np.sum(D.reshape(len(D), 2, -1) ** 2, axis=(0, 1)))
@@ -51,12 +51,6 @@ def denoised(
     L = np.linalg.svd(D - E @ (E.T @ D), full_matrices=False)[0][:, :directions]
     onto = np.hstack([E, L]).T
     return RegressionRows(onto @ rows.P, onto @ rows.T, rows.rest, rows.samples)
-
-
-def _basis(P: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m r"]:
-    """Return orthonormal columns that span those of P."""
-    U, s, _ = np.linalg.svd(P, full_matrices=False)
-    return U[:, s > np.finfo(float).eps * len(P) * s.max(initial=0.0)]
 
 
 _DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is taken

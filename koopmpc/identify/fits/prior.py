@@ -179,12 +179,6 @@ class Entries:
     low: Float[np.ndarray, "nz n"]
     high: Float[np.ndarray, "nz n"]
 
-    @property
-    def bounded(self) -> Bool[np.ndarray, " nz"]:
-        """True for each row of [A B] that has a bound on a free entry."""
-        limited = np.isfinite(self.low) | np.isfinite(self.high)
-        return np.asarray((limited & np.isnan(self.known)).any(axis=1))
-
 
 def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) -> Entries:
     """Return the known value and the bounds of each entry of [A B], for these observables and inputs.

@@ -7,7 +7,8 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.identify.solve import RegressionRows, root, solve
+from koopmpc.identify.regression import scale_factor
+from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.state import Constant, Monomials, State
@@ -112,7 +113,8 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
                 if place >= 0:
                     C[i] = np.eye(nz)[place]
             self.predictor_ = LinearPredictor(
-                *(K[:, :nz], K[:, nz:], C, self.lifting_, self.dt, names[:nx], names[nx:]), scale=root(Z, len(Z))
+                *(K[:, :nz], K[:, nz:], C, self.lifting_, self.dt, names[:nx], names[nx:]),
+                scale=scale_factor(Z, len(Z)),
             )
         return self
 
