@@ -17,7 +17,7 @@ from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 

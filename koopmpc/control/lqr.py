@@ -15,7 +15,7 @@ from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.estimate.observer import Measured
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 _NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here

@@ -13,7 +13,7 @@ from koopmpc.control.solvers.base import QPSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.qp import QP
 from koopmpc.errors import ShapeError
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Measured, StateModel
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 

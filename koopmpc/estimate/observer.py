@@ -10,8 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.data.delay import Delay
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.buffered import buffered
+from koopmpc.lifting.base import Lifting, buffered
 from koopmpc.predict.predictors import LinearPredictor
 
 

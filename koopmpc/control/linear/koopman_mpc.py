@@ -21,7 +21,7 @@ from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 _VIEWS = ("_met", "_met_low", "_met_high")

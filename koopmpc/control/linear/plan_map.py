@@ -10,7 +10,7 @@ from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
 from koopmpc.control.linear.qp import groups, step_qp
 from koopmpc.control.riccati import recursion
 from koopmpc.control.target import margin, targets_of
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 

@@ -16,7 +16,7 @@ from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.estimate.observer import Estimator
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 
 EACH, FIRST = 12, 10  # iterations from each start of a first step, and of its best plan, at most

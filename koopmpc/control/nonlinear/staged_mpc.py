@@ -18,7 +18,7 @@ from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTarget
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.target import reference_rows
 from koopmpc.estimate.observer import Estimator
-from koopmpc.lifting.buffered import HUGE
+from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)

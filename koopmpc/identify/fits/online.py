@@ -14,8 +14,7 @@ from koopmpc.identify.moments.rows import row_columns
 from koopmpc.identify.moments.sliding import Forgetting, Window
 from koopmpc.identify.regression import linear_predictor, regression_of, unreduced
 from koopmpc.identify.solve import Ridge, doubts, ridge_of, rule, solve
-from koopmpc.lifting.base import Lifting, lifting_of
-from koopmpc.lifting.buffered import buffered
+from koopmpc.lifting.base import Lifting, buffered, lifting_of
 from koopmpc.predict.predictors import LinearPredictor
 
 _BLOCK = 32  # rows that the factor takes in at once
