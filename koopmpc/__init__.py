@@ -83,8 +83,10 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
     from koopmpc.loop.metrics import metrics as metrics
     from koopmpc.loop.run import Run as Run
     from koopmpc.loop.simulate import simulate as simulate
+    from koopmpc.plants.black_box import black_box as black_box
     from koopmpc.plants.dynamics import Dynamics as Dynamics
     from koopmpc.plants.dynamics import Plant as Plant
+    from koopmpc.plants.gym_plant import GymPlant as GymPlant
     from koopmpc.plants.integrators import CVODES as CVODES
     from koopmpc.plants.integrators import RK4 as RK4
     from koopmpc.plants.integrators import Collocation as Collocation
@@ -148,7 +150,9 @@ else:
             "loop.metrics": "metrics",
             "loop.run": "Run",
             "loop.simulate": "simulate",
+            "plants.black_box": "black_box",
             "plants.dynamics": "Dynamics Plant",
+            "plants.gym_plant": "GymPlant",
             "plants.integrators": "CVODES RK4 Collocation Euler ImplicitMidpoint",
             "plants.step_map": "StepMap discretize",
             "predict.predictors": "BilinearPredictor LinearPredictor load_model",

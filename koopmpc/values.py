@@ -271,4 +271,4 @@ def _parts(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def _fields(value: Value) -> list[str]:
-    return [f.name for f in dataclasses.fields(cast(Any, value)) if f.init]
+    return [f.name for f in dataclasses.fields(cast(Any, value)) if f.init and f.compare]

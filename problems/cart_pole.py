@@ -36,24 +36,23 @@ class CartPole(km.Dynamics):
         acceleration = force / (self.M + self.m * S**2)
         return ca.vertcat(velocity, acceleration, omega, -(acceleration * C + self.g * S) / self.L)
 
+    def scene(self, x: np.ndarray, u: np.ndarray) -> list[km.scene.Shape]:
+        """Draw the rail with a tick at each metre, the cart, the pole, and the force as a bar of 1 m for 40 N."""
+        position, theta, L = float(x[0]), float(x[2]), self.L
+        tip = (position + L * float(np.sin(theta)), -L * float(np.cos(theta)))
+        ticks = [(float(metre), depth) for metre in range(-3, 8) for depth in (-0.2, -0.35, -0.2)]
+        return [
+            km.scene.Line("rail", ticks, width=0.03, color=(150, 160, 170)),
+            km.scene.Box("cart", (position, 0.0), (0.8, 0.4)),
+            km.scene.Line("pole", [(position, 0.0), tip], width=0.06, color=(120, 130, 150)),
+            km.scene.Disk("tip", tip, 0.14),
+            km.scene.Line(
+                "force", [(position, 0.0), (position + float(u[0]) / 40.0, 0.0)], width=0.08, color=(40, 120, 200)
+            ),
+        ]
+
 
 cart_pole = CartPole()
-
-
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
-    """Draw the rail with a tick at each metre, the cart, the pole, and the force as a bar of 1 m for 40 N."""
-    position, theta, L = float(x[0]), float(x[2]), cart_pole.L
-    tip = (position + L * float(np.sin(theta)), -L * float(np.cos(theta)))
-    ticks = [(float(metre), depth) for metre in range(-3, 8) for depth in (-0.2, -0.35, -0.2)]
-    return [
-        km.scene.Line("rail", ticks, width=0.03, color=(150, 160, 170)),
-        km.scene.Box("cart", (position, 0.0), (0.8, 0.4)),
-        km.scene.Line("pole", [(position, 0.0), tip], width=0.06, color=(120, 130, 150)),
-        km.scene.Disk("tip", tip, 0.14),
-        km.scene.Line(
-            "force", [(position, 0.0), (position + float(u[0]) / 40.0, 0.0)], width=0.08, color=(40, 120, 200)
-        ),
-    ]
 
 
 problem = km.Problem(
@@ -80,5 +79,4 @@ problem = km.Problem(
         ),
     },
     angles=(2,),
-    scene=scene,
 )

@@ -34,6 +34,21 @@ class CartPole(km.Dynamics):
         acceleration = force / (self.M + self.m * S**2)
         return ca.vertcat(velocity, acceleration, omega, (self.g * S - acceleration * C) / self.L)
 
+    def scene(self, x: np.ndarray, u: np.ndarray) -> list[km.scene.Shape]:
+        """Draw the rail with its ends, the cart, the pole, and the force as a bar of 1 m for 12 N."""
+        position, theta, L = float(x[0]), float(x[2]), self.L
+        tip = (position + L * float(np.sin(theta)), L * float(np.cos(theta)))
+        rail = [(-2.4, 0.15), (-2.4, -0.1), (2.4, -0.1), (2.4, 0.15)]
+        return [
+            km.scene.Line("rail", rail, width=0.02, color=(150, 160, 170)),
+            km.scene.Box("cart", (position, 0.0), (0.3, 0.15)),
+            km.scene.Line("pole", [(position, 0.0), tip], width=0.03, color=(120, 130, 150)),
+            km.scene.Disk("tip", tip, 0.05),
+            km.scene.Line(
+                "force", [(position, 0.0), (position + float(u[0]) / 12.0, 0.0)], width=0.04, color=(40, 120, 200)
+            ),
+        ]
+
 
 cart_pole = CartPole()
 HARMONICS = (1, 2, 3, 4)
@@ -48,22 +63,6 @@ def products(x: ca.SX) -> list[ca.SX]:
 
 names = [f"omega^{n} {f}({k} theta)" for n in (1, 2) for k in HARMONICS for f in ("sin", "cos")]
 tracked = ("position [m]", "velocity [m/s]", "sin(theta)", "cos(theta)", "omega [rad/s]")
-
-
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
-    """Draw the rail with its ends, the cart, the pole, and the force as a bar of 1 m for 12 N."""
-    position, theta, L = float(x[0]), float(x[2]), cart_pole.L
-    tip = (position + L * float(np.sin(theta)), L * float(np.cos(theta)))
-    rail = [(-2.4, 0.15), (-2.4, -0.1), (2.4, -0.1), (2.4, 0.15)]
-    return [
-        km.scene.Line("rail", rail, width=0.02, color=(150, 160, 170)),
-        km.scene.Box("cart", (position, 0.0), (0.3, 0.15)),
-        km.scene.Line("pole", [(position, 0.0), tip], width=0.03, color=(120, 130, 150)),
-        km.scene.Disk("tip", tip, 0.05),
-        km.scene.Line(
-            "force", [(position, 0.0), (position + float(u[0]) / 12.0, 0.0)], width=0.04, color=(40, 120, 200)
-        ),
-    ]
 
 
 problem = km.Problem(
@@ -95,5 +94,4 @@ problem = km.Problem(
     },
     angles=(2,),
     controllers=("koopman-mpc", "bilinear-mpc", "nonlinear-mpc"),
-    scene=scene,
 )

@@ -29,6 +29,19 @@ class Pendulum(km.Dynamics):
         theta, omega = x[0], x[1]
         return ca.vertcat(omega, self.g / self.L * ca.sin(theta) + u[0] / (self.m * self.L**2))
 
+    def scene(self, x: np.ndarray, u: np.ndarray) -> list[km.scene.Shape]:
+        """Draw the rod, the bob, the pivot and the torque as an arc."""
+        theta, L = float(x[0]), self.L
+        bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
+        sweep = np.linspace(0.0, float(np.clip(u[0] / 25.0, -1.0, 1.0)) * np.pi, 24)
+        arc = [(0.5 * float(np.sin(a)), 0.5 * float(np.cos(a))) for a in sweep]
+        return [
+            km.scene.Line("rod", [(0.0, 0.0), bob], width=0.05),
+            km.scene.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
+            km.scene.Disk("bob", bob, 0.16),
+            km.scene.Line("torque", arc, width=0.05, color=(40, 120, 200)),
+        ]
+
 
 pendulum = Pendulum()
 
@@ -46,21 +59,6 @@ def products(x: ca.SX) -> list[ca.SX]:
 
 
 names = ["omega sin(theta)", "omega cos(theta)", "omega sin(2 theta)", "omega cos(2 theta)", "omega²"]
-
-
-def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Line | km.scene.Box | km.scene.Disk]:
-    """Draw the rod, the bob, the pivot, the target, and the torque as an arc."""
-    theta, L = float(x[0]), pendulum.L
-    bob = (L * float(np.sin(theta)), L * float(np.cos(theta)))
-    sweep = np.linspace(0.0, float(np.clip(u[0] / 25.0, -1.0, 1.0)) * np.pi, 24)
-    arc = [(0.5 * float(np.sin(a)), 0.5 * float(np.cos(a))) for a in sweep]
-    return [
-        km.scene.Disk("target", (0.0, L), 0.2, color=(200, 215, 200)),
-        km.scene.Line("rod", [(0.0, 0.0), bob], width=0.05),
-        km.scene.Disk("pivot", (0.0, 0.0), 0.07, color=(70, 90, 110)),
-        km.scene.Disk("bob", bob, 0.16),
-        km.scene.Line("torque", arc, width=0.05, color=(40, 120, 200)),
-    ]
 
 
 problem = km.Problem(
@@ -85,5 +83,4 @@ problem = km.Problem(
         "hold": km.Case(x0=[np.pi / 4, 0.0], reference=[0.8, 0.0], steps=200, plant=Pendulum(m=1.2)),
     },
     angles=(0,),
-    scene=scene,
 )

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from koopmpc.bench.controllers import CONTROLLERS as CONTROLLERS
     from koopmpc.bench.controllers import Prepared as Prepared
     from koopmpc.bench.library import list_problems as list_problems
+    from koopmpc.bench.library import new_problem as new_problem
     from koopmpc.bench.library import shipped as shipped
     from koopmpc.bench.results import RunRow as RunRow
     from koopmpc.bench.results import reached as reached
@@ -19,7 +20,7 @@ else:
         __name__,
         {
             "controllers": "CONTROLLERS Prepared",
-            "library": "list_problems shipped",
+            "library": "list_problems new_problem shipped",
             "results": "RunRow reached row_to_view",
             "sweep": "FAULTS",
             "table": "results_table",

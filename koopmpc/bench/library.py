@@ -1,4 +1,4 @@
-"""Problem files: found by path or name, listed, and loaded."""
+"""Problem files: found by path or name, listed, loaded, and begun from a commented example."""
 
 import ast
 import hashlib
@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from koopmpc import checks
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
@@ -59,6 +60,27 @@ def load_problem(problem: str | Path) -> Problem:
         raise ProblemError(_unknown(text))
     loaded = _load(path)
     return loaded.select(case) if case else loaded
+
+
+def new_problem(name: str | Path) -> Path:
+    """Write a commented problem that runs, a mass on a spring, to <name>.py in the current folder; return its path.
+
+    Raises
+    ------
+    ProblemError
+        The name cannot be that of a Python file, or the file is there already.
+    LogError
+        The file cannot be written.
+    """
+    path = Path(name)
+    path = path if path.suffix == ".py" else path.with_name(f"{path.name}.py")
+    if not path.stem.isidentifier():
+        raise ProblemError(f"{path.stem!r} is no name for a problem; use letters, digits and _, a letter first")
+    if path.exists():
+        raise ProblemError(f"{path} exists already and is kept as it is; choose another name")
+    with checks.writing(path, "xb") as file:
+        file.write((Path(__file__).parent / "template.txt").read_bytes())
+    return path
 
 
 def _find(text: str) -> Path | None:

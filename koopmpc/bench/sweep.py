@@ -3,6 +3,7 @@
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,12 +129,12 @@ def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> RunRow:
     problem, (case, name, fault) = parts.problem.name, task
     log = folder / ("-".join((problem, *filter(None, task))) + ".rrd")
     try:
-        run, drawn = _run(parts, task, live)
+        run = _run(parts, task, live)
         judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[case].steps)
     except Exception as error:  # the other runs go on; the exit code says that one failed
         return RunRow(problem, case, name, failure=_described(error, log), fault=fault)
     try:
-        found += _recorded(run, log, drawn)
+        found += _recorded(run, log)
         if load_run(log) != run:
             found.append(f"{log.name} does not read back equal to the run")
     except Exception as error:  # the figures of the run are kept without its log
@@ -152,20 +153,20 @@ def _described(error: Exception, log: Path) -> str:
     return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
 
 
-def _recorded(run: Run, log: Path, drawn: dict[str, Any]) -> list[str]:
+def _recorded(run: Run, log: Path) -> list[str]:
     """Write the log; where its scene cannot be drawn, write it without the scene and return why."""
     try:
-        record(run, log, **drawn)
+        record(run, log)
     except Exception as error:
-        if drawn["scene"] is None:
+        if run.scene is None:
             raise
-        record(run, log, **{**drawn, "scene": None})
+        record(replace(run, scene=None), log)
         return [f"the log is without its scene: drawing scene(x, u) raised {_described(error, log)}"]
     return []
 
 
-def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]:
-    """Return the run of one controller on one case, and what is drawn with it."""
+def _run(parts: Prepared, task: _Task, live: bool) -> Run:
+    """Return the run of one controller on one case."""
     problem, case, plant = parts.problem, parts.problem.cases[task.case], parts.truth_of(task.case)
     limits = problem.limits_of(task.case)
     controller = CONTROLLERS[task.controller](parts, limits)
@@ -178,10 +179,10 @@ def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]
         "angles": tuple(problem.angles),
         "metadata": _metadata(problem, task, injected),
     }
-    drawn: dict[str, Any] = {"scene": problem.scene, "model": getattr(controller, "predictor", None)}
+    scene = problem.scene or getattr(plant, "scene", None)
 
     def closed_loop(*observers: StepObserver) -> Run:
-        return simulate(
+        run = simulate(
             plant,
             controller,
             x0=case.x0,
@@ -193,12 +194,13 @@ def _run(parts: Prepared, task: _Task, live: bool) -> tuple[Run, dict[str, Any]]
             plans=True,
             **about,
         )
+        return replace(run, scene=scene)
 
     if not live:
-        return closed_loop(), drawn
+        return closed_loop()
     names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
-    with Recorder(live=True, **names, **about, **drawn) as viewer:
-        return closed_loop(viewer), drawn
+    with Recorder(live=True, **names, **about, scene=scene, model=getattr(controller, "predictor", None)) as viewer:
+        return closed_loop(viewer)
 
 
 def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:

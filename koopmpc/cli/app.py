@@ -65,6 +65,20 @@ def list_() -> None:
 
 
 @app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="Name of the problem; the file <name>.py is written here.")],
+) -> None:
+    """Write a commented problem file that runs, to be changed into your own."""
+    from koopmpc.bench.library import new_problem
+
+    out = _console()
+    with _friendly():
+        path = new_problem(name)
+    out.print(Text(f"written: {path}; it holds a mass on a spring, put your plant in its place"), soft_wrap=True)
+    out.print(Text(f"run it: {shlex.join([*_program(), 'run', str(path)])}"), soft_wrap=True)
+
+
+@app.command()
 def run(
     problem: Annotated[str, typer.Argument(help=_PROBLEM)],
     controller: Controllers = None,

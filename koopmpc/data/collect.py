@@ -39,7 +39,7 @@ class Uniform(Value):
 
 def collect(
     plant: StepMap | Plant,
-    x0: Uniform | ArrayLike,
+    x0: Uniform | ArrayLike | None,
     excitation: Excitation | InputFunction,
     *,
     episodes: int,
@@ -53,11 +53,11 @@ def collect(
     plant
         A step map, or a plant that holds its state; then X holds y.
     x0
-        `Uniform`, or (E, nx), or one (nx,) for all episodes.
+        `Uniform`, or (E, nx), or one (nx,) for all episodes. None: each begins where the plant itself begins.
     excitation
         An `Excitation`, or a function ``(k, y, rng) -> u``, called in the order of k.
     episodes, steps
-        Number of episodes, and steps of each: X is (steps+1, ny).
+        Number of episodes, and steps of each: X is (steps+1, ny), or less where the plant itself ends an episode.
     rng
         Generator or seed; the same seed gives the same data, whichever way the plant is run.
 
@@ -73,7 +73,7 @@ def collect(
     count, length = checks.count(episodes, "episodes"), checks.count(steps, "steps")
     source = checks.generator(rng)
     nu = len(plant.inputs)
-    starts = _starts(x0, len(plant.states), count, source)
+    starts = None if x0 is None else _starts(x0, len(plant.states), count, source)
     streams = source.spawn(count)
     if isinstance(excitation, Excitation) and excitation.nu != nu:
         raise ShapeError(
@@ -83,7 +83,10 @@ def collect(
     with np.errstate(over="ignore", invalid="ignore"):  # `_finite` reports a plant that diverges
         if not isinstance(plant, StepMap):
             policies = [_start(excitation, length, plant.dt, nu, own) for own in streams]
-            runs = [_drive(plant, *each, length) for each in zip(range(count), starts, policies, streams, strict=True)]
+            begins = [None] * count if starts is None else starts
+            runs = [_drive(plant, *each, length) for each in zip(range(count), begins, policies, streams, strict=True)]
+        elif starts is None:
+            raise DataError("a step map has no state of its own to begin in; pass x0, such as km.Uniform(low, high)")
         else:
             X, U = _batch(plant, starts, excitation, length, streams)
             Y = _measured(plant, X)
@@ -93,9 +96,9 @@ def collect(
 
 
 def _drive(
-    plant: Plant, e: int, x0: Float[np.ndarray, " nx"], policy: Policy, rng: np.random.Generator, steps: int
+    plant: Plant, e: int, x0: Float[np.ndarray, " nx"] | None, policy: Policy, rng: np.random.Generator, steps: int
 ) -> Episode:
-    """Run one episode of a plant that holds its state."""
+    """Run one episode of a plant that holds its state, until the plant ends it."""
     Y = np.empty((steps + 1, len(plant.outputs)))
     U = np.empty((steps, len(plant.inputs)))
     Y[0] = plant.reset(x0, rng)
@@ -103,6 +106,8 @@ def _drive(
         U[k] = policy(k, Y[k])
         Y[k + 1] = plant.step(U[k])
         _finite(Y[None, k + 1 : k + 2], e, k + 1)
+        if getattr(plant, "ended", ""):
+            return Episode(X=Y[: k + 2], U=U[: k + 1])
     return Episode(X=Y, U=U)
 
 

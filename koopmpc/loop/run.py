@@ -10,6 +10,8 @@ from jaxtyping import Float, Int
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
+from koopmpc.predict.base import Predictor
+from koopmpc.scene import Scene
 from koopmpc.values import Value
 
 
@@ -202,9 +204,15 @@ class Run(About, StepRows):
         The plan of each step, where asked for.
     cost, limits, dt, states, inputs, outputs, angles, metadata
         What does not change from step to step.
+    scene
+        scene(x, u) → shapes, where the plant has one: `record` draws it. No log keeps it, and `==` does not look.
+    model
+        The controller's predictor, where it has one: `record` shows its eigenvalues. Kept no longer than the scene.
     """
 
     plans: Plans | None = None
+    scene: Scene | None = field(default=None, compare=False)
+    model: Predictor | None = field(default=None, compare=False)
 
     @property
     def steps(self) -> int:

@@ -1,5 +1,6 @@
 """simulate: one controller on one plant, step by step; every step has a status, every input is finite."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
@@ -34,7 +35,7 @@ def simulate(
     plant: StepMap | Plant,
     controller: Controller,
     *,
-    x0: ArrayLike,
+    x0: ArrayLike | None,
     reference: ArrayLike,
     steps: int,
     cost: Cost | None = None,
@@ -60,12 +61,13 @@ def simulate(
     controller
         Any Controller with the plant's dt. It is reset to x0 at the beginning.
     x0
-        (nx,) initial state.
+        (nx,) initial state; None: the plant begins where it begins by itself.
     reference
         (nr,) held throughout, or (steps+1, nr): row k belongs to x_k. The controller gets rows k … k+horizon, the
         last one repeated; with ``preview=False`` row k throughout.
     steps
-        Number of steps T.
+        Number of steps T. Where the plant itself ends the episode before, as a `GymPlant` may, the run ends there, a
+        UserWarning says so and the metadata hold the reason under "ended".
     cost, limits
         What the run is judged by; kept in the Run.
     u_reference
@@ -103,7 +105,8 @@ def simulate(
     ShapeError, DataError
         Sizes do not fit; plant or controller lack a member; a controller returned a u that is not finite.
     """
-    steps, rng, x0 = checks.count(steps, "steps"), checks.generator(rng), checks.array(x0, "x0", (None,))
+    steps, rng = checks.count(steps, "steps"), checks.generator(rng)
+    x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if isinstance(plant, StepMap):
         plant = SimulatedPlant(plant)
@@ -184,6 +187,10 @@ def simulate(
             observer(step)
         taken.append(step if plans or plan is None else replace(step, plan=None))
         x, y, applied = x_next, y_next, u
+        if (ended := getattr(plant, "ended", "")) and k + 1 < steps:
+            metadata["ended"] = str(ended)
+            warnings.warn(f"the plant ended the run after {k + 1} of {steps} steps: {ended}", UserWarning, stacklevel=2)
+            break
     return Run(
         **StepRows.of(taken, nx, end=True).columns(),
         cost=cost,
@@ -195,6 +202,8 @@ def simulate(
         plans=Plans.of([step.plan for step in taken]),
         angles=tuple(angles),
         metadata=metadata,
+        scene=getattr(plant, "scene", None),
+        model=getattr(controller, "predictor", None),
     )
 
 

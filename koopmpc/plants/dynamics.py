@@ -1,6 +1,7 @@
 """Continuous-time models ẋ = f(x, u), y = h(x), written in CasADi operations; the protocol of a plant that runs."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, Protocol, cast, runtime_checkable
 
 import casadi as ca
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.scene import Scene, Shape
 from koopmpc.values import Named
 
 
@@ -29,10 +31,18 @@ class Dynamics(Named, ABC):
         """Return y = h(x): (ny, 1) from x (nx, 1); the whole state unless overridden."""
         return x
 
+    def scene(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape] | None:
+        """Return the shapes that draw x (nx,) and u (nu,), always with the same names; None: nothing is drawn."""
+        return None
+
 
 @runtime_checkable
 class Plant(Protocol):
-    """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`."""
+    """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`.
+
+    Two members more are used where a plant has them: `ended`, a text that is empty until the plant itself ends the
+    episode and then says why, and `scene`, scene(x, u) → shapes for the animation in the logs.
+    """
 
     @property
     def dt(self) -> float:
@@ -59,8 +69,8 @@ class Plant(Protocol):
         """The true x (nx,), where it can be known."""
         ...
 
-    def reset(self, x0: ArrayLike, rng: np.random.Generator | int) -> np.ndarray:
-        """Go to x0 (nx,) and return y (ny,)."""
+    def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int) -> np.ndarray:
+        """Go to x0 (nx,), or begin where the plant is when it is None, and return y (ny,)."""
         ...
 
     def step(self, u: ArrayLike) -> np.ndarray:
@@ -81,6 +91,12 @@ def require_plant(plant: object) -> None:
     )
     needed = ("dt", "states", "inputs", "outputs", "state", "reset", "step")
     checks.members(plant, "the plant", needed, advice)
+
+
+def drawn_by(dynamics: Dynamics) -> Scene | None:
+    """Return the scene of `dynamics`; None where its class draws none."""
+    draw = dynamics.scene
+    return None if type(dynamics).scene is Dynamics.scene else lambda x, u: draw(x, u) or ()
 
 
 def right_side(dynamics: Dynamics) -> ca.Function:

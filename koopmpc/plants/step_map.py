@@ -1,9 +1,9 @@
 """The discrete-time plant x⁺ = F(x, u), y = h(x): immutable, and as a plant that remembers its state."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -14,8 +14,9 @@ from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.batch import Batch, march, warn_of
 from koopmpc.plants.compiled import Buffered, dense
-from koopmpc.plants.dynamics import Dynamics, output, right_side
+from koopmpc.plants.dynamics import Dynamics, drawn_by, output, right_side
 from koopmpc.plants.integrators import RK4, Integrator
+from koopmpc.scene import Scene
 from koopmpc.values import Named, Value, freeze
 
 
@@ -42,6 +43,8 @@ class StepMap(Named):
         CasADi function of x that returns y (ny); by default y = x.
     states, inputs, outputs
         Names with units; by default x0, x1, …; u0, …; and the states' names or y0, ….
+    scene
+        scene(x, u) → shapes, for the animation in the logs; pickling leaves it out.
 
     Raises
     ------
@@ -57,6 +60,7 @@ class StepMap(Named):
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    scene: Scene | None = field(default=None, compare=False)
 
     def __init__(
         self,
@@ -66,6 +70,7 @@ class StepMap(Named):
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
         outputs: Sequence[str] | None = None,
+        scene: Scene | None = None,
     ) -> None:
         _check_signature(F, "F", 2)
         nx, nu = F.size1_in(0), F.size1_in(1)
@@ -86,6 +91,7 @@ class StepMap(Named):
             states=checks.names(states, "states", "x", nx),
             inputs=checks.names(inputs, "inputs", "u", nu),
             outputs=checks.names(outputs, "outputs", "y", h.size1_out(0)),
+            scene=scene,
         )
 
     @property
@@ -163,13 +169,55 @@ class StepMap(Named):
         return Buffered(together.expand("linearize", {"cse": True}) if self.F.is_a("SXFunction") else together)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scene"}
+
+
+class Transition(Protocol):
+    """x⁺ = F(x, u), y = h(x): what a `SimulatedPlant` needs of a step map."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        ...
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of x."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of u."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of y."""
+        ...
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        ...
+
+    @property
+    def scene(self) -> Scene | None:
+        """scene(x, u) → shapes, None where there is none."""
+        ...
+
+    def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nx"]:
+        """x⁺ = F(x, u)."""
+        ...
+
+    def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
+        """Return y = h(x)."""
+        ...
 
 
 class SimulatedPlant:
-    """x⁺ = F(x, u) + w, y = h(x): a `StepMap` that remembers its state."""
+    """x⁺ = F(x, u) + w, y = h(x): a `StepMap`, or the map of a `black_box`, that remembers its state."""
 
-    def __init__(self, step_map: StepMap) -> None:
+    def __init__(self, step_map: Transition) -> None:
         self.step_map = step_map
         self._x: Float[np.ndarray, " nx"] | None = None
 
@@ -194,12 +242,19 @@ class SimulatedPlant:
         return self.step_map.outputs
 
     @property
+    def scene(self) -> Scene | None:
+        """scene(x, u) → shapes of the step map, None where it has none."""
+        return self.step_map.scene
+
+    @property
     def state(self) -> Float[np.ndarray, " nx"] | None:
         """A copy of x (nx,); None before the first `reset`."""
         return None if self._x is None else self._x.copy()
 
-    def reset(self, x0: ArrayLike, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " ny"]:
+    def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " ny"]:
         """Go to x0 (nx,) and return y (ny,); nothing here is random, `rng` is the protocol's."""
+        if x0 is None:
+            raise DataError("a simulated plant has no state of its own to begin in; pass x0")
         self._x = checks.array(x0, "x0", (self.step_map.nx,))
         return self.step_map.measure(self._x)
 
@@ -235,7 +290,7 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
     checks.positive(dt, "dt", "s")
     F = integrator.step(right_side(dynamics), dt)
     h, outputs = output(dynamics)
-    return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs)
+    return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs, drawn_by(dynamics))
 
 
 def _vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:

@@ -90,9 +90,9 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     path
         The .rrd to write; its folders are made.
     scene
-        scene(x, u) → shapes, drawn for every state and for a few stages of every plan.
+        scene(x, u) → shapes, drawn for every state and for a few stages of every plan; by default the run's own.
     model
-        The predictor whose eigenvalues are shown.
+        The predictor whose eigenvalues are shown; by default the run's own.
 
     Raises
     ------
@@ -101,6 +101,7 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     LogError
         The path cannot be written.
     """
+    scene, model = scene or run.scene, run.model if model is None else model
     writer = Writer(About(**run.about()), path=Path(path), scene=scene, model=model, steps=run.steps)
     writer.write(block_of_run(run))
     writer.end(run)

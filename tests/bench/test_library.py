@@ -1,6 +1,7 @@
 """Problems are found by path or name, and every way to miss one has a message that helps."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -137,3 +138,18 @@ def test_a_loaded_problem_holds_checked_arrays(tmp_path):
     problem = km.load_problem(write(tmp_path))
     x, u = problem.equilibrium
     assert x.dtype == u.dtype == np.float64
+
+
+def test_a_new_problem_is_the_documented_one_and_is_never_overwritten(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = km.bench.new_problem("mine")
+    text = (Path(__file__).parents[2] / "docs" / "problems.md").read_text()
+    assert path == Path("mine.py")
+    assert f"```python\n{path.read_text()}```" in text  # which the tests of the documentation run
+    assert km.load_problem("mine.py").name == "mine"
+    path.write_text("kept")
+    with pytest.raises(km.KoopmpcError, match="exists already and is kept as it is"):
+        km.bench.new_problem("mine.py")
+    assert path.read_text() == "kept"
+    with pytest.raises(km.KoopmpcError, match="'my-plant' is no name for a problem"):
+        km.bench.new_problem("my-plant")

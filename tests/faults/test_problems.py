@@ -87,9 +87,9 @@ def test_references_are_equilibria_and_cases_fit(problem):
 @pytest.mark.parametrize("problem", [PENDULUM, CART_POLE], ids=lambda p: p.name)
 @given(theta=angle, u=st.floats(-40.0, 40.0))
 def test_scenes_have_the_same_finite_shapes_everywhere(problem, theta, u):
-    start = problem.scene(problem.equilibrium[0], np.zeros(1))
+    start = problem.dynamics.scene(problem.equilibrium[0], np.zeros(1))
     x = problem.equilibrium[0] + theta
-    shapes = problem.scene(x, np.array([u]))
+    shapes = problem.dynamics.scene(x, np.array([u]))
     assert [(type(s), s.name) for s in shapes] == [(type(s), s.name) for s in start]
     assert len({s.name for s in shapes}) == len(shapes)
 
