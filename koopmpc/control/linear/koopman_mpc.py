@@ -11,14 +11,16 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, lifted_tracking
+from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
 from koopmpc.control.limits import Interval, Limits, admitted
-from koopmpc.control.linear.condense import Coordinates
-from koopmpc.control.linear.plan_map import PlanMap
+from koopmpc.control.linear.condense import Coordinates, condense, scaled
+from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
+from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
-from koopmpc.control.target import reference_rows
+from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.base import HUGE
@@ -105,15 +107,8 @@ class KoopmanMPC(MPCBase):
         track = lifted_tracking(predictor, self.cost, self.limits)
         move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
         self._begin(predictor, track, estimator, with_rates=track.with_rates, move_of=move_of)
-        self._map = PlanMap(
-            predictor,
-            self.cost,
-            track,
-            self._blocks,
-            disturbed=self._disturbed,
-            coordinates=self._wanted or SOLVERS[solver].coordinates,
-        )
         asked = SOLVERS[solver]
+        self._map = self._plan_map(predictor, track, self._wanted or asked.coordinates)
         exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
         choices = [Choice(asked, {**asked.impatient, **(settings or {})}), *exact]
         self._qps = StepSolver(self._map.qp, [*choices, Choice(SOLVERS["osqp"], {}, late=True)])
@@ -121,8 +116,18 @@ class KoopmanMPC(MPCBase):
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
-        self._given_row = 0  # of a u_target that is given in rows, for the next call
+        self._given_row, self._rows_left = 0, False  # of a u_target that is given in rows, for the next call
         self._see()
+
+    def _plan_map(self, predictor: LinearPredictor, track: LiftedTracking, coordinates: Coordinates) -> PlanMap:
+        """Return the plan of a predictor: its horizon by the Riccati recursion, condensed, with the limits."""
+        targets = targets_of(predictor, self.cost, track)
+        horizon = horizon_of(predictor, track, self._blocks, disturbed=self._disturbed)
+        steps = stages(horizon, targets)
+        end = terminal_of(predictor, self.cost, horizon, targets)
+        law = recursion(steps, end.P, end.p)
+        maps = condense(horizon, law, end, targets, coordinates)
+        return PlanMap(track, targets, horizon, scaled(maps, track.inputs, len(self._blocks)))
 
     def _see(self) -> None:
         """Make the views of the bytes that say which limits are met; a copy makes its own."""
@@ -151,7 +156,7 @@ class KoopmanMPC(MPCBase):
         super().reset(x0, u_prev)
         self._qps.reset()
         if self._given_row:
-            self._given_row, self._reference_key = 0, None
+            self._given_row, self._rows_left, self._reference_key = 0, False, None
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
@@ -166,14 +171,8 @@ class KoopmanMPC(MPCBase):
         for name in ("lifting", "dt", "states", "inputs", "disturbances"):
             if getattr(predictor, name) != getattr(old, name):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
-        self._map = PlanMap(
-            predictor,
-            self.cost,
-            lifted_tracking(predictor, self.cost, self.limits),
-            self._blocks,
-            disturbed=self._disturbed,
-            coordinates="plain" if self.coordinates == "plain" else "riccati",
-        )
+        track = lifted_tracking(predictor, self.cost, self.limits)
+        self._map = self._plan_map(predictor, track, "plain" if self.coordinates == "plain" else "riccati")
         self.predictor = predictor
         self._qps.update(self._map.qp)
         self._reference_key = None
@@ -201,16 +200,15 @@ class KoopmanMPC(MPCBase):
             w_{k+N+latency−1} with latency; by default zero.
         """
         start = perf_counter()
-        origin = self._initial
-        origin.take(y, self._given, applied, w)
         target = numbers(reference, "reference")
         key = target.tobytes()
         if key != self._reference_key:
             self._aim(target)
             self._reference_key = key
-            if self._given_row + 1 < self._map.given_rows:  # the next call has its own row of a given u_target
-                self._given_row, self._reference_key = self._given_row + 1, None
-
+        origin = self._initial
+        origin.take(y, self._given, applied, w)
+        if self._rows_left:  # the next call has its own row of a given u_target
+            self._given_row, self._reference_key = self._given_row + 1, None
         t = self._spare
         self._map.matrix.dot(origin.known, t)
         np.greater_equal(t, self._map.low, out=self._met_low)
@@ -236,19 +234,32 @@ class KoopmanMPC(MPCBase):
         return Plan(Z @ C.T, U)
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
-        """Write the reference's part of the plan into the last column."""
-        self._reference = reference_rows(reference, self._N, self._reference.shape[1], self._latency)
-        self._map.aim(self._reference, self._given_row + self._latency)
+        """Write the reference's part of the plan into the last column, NaN where a row is."""
+        plan, maps, found = self._map, self._map.maps, self._map.targets
+        R = self._reference = reference_rows(reference, self._N, self._reference.shape[1], self._latency)
+        given, column = plan.track.given, plan.matrix[:, -1]
+        self._rows_left = given is not None and self._given_row + 1 < len(given)
+        if not np.isfinite(R).all():
+            column[:] = np.nan
+            return
+        v = maps.from_reference @ R.ravel() + maps.offset
+        if given is not None:
+            ahead = np.arange(len(R)) + self._given_row + self._latency
+            v += maps.from_given @ given[np.minimum(ahead, len(given) - 1)].ravel()
+        if plan.aimed:
+            driven = plan.disturbance.shape[1] > 0
+            alpha = found.nearest(R) if driven else found.coordinates(R)
+            v += maps.from_target @ alpha.ravel()
+            if driven:
+                values = (alpha @ found.rows.T)[:, plan.checked]
+                column[plan.planned :] = np.concatenate([values.min(axis=0), values.max(axis=0)])
+        column[: plan.planned] = v
 
     def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._qps.rest()
-        self._take(t)
-        return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
-
-    def _take(self, t: Float[np.ndarray, " nt"]) -> None:
-        """Make t the plan; the array of the plan before it is free for the next step."""
         self._plan, self._spare = t, self._plan
         self._keep(t)
+        return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
 
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Go on where the plan breaks a limit, its target does, or something is not finite."""
@@ -259,11 +270,14 @@ class KoopmanMPC(MPCBase):
             u_prev[:] = self._given
             np.dot(plan.matrix, origin.known, out=t)
         if not t.dot(t) < HUGE * HUGE:
+            self._qps.cool()
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
         n = plan.planned
         v = t[:n]
         if n < len(t) and not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
-            v += plan.correction(self._reference, origin.drive)
+            e = plan.disturbance @ origin.drive  # a limit moves a target
+            moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
+            v += plan.maps.from_target @ moved.ravel()
             changed = True
         if changed and (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
             return self._unconstrained(t, start)
@@ -274,6 +288,7 @@ class KoopmanMPC(MPCBase):
         found, gave_way = self._qps.solve(v, room, deadline)
         status = Status.FAILED if self.solver_fails else found.status
         if status is not Status.OPTIMAL:
+            self._qps.cool()
             return self._fail(v[: self.nu], applied, status, found.iterations, start, found.solver)
         U, (low, high) = t[: plan.moves], plan.box
         U += plan.deviation.dot(found.v)
@@ -282,19 +297,7 @@ class KoopmanMPC(MPCBase):
         u = U[: self.nu]
         if self._hard_rates is not None:
             u[:] = admitted(u, inputs, self._hard_rates, u_prev)
-        self._take(t)
+        self._plan, self._spare = t, self._plan  # the array of the plan before it is free for the next step
+        self._keep(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
         return self._move(u.copy(), status, found.iterations, start, gave_way, found.solver)
-
-    def _fail(
-        self,
-        free: Float[np.ndarray, " nu"] | None,
-        applied: ArrayLike | None,
-        status: Status,
-        iterations: int,
-        start: float,
-        solver: str = "",
-    ) -> Move:
-        """Return what stands in for a failed step, with the status that says why; the next one starts cold."""
-        self._qps.cool()
-        return super()._fail(free, applied, status, iterations, start, solver)

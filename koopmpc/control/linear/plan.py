@@ -1,0 +1,145 @@
+"""The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.linear.condense import Condensed, row_sizes
+from koopmpc.control.linear.horizon import Horizon
+from koopmpc.control.solvers.qp import StepQP
+from koopmpc.control.target import Targets, margin
+from koopmpc.lifting.base import HUGE
+
+
+class PlanLimits(NamedTuple):
+    """The limits of every entry of a plan [moves; their changes, where they have limits; outputs], stage by stage.
+
+    `size` is the norm of the entry's row of D, root mean square of all stages. `next` is the entry a step on: of
+    outputs that of the next step, of moves that of the one that then holds; past the end it is the number of entries.
+    """
+
+    low: Float[np.ndarray, " nv"]
+    high: Float[np.ndarray, " nv"]
+    softness: Softness
+    size: Float[np.ndarray, " nv"]
+    next: Int[np.ndarray, " nv"]
+
+
+class PlanMap:
+    """t = M [z; u_{−1}; g; 1] with low ≤ t ≤ high where the unconstrained plan is the optimum.
+
+    t = [v; lowest and highest target], v the plan as in `Condensed`. u_{−1} is there where the change of inputs is
+    weighed or limited, g = [w_0 … w_{N−1}; d] where disturbances are known; the last column of M is that of the
+    reference. Without a g it holds all of the reference's part. With one it holds that of targets which no limit moves,
+    and the last rows of t, of the limits `checked`, show where a limit does move one.
+
+    Parameters
+    ----------
+    track, targets
+        What is tracked and limited, and the equilibria.
+    horizon, maps
+        The horizon and what `condense` made of it.
+
+    Attributes
+    ----------
+    moves, planned
+        Entries of the inputs, which come first, and of v.
+    box
+        Limits of the inputs.
+    deviation
+        How a solution w of the QP moves the inputs.
+    disturbance
+        (nz, ng) what g adds to z⁺ at the end of the horizon.
+    aimed
+        Whether a target enters the plan.
+    qp
+        The QP of w.
+    """
+
+    def __init__(self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed) -> None:
+        self.track, self.targets, self.maps = track, targets, maps
+        self.moves = len(maps.hessian)
+        self.deviation = maps.deviation[: self.moves]
+        limits = _plan_limits(track, horizon, maps.deviation)
+        self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low))
+        low, high, nv = limits.low, limits.high, len(limits.low)
+        last, first = horizon.disturbance(horizon.N - 1), np.zeros((nv, 0))
+        self.disturbance = np.zeros((len(horizon.A), 0)) if last is None else last[:, :-1]
+        driven = self.disturbance.shape[1] > 0
+        self.checked = np.zeros(len(targets.low), dtype=np.bool_)
+        self.aimed = bool(maps.from_target.any())
+        if driven:
+            first = maps.from_drive
+        if driven and self.aimed:
+            self.checked = checked = np.isfinite(targets.low) | np.isfinite(targets.high)
+            from_disturbance = targets.from_disturbance @ self.disturbance
+            every = maps.from_target.reshape(nv, horizon.N + 1, -1).sum(axis=1)
+            moved = (targets.rows @ from_disturbance + targets.rows_disturbance @ self.disturbance)[checked]
+            first = np.vstack([first + every @ from_disturbance, moved, moved])
+            free = np.full(len(moved), np.inf)
+            t_low, t_high = targets.low[checked], targets.high[checked]
+            low = np.concatenate([low, t_low - margin(t_low), -free])
+            high = np.concatenate([high, free, t_high + margin(t_high)])
+        self.planned = nv
+        self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
+        self.box = Interval(self.low[: self.moves], self.high[: self.moves])
+        from_state = np.zeros((len(low), horizon.size))
+        from_state[:nv] = maps.from_state
+        self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
+
+
+def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "nv nw"]) -> PlanLimits:
+    """Return the limits of a plan whose entries move by D w."""
+    moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
+    starts = np.cumsum([0, *horizon.blocks[:-1]])
+    held = np.append(np.repeat(np.arange(moves), horizon.blocks), moves)[starts + 1]
+    none = np.zeros(nu)
+    groups = [(track.inputs, Softness(np.full(nu, np.inf), none, none), held)]
+    if track.rates is not None:
+        groups.append((track.rates, track.rate_softness, held))
+    groups.append((track.outputs, track.softness, np.arange(1, N + 1)))
+    parts: list[list[np.ndarray]] = []
+    first = 0
+    for bounds, softness, following in groups:
+        stages, width = len(following), len(bounds.low)
+        size = row_sizes(D[first : first + stages * width], stages)
+        place = first + width * following[:, None] + np.arange(width)
+        place[following >= stages] = len(D)
+        parts.append([*(np.tile(each, stages) for each in (*bounds, *softness, size)), place.ravel()])
+        first += stages * width
+    low, high, linear, quadratic, allowance, size, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place)
+
+
+def _step_qp(maps: Condensed, limits: PlanLimits, changes: int) -> StepQP:
+    """Return the QP of a condensed horizon under these limits, so many of each move's changes having some.
+
+    Every row is measured by the norm of its row of D, so that the price of its violation is, too.
+    """
+    D, unit, n = maps.deviation, maps.unit, len(maps.hessian)
+    limited = np.isfinite(limits.low) | np.isfinite(limits.high)
+    source = np.flatnonzero(limited)
+    size, (linear, quadratic, allowance) = limits.size[source], limits.softness
+    row = np.full(len(D) + 1, len(source))
+    row[source] = np.arange(len(source))
+    first = np.arange(n, n + changes)
+    hard = first[limited[first] & np.isinf(linear[first])]
+    return StepQP(
+        P=maps.hessian,
+        q=np.zeros(n),
+        A=D[source] * (1 / size)[:, None],
+        low=limits.low[source] / size,
+        high=limits.high[source] / size,
+        softness=Softness(
+            linear[source] * size / (2 * unit), quadratic[source] * size**2 / (2 * unit), allowance[source]
+        ),
+        source=source,
+        scale=1 / size,
+        shift_primal=np.minimum(limits.next[:n], n),
+        shift_dual=row[limits.next[source]],
+        rate_rows=row[hard],
+        rate_inputs=hard - n,
+    )
