@@ -32,6 +32,10 @@ DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
 _WIDER = 1e-8  # relative widening of the limits before a problem is believed to have no solution
 _ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
 
+_STEEP = 1e-8  # smallest over largest eigenvalue of AᵀA of the hard rows below which rounding makes them look dependent
+# Weight of a change of the hard rows in the first step towards the solution of a steep problem, its factor from step to
+# step, where it ends, and how many steps there are at most.
+_DAMPING, _EASING, _MOST_DAMPING, _PASSES = 1e4, 10.0, 1e8, 20
 _CURVED = 1e-6  # least curvature of a price by its slope, per unit of a row: DAQP divides by it
 
 _MANY = 16  # iterations of a solve that tell how long one takes
@@ -80,6 +84,7 @@ class DAQP(QPSolver):
         if self._mixed:
             hard, qp = self._sense != _SOFT, self._qp
             self._hard = DAQP(QP(qp.P, qp.q, qp.A[hard], qp.low[hard], qp.high[hard]), self._settings)
+        self._is_steep: bool | None = None  # found out when it is asked
         if self._soft:
             linear, rho = (np.where(self._sense == _SOFT, part, 0.0) for part in (self._linear, 1 / self._curved))
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
@@ -115,14 +120,17 @@ class DAQP(QPSolver):
         if flag == _INFEASIBLE and self._mixed and self._contradictory(time_limit):
             self._unmet = True
         elif not good and flag != _TIME_LIMIT:
-            left = limit - (perf_counter() - start) if limit else 0.0
-            if left < 0:
-                flag = _TIME_LIMIT
-            else:
-                self._send(self._sense, _WIDER)
-                x, multipliers, flag, more = self._run(left)
-                iterations += more
-                good = flag > 0 and self._accurate(x, multipliers)
+            if flag != _INFEASIBLE or not self._steep():
+                left = limit - (perf_counter() - start) if limit else 0.0
+                if left < 0:
+                    flag = _TIME_LIMIT
+                else:
+                    self._send(self._sense, _WIDER)
+                    x, multipliers, flag, more = self._run(left)
+                    iterations += more
+                    good = flag > 0 and self._accurate(x, multipliers)
+            if not good and flag != _TIME_LIMIT and self._steep():
+                return self._approach(v, y, limit - (perf_counter() - start) if limit else None, iterations)
         status = Status.OPTIMAL if good else _STATUS.get(flag, Status.FAILED)
         if self._scaled:
             x, multipliers = self._columns * x, self._multipliers * multipliers
@@ -141,6 +149,59 @@ class DAQP(QPSolver):
         found = own.solve(np.zeros_like(self._qp.q), np.zeros(len(own.low)), time_limit)
         self._unmet = found.status is Status.INFEASIBLE
         return self._unmet
+
+    def _metric(self) -> Float[np.ndarray, "n n"]:
+        """Return AᵀA of the hard rows, of all rows where none is hard."""
+        hard = self._qp.A[self._sense != _SOFT]
+        rows = hard if len(hard) else self._qp.A
+        return rows.T @ rows
+
+    def _steep(self) -> bool:
+        """Return whether hard rows are so close to dependent that INFEASIBLE cannot be believed."""
+        if self._is_steep is None:
+            values = np.linalg.eigvalsh(self._metric())
+            self._is_steep = bool(values[0] < _STEEP * values[-1] and (np.diag(self._qp.P) > 0).all())
+        return self._is_steep
+
+    def _approach(
+        self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None, iterations: int
+    ) -> QPSolution:
+        """Solve by proximal points: v ← argmin ½vᵀPv + qᵀv + ½c ‖A_h (v − v_last)‖² within the limits.
+
+        A_h are the hard rows. In plans of unstable plants these are inputs, of which some combinations take a v a
+        million times as large as others: DAQP then takes independent rows for dependent ones. The added weight makes
+        them alike, and two or three steps lead to the solution of the QP itself.
+
+        Rockafellar, "Monotone operators and the proximal point algorithm", SIAM J. Control and Optimization 14, 1976.
+        """
+        start, qp, metric = perf_counter(), self._qp, self._metric()
+        center, rows, weight, falling = np.zeros_like(v), y, _DAMPING, True
+        found = last = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name)
+        for _ in range(_PASSES):
+            solver = self._eased(qp.P + weight * metric, qp.q - weight * metric @ center)
+            found = solver.solve(center, rows, None if time_limit is None else time_limit - (perf_counter() - start))
+            iterations += found.iterations
+            if found.status is Status.OPTIMAL:
+                missed = weight * np.abs(metric @ (found.v - center)).max()
+                if missed <= _ACCURACY * max(1.0, np.abs(qp.P @ found.v).max(), np.abs(found.y @ qp.A).max()):
+                    break
+                last, center, rows = found, found.v, found.y
+                weight /= _EASING if falling else 1.0
+                found.status = Status.MAX_ITERATIONS
+            elif found.status is Status.TIME_LIMIT or weight > _MOST_DAMPING:
+                break
+            else:  # as light a weight as this does not make the rows alike
+                found, falling = last, last.status is Status.INFEASIBLE
+                weight *= _EASING if not falling else _EASING**2
+        found.iterations = iterations
+        return found
+
+    def _eased(self, P: Float[np.ndarray, "n n"], q: Float[np.ndarray, " n"]) -> "DAQP":
+        """Return the solver of the same rows with another cost, whose INFEASIBLE is believed."""
+        qp = self._qp
+        solver = DAQP(QP(P, q, qp.A, self.low, self.high, qp.softness), self._settings)
+        solver._is_steep = False
+        return solver
 
     def _active(self, y: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
         """Return the rows with the ends that y pushes to as DAQP's senses."""
