@@ -33,9 +33,11 @@ _WIDER = 1e-8  # relative widening of the limits before a problem is believed to
 _ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
 
 _STEEP = 1e-8  # smallest over largest eigenvalue of AᵀA of the hard rows below which rounding makes them look dependent
-# Weight of a change of the hard rows in the first step towards the solution of a steep problem, its factor from step to
-# step, where it ends, and how many steps there are at most.
-_DAMPING, _EASING, _MOST_DAMPING, _PASSES = 1e4, 10.0, 1e8, 20
+# Weight of a change of the hard rows, by the size of P, in the first step towards the solution of a steep problem; its
+# factor where it has to be another; its end; how many steps there are at most.
+_DAMPING, _EASING, _MOST_DAMPING, _PASSES = 1e7, 10.0, 1e9, 20
+_LEAST = np.full(1, 1e-300)
+_SLOW = 0.1  # share of what the step before missed above which the weight is eased
 _CURVED = 1e-6  # least curvature of a price by its slope, per unit of a row: DAQP divides by it
 
 _MANY = 16  # iterations of a solve that tell how long one takes
@@ -80,20 +82,21 @@ class DAQP(QPSolver):
         if flag < 0:
             raise DataError(f"DAQP refuses the problem, exit flag {flag}; pass a convex QP, P ⪰ 0")
         self._mixed = self._unmet = self._soft and not self._sense.all()
-        self._hard: DAQP | None = None  # the hard rows alone
-        if self._mixed:
-            hard, qp = self._sense != _SOFT, self._qp
-            self._hard = DAQP(QP(qp.P, qp.q, qp.A[hard], qp.low[hard], qp.high[hard]), self._settings)
+        self._hard: DAQP | None = None  # the hard rows alone, set up when they are asked for
         self._is_steep: bool | None = None  # found out when it is asked
+        self._far = (
+            False  # whether a solution of many active rows had to be approached last, so that the next one is at once
+        )
         if self._soft:
             linear, rho = (np.where(self._sense == _SOFT, part, 0.0) for part in (self._linear, 1 / self._curved))
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
 
-    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], Interval]:
-        return type(self), (self._qp, self._settings), Interval(self.low, self.high)
+    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool]]:
+        return type(self), (self._qp, self._settings), (Interval(self.low, self.high), self._far)
 
-    def __setstate__(self, limits: Interval) -> None:
-        """Take over the limits that the original had."""
+    def __setstate__(self, state: tuple[Interval, bool]) -> None:
+        """Take over the limits that the original had, and how far from them its last solution was."""
+        limits, self._far = state
         self.set_bounds(*limits)
 
     def update(self, qp: QP) -> None:
@@ -101,7 +104,8 @@ class DAQP(QPSolver):
         self.__init__(qp, self._settings)
 
     def reset(self) -> None:
-        """Do nothing: a solve starts from its y alone."""
+        """Forget how hard the last solve was: a solve starts from its y alone."""
+        self._far = False
 
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
         """Solve: DAQP looks at the clock every 32 iterations, so that it gets as many as fit in, too.
@@ -111,26 +115,30 @@ class DAQP(QPSolver):
         start from rows that have moved on by a step, and a copy would not have the same iterates.
         """
         start = perf_counter()
+        limit = self._time_limit if time_limit is None else time_limit
+        if self._far:
+            return self._approach(v, y, limit)
         if self._unmet and self._contradictory(time_limit):
             return QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name)
         self._send(self._active(y))
-        limit = self._time_limit if time_limit is None else time_limit
         x, multipliers, flag, iterations = self._run(limit)
         good = (flag == _OPTIMAL and self._exact) or (flag > 0 and self._accurate(x, multipliers))
-        if flag == _INFEASIBLE and self._mixed and self._contradictory(time_limit):
+        steep = not good and flag != _TIME_LIMIT and self._steep()
+        if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(time_limit):
             self._unmet = True
-        elif not good and flag != _TIME_LIMIT:
-            if flag != _INFEASIBLE or not self._steep():
-                left = limit - (perf_counter() - start) if limit else 0.0
-                if left < 0:
-                    flag = _TIME_LIMIT
-                else:
-                    self._send(self._sense, _WIDER)
-                    x, multipliers, flag, more = self._run(left)
-                    iterations += more
-                    good = flag > 0 and self._accurate(x, multipliers)
-            if not good and flag != _TIME_LIMIT and self._steep():
-                return self._approach(v, y, limit - (perf_counter() - start) if limit else None, iterations)
+        elif not good and flag != _TIME_LIMIT and (flag != _INFEASIBLE or not steep):
+            left = limit - (perf_counter() - start) if limit else 0.0
+            if left < 0:
+                flag = _TIME_LIMIT
+            else:
+                self._send(self._sense, _WIDER)
+                x, multipliers, flag, more = self._run(left)
+                iterations += more
+                good = flag > 0 and self._accurate(x, multipliers)
+        if not good and flag != _TIME_LIMIT and steep:
+            found = self._approach(v, y, limit - (perf_counter() - start) if limit else 0.0)
+            found.iterations += iterations
+            return found
         status = Status.OPTIMAL if good else _STATUS.get(flag, Status.FAILED)
         if self._scaled:
             x, multipliers = self._columns * x, self._multipliers * multipliers
@@ -142,19 +150,21 @@ class DAQP(QPSolver):
         Where soft rows are far outside, DAQP moves through all of these before it finds that out; it is asked at once
         where it was so in the last solve.
         """
+        rows, qp = self._sense != _SOFT, self._qp
         if self._hard is None:
-            return False
-        own, rows = self._hard, self._sense != _SOFT
+            self._hard = DAQP(QP(qp.P, qp.q, qp.A[rows], qp.low[rows], qp.high[rows]), self._settings)
+        own = self._hard
         own.low[:], own.high[:] = self.low[rows], self.high[rows]
-        found = own.solve(np.zeros_like(self._qp.q), np.zeros(len(own.low)), time_limit)
+        found = own.solve(np.zeros_like(qp.q), np.zeros(len(own.low)), time_limit)
         self._unmet = found.status is Status.INFEASIBLE
         return self._unmet
 
     def _metric(self) -> Float[np.ndarray, "n n"]:
-        """Return AᵀA of the hard rows, of all rows where none is hard."""
+        """Return AᵀA of the hard rows, of all rows where none is hard, as large as P is on the mean."""
         hard = self._qp.A[self._sense != _SOFT]
         rows = hard if len(hard) else self._qp.A
-        return rows.T @ rows
+        gram = rows.T @ rows
+        return gram * float(np.trace(self._qp.P) / max(np.trace(gram), 1e-300))
 
     def _steep(self) -> bool:
         """Return whether hard rows are so close to dependent that INFEASIBLE cannot be believed."""
@@ -163,9 +173,7 @@ class DAQP(QPSolver):
             self._is_steep = bool(values[0] < _STEEP * values[-1] and (np.diag(self._qp.P) > 0).all())
         return self._is_steep
 
-    def _approach(
-        self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None, iterations: int
-    ) -> QPSolution:
+    def _approach(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], limit: float) -> QPSolution:
         """Solve by proximal points: v ← argmin ½vᵀPv + qᵀv + ½c ‖A_h (v − v_last)‖² within the limits.
 
         A_h are the hard rows. In plans of unstable plants these are inputs, of which some combinations take a v a
@@ -175,32 +183,34 @@ class DAQP(QPSolver):
         Rockafellar, "Monotone operators and the proximal point algorithm", SIAM J. Control and Optimization 14, 1976.
         """
         start, qp, metric = perf_counter(), self._qp, self._metric()
-        center, rows, weight, falling = np.zeros_like(v), y, _DAMPING, True
-        found = last = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name)
+        center, rows, weight, least, missed, iterations = np.zeros_like(v), y, _DAMPING, 0.0, np.inf, 0
+        found = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name)
         for _ in range(_PASSES):
             solver = self._eased(qp.P + weight * metric, qp.q - weight * metric @ center)
-            found = solver.solve(center, rows, None if time_limit is None else time_limit - (perf_counter() - start))
+            found = solver.solve(center, rows, limit - (perf_counter() - start) if limit else None)
             iterations += found.iterations
             if found.status is Status.OPTIMAL:
-                missed = weight * np.abs(metric @ (found.v - center)).max()
-                if missed <= _ACCURACY * max(1.0, np.abs(qp.P @ found.v).max(), np.abs(found.y @ qp.A).max()):
+                before, missed = missed, weight * float(np.abs(metric @ (found.v - center)).max())
+                missed /= max(float(np.abs(part).max()) for part in (qp.P @ found.v, found.y @ qp.A, _LEAST))
+                if missed <= _ACCURACY:
                     break
-                last, center, rows = found, found.v, found.y
-                weight /= _EASING if falling else 1.0
-                found.status = Status.MAX_ITERATIONS
+                center, rows, found.status = found.v, found.y, Status.MAX_ITERATIONS
+                if missed > _SLOW * before:
+                    weight = max(weight / _EASING, least)
             elif found.status is Status.TIME_LIMIT or weight > _MOST_DAMPING:
                 break
             else:  # as light a weight as this does not make the rows alike
-                found, falling = last, last.status is Status.INFEASIBLE
-                weight *= _EASING if not falling else _EASING**2
+                weight *= _EASING
+                least = weight
         found.iterations = iterations
+        self._far = found.status is Status.OPTIMAL and 2 * np.count_nonzero(found.y) > len(v)
         return found
 
     def _eased(self, P: Float[np.ndarray, "n n"], q: Float[np.ndarray, " n"]) -> "DAQP":
         """Return the solver of the same rows with another cost, whose INFEASIBLE is believed."""
         qp = self._qp
         solver = DAQP(QP(P, q, qp.A, self.low, self.high, qp.softness), self._settings)
-        solver._is_steep = False
+        solver._mixed = solver._unmet = solver._is_steep = False
         return solver
 
     def _active(self, y: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:

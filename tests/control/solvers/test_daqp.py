@@ -1,3 +1,4 @@
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -48,6 +49,22 @@ def test_rows_close_to_equal_are_not_contradictory():
         solution = solved(DAQP(qp), n, 2 * n)
         assert solution.status is km.Status.OPTIMAL
         np.testing.assert_allclose(solution.v, inside, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_inputs_that_cannot_hold_an_unstable_plant_are_not_called_infeasible(seed):
+    """|u_k| ≤ 1 and |u_k − u_{k−1}| ≤ 0.2, u_k = v_k − 1.3 v_{k−1} − p_k: all u in the box can be, with |v| to 1e9."""
+    n, rng = 50, np.random.default_rng(seed)
+    A, change = np.eye(n) - 1.3 * np.eye(n, k=-1), np.eye(n) - np.eye(n, k=-1)
+    p, half = 10.0 ** rng.uniform(0, 4) * rng.normal(size=n), np.repeat([1.0, 0.2], n)
+    rows, middle = np.vstack([A, change @ A]), np.concatenate([p, change @ p])
+    solution = solved(DAQP(QP(np.eye(n), np.zeros(n), rows, middle - half, middle + half)), n, 2 * n)
+    assert solution.status is km.Status.OPTIMAL
+    assert (np.abs(rows @ solution.v - middle) <= half + 1e-6).all()
+    back = np.linalg.inv(A) / np.linalg.norm(solution.v)
+    u = cp.Variable(n)  # the same in u, whose limits have no rounding; its cost is near 1
+    least = cp.Problem(cp.Minimize(cp.sum_squares(back @ (u + p))), [cp.abs(u) <= 1, cp.abs(change @ u) <= 0.2])
+    assert abs(least.solve(solver="CLARABEL") - 1) < 1e-7
 
 
 def test_equalities_come_and_go():
