@@ -2,15 +2,14 @@
 
 This file is the table of contents: names of daily work here, the rest one level down in `km.faults`, `km.plot`,
 `km.scene`, `km.validate`, `km.spectrum`, `km.moments` and `km.errors`. A name is imported when it is first asked for
-(PEP 562).
-README.md has ten lines that use it.
+(PEP 562). README.md has ten lines that use it.
 """
 
 from typing import TYPE_CHECKING
 
 from koopmpc.lazy import attach
 
-if TYPE_CHECKING:  # the same table for type checkers and editors; a test compares the two
+if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, and attach serves its names
     import koopmpc.figures
     from koopmpc import bench as bench
     from koopmpc import control as control
@@ -110,59 +109,6 @@ if TYPE_CHECKING:  # the same table for type checkers and editors; a test compar
 else:
     __getattr__, __dir__, __all__ = attach(
         __name__,
-        {
-            "bench.library": "load_problem",
-            "bench.problem": "Case Problem Training",
-            "bench.sweep": "sweep",
-            "control.cost": "Cost",
-            "control.limits": "Limits",
-            "control.linear.koopman_mpc": "KoopmanMPC",
-            "control.linear.linear_mpc": "LinearMPC",
-            "control.lqr": "LQR",
-            "control.move": "Move Status",
-            "control.nonlinear.bilinear_mpc": "BilinearMPC",
-            "control.nonlinear.nonlinear_mpc": "NonlinearMPC",
-            "control.riccati": "dlqr lqr",
-            "data.collect": "Uniform collect",
-            "data.delay": "Delay",
-            "data.episodes": "Episode Episodes",
-            "data.excitation": "PRBS Chirp Feedback Multisine Noise",
-            "data.files.storage": "Files load_episodes",
-            "data.source": "Stream",
-            "errors": "FitWarning KoopmpcError",
-            "estimate.disturbance": "LiftedDisturbance",
-            "estimate.kalman": "LiftedKalman",
-            "identify.fits.bilinear": "bilinear_edmd",
-            "identify.fits.constrained": "constrained_edmd",
-            "identify.fits.dmd": "dmd dmdc",
-            "identify.fits.edmd": "edmd",
-            "identify.fits.online": "OnlineEDMD",
-            "identify.fits.prior": "Prior",
-            "identify.fits.regressor": "KoopmanRegressor",
-            "identify.fits.sparse": "sparse_edmd",
-            "identify.fits.stable": "stable_edmd",
-            "lifting.base": "Lifting",
-            "lifting.expressions": "Expressions",
-            "lifting.fourier": "Fourier RandomFourier",
-            "lifting.radial": "Gaussian ThinPlate",
-            "lifting.standardized": "Standardized",
-            "lifting.state": "Constant Monomials State",
-            "loop.metrics": "metrics",
-            "loop.run": "Run",
-            "loop.simulate": "simulate",
-            "plants.black_box": "black_box",
-            "plants.dynamics": "Dynamics Plant",
-            "plants.gym_plant": "GymPlant",
-            "plants.integrators": "CVODES RK4 Collocation Euler ImplicitMidpoint",
-            "plants.step_map": "StepMap discretize",
-            "predict.predictors": "BilinearPredictor LinearPredictor load_model",
-            "recording.format.reader": "load_run",
-            "recording.recorder": "Recorder record",
-            "recording.viewer": "view",
-            "synthesis.select": "select",
-            "validate.report": "trust",
-            "validate.scoring": "score",
-        },
         modules={
             "bench": "bench",
             "control": "control",

@@ -1,5 +1,6 @@
 """Names that a package serves from its files, each imported when it is first asked for (PEP 562)."""
 
+import ast
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from sys import modules as loaded
@@ -7,24 +8,24 @@ from typing import Any
 
 
 def attach(
-    package: str, names: Mapping[str, str], modules: Mapping[str, str] | None = None, *, core: Sequence[str] = ()
+    package: str, modules: Mapping[str, str] | None = None, *, core: Sequence[str] = ()
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package that serves names from its files.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package that serves the names which type checkers see.
+
+    These are the names that its own ``if TYPE_CHECKING:`` imports, as ``from koopmpc.file import Name as Name``.
 
     Parameters
     ----------
     package
         The package's `__name__`.
-    names
-        File below the package → the names that it gives, separated by spaces.
     modules
         Name → the module below ``koopmpc`` that it stands for; in `__dir__`, but not in `__all__`.
     core
         Files below the package that the first name brings along, so that no later call waits for an import.
     """
-    home = {name: f"{package}.{file}" for file, given in names.items() for name in given.split()}
     rooms = {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
-
+    home = {name: file for name, file in _imported(package).items() if name not in rooms}
+    every = sorted(home)
     waiting = [f"{package}.{file}" for file in core]
 
     def serve(name: str) -> Any:
@@ -42,5 +43,13 @@ def attach(
         setattr(loaded[package], name, found)
         return found
 
-    every = sorted(home)
     return serve, lambda: sorted([*every, *rooms]), every
+
+
+def _imported(package: str) -> dict[str, str]:
+    """Return name → file of the imports below ``if TYPE_CHECKING:`` in the source of a package that is being loaded."""
+    loader: Any = loaded[package].__loader__
+    tree = ast.parse(loader.get_source(package))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: node.module or "" for node in imports for alias in node.names}

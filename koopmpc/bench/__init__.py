@@ -16,13 +16,4 @@ if TYPE_CHECKING:
     from koopmpc.bench.sweep import FAULTS as FAULTS
     from koopmpc.bench.table import results_table as results_table
 else:
-    __getattr__, __dir__, __all__ = attach(
-        __name__,
-        {
-            "controllers": "CONTROLLERS Prepared",
-            "library": "list_problems new_problem shipped",
-            "results": "RunRow reached row_to_view",
-            "sweep": "FAULTS",
-            "table": "results_table",
-        },
-    )
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -10,4 +10,4 @@ if TYPE_CHECKING:
     from koopmpc.control.move import Plan as Plan
     from koopmpc.control.riccati import Gain as Gain
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"move": "Controller Fallback Plan", "riccati": "Gain"})
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -8,4 +8,4 @@ if TYPE_CHECKING:
     from koopmpc.data.episodes import Snapshots as Snapshots
     from koopmpc.data.source import Source as Source
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"episodes": "Snapshots", "source": "Source"})
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -7,4 +7,4 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.estimate.observer import Estimator as Estimator
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"observer": "Estimator"})
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -14,13 +14,4 @@ if TYPE_CHECKING:
     from koopmpc.figures.series import run as run
     from koopmpc.figures.style import save as save
 else:
-    __getattr__, __dir__, __all__ = attach(
-        __name__,
-        {
-            "comparisons": "error reconstruction runs",
-            "eigenvalues": "spectrum",
-            "plane": "eigenfunctions",
-            "series": "rollout run",
-            "style": "save",
-        },
-    )
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -8,4 +8,4 @@ if TYPE_CHECKING:
     from koopmpc.identify.fits.prior import Combination as Combination
     from koopmpc.identify.fits.prior import Dissipation as Dissipation
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"fits.prior": "Combination Dissipation"})
+    __getattr__, __dir__, __all__ = attach(__name__)

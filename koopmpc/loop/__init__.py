@@ -9,4 +9,4 @@ if TYPE_CHECKING:
     from koopmpc.loop.run import Plans as Plans
     from koopmpc.loop.run import Step as Step
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"metrics": "Metrics", "run": "Plans Step"})
+    __getattr__, __dir__, __all__ = attach(__name__)

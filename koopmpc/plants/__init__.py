@@ -8,4 +8,4 @@ if TYPE_CHECKING:
     from koopmpc.plants.step_map import Affine as Affine
     from koopmpc.plants.step_map import SimulatedPlant as SimulatedPlant
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"step_map": "Affine SimulatedPlant"})
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -8,4 +8,4 @@ if TYPE_CHECKING:
     from koopmpc.recording.format.reader import run_episodes as run_episodes
     from koopmpc.recording.model import record_model as record_model
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"format.reader": "run_episodes", "model": "record_model"})
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -9,6 +9,4 @@ if TYPE_CHECKING:
     from koopmpc.synthesis.selection import LeaderboardRow as LeaderboardRow
     from koopmpc.synthesis.selection import Selection as Selection
 else:
-    __getattr__, __dir__, __all__ = attach(
-        __name__, {"candidates": "Candidate", "selection": "LeaderboardRow Selection"}
-    )
+    __getattr__, __dir__, __all__ = attach(__name__)

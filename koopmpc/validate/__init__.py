@@ -23,14 +23,4 @@ if TYPE_CHECKING:
     from koopmpc.validate.scoring import Score as Score
     from koopmpc.validate.scoring import score as score
 else:
-    __getattr__, __dir__, __all__ = attach(
-        __name__,
-        {
-            "bands": "ConformalBand Forecast conformal forecast",
-            "identifiability": "Persistency feedback_share persistency",
-            "regions": "Coverage coverage",
-            "report": "TrustReport trust",
-            "residuals": "Invariance ResidualDMD invariance residual_dmd",
-            "scoring": "Score score",
-        },
-    )
+    __getattr__, __dir__, __all__ = attach(__name__)

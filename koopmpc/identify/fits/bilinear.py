@@ -107,7 +107,6 @@ def bilinear_edmd(
     K = (solution.K + start) @ basis
     N = np.zeros((nu, r, r))
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
-    scale = scale_factor(P[:, :r], given.samples)
     regression = replace(regression, rows=RegressionRows(P, given.T, given.rest, given.samples))
     solved = rule(regression.rows, ridge, solution.ridge)
     result = FitResult(
@@ -134,7 +133,7 @@ def bilinear_edmd(
         regression.inputs,
         fit_report(regression, result),
         regression.embedding,
-        scale,
+        scale_factor(P[:, :r], given.samples),
     )
 
 

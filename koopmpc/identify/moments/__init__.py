@@ -8,4 +8,4 @@ if TYPE_CHECKING:
     from koopmpc.identify.moments.moments import Moments as Moments
     from koopmpc.identify.moments.read import second_moments as second_moments
 else:
-    __getattr__, __dir__, __all__ = attach(__name__, {"moments": "Moments", "read": "second_moments"})
+    __getattr__, __dir__, __all__ = attach(__name__)
