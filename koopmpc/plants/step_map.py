@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -172,6 +172,7 @@ class StepMap(Named):
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scene"}
 
 
+@runtime_checkable
 class Transition(Protocol):
     """x⁺ = F(x, u), y = h(x): what a `SimulatedPlant` needs of a step map."""
 
