@@ -49,7 +49,8 @@ class Cost(Value):
         Weight of the changes of the inputs from step to step, ⪰ 0; a scalar or a vector is a diagonal.
     tail
         Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
-        was fitted to data as long as the horizon, for beyond that the errors of such a model outweigh the rest.
+        was fitted to data until the gain rests as far as the model is accurate, for what a longer one adds are the
+        errors of such a model: until its change is a smaller share than what the model misses of its states in a step.
         BilinearMPC and NonlinearMPC have no tail: without Q_N their end costs the Riccati solution at the equilibrium
         nearest to r_N.
 

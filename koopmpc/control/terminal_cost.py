@@ -9,6 +9,8 @@ from scipy.linalg.lapack import dgesv
 
 from koopmpc.control.riccati import Gain, Stage, gain, one_step, recursion, solved, step
 from koopmpc.errors import DefinitenessError
+from koopmpc.lifting.base import HUGE
+from koopmpc.predict.predictors import LinearPredictor
 
 ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or not
 SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
@@ -17,6 +19,7 @@ GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row 
 APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
 RESTS = 50  # steps for which it must have settled, at most
 LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
+AHEAD = 10  # horizons within which the gain of a learned model rests, or else its tail is as long as the horizon
 LEAPT = 100.0  # growth of the closed loop over the first steps up to which doubling keeps its digits
 
 
@@ -67,16 +70,60 @@ def tail_of(stage: Stage, steps: int | None) -> Tail:
     if e is None or q is None or r is None:
         raise ValueError("a stage of a tail knows its signals")
     if steps is not None:
-        last = Q
-        if M is not None:  # no change of the input follows the last state
-            last = Q.copy()
-            last[-len(R) :, -len(R) :] = 0.0
+        last = _last(stage)
         law = recursion([stage] * max(steps, 1), last, q)
         return Tail(law.P, law.p, law.K[0], law.v[0]) if steps else Tail(last, q, law.K[0], law.v[0])
     P = stationary(A, B, Q, R, ITERATIONS, M).P
     K, L = gain(A, B, R, P, M)
     p = _resting(A - B @ K, q + (A - B @ K).T @ (P @ e) - K.T @ r, B)
     return Tail(P, p, K, -solved(L, B.T @ (p + P @ e) + r))
+
+
+def learned_steps(stage: Stage, predictor: LinearPredictor, N: int) -> int:
+    """Return the steps of the default tail of a learned model: until the gain rests as far as the model is accurate.
+
+    Every further step of the tail changes the gain K. Once the change is a smaller share of K than what the model
+    misses in one step is of its states, further steps only make the tail follow the model's errors: modes that the
+    plant does not have grow in it until they rule the plan. Both shares are root mean squares over the data, about
+    their mean: that of the change is ‖Lᵀ(K⁺ − K)(z − z̄)‖ over ‖LᵀK⁺(z − z̄)‖, S = L Lᵀ, so that inputs count by what
+    they cost. The gain rests when the change is so small for as many steps as the model's point has entries, for a
+    weight may take that long to reach an input. The tail has N steps where this takes more than 10 N, and where the
+    model does not know its errors.
+    """
+    report, scale = predictor.report, predictor.scale
+    if report is None or scale is None:
+        return N
+    spread, constant = scale, predictor.lifting.constant_index
+    if constant is not None:
+        one = scale[:, [constant]] / np.linalg.norm(scale[:, constant])
+        spread = scale - one @ (one.T @ scale)
+    sizes: Float[np.ndarray, " nx"] = np.linalg.norm(spread @ predictor.C.T, axis=0)
+    missed: Float[np.ndarray, " n"] = report.residual[sizes > 0] / sizes[sizes > 0]
+    enough = max(float(np.sqrt(np.mean(missed**2))) if missed.size else 0.0, SETTLED)
+    A, B, P, M, R = stage.A, stage.B, _last(stage), stage.M, stage.R
+    (nz, _), needed, rested = scale.shape, len(predictor.point_names), 0
+    K = np.zeros((B.shape[1], len(A)))
+    for n in range(1, AHEAD * N + 1):
+        try:
+            K_next, L, P = step(A, B, stage.Q, R, P, M)
+        except DefinitenessError:  # P has lost its digits
+            break
+        if not np.abs(P).max() < HUGE:
+            break
+        moved, whole = (np.linalg.norm(L.T @ gains[:, :nz] @ spread.T) for gains in (K_next - K, K_next))
+        K, rested = K_next, rested + 1 if moved <= enough * whole else 0
+        if rested >= needed:
+            return n
+    return N
+
+
+def _last(stage: Stage) -> Float[np.ndarray, "nx nx"]:
+    """Return the weight of the state after the last step: no change of the input follows it."""
+    if stage.M is None:
+        return stage.Q
+    last = stage.Q.copy()
+    last[-len(stage.R) :, -len(stage.R) :] = 0.0
+    return last
 
 
 def _resting(

@@ -147,6 +147,70 @@ def equilibrium_input(model, cost, r, e):
     return (base + span @ alpha)[nz:]
 
 
+def learned(seed, noise, lifting, steps=40):
+    """A model of a pendulum from noisy data, and these data."""
+    rng = np.random.default_rng(seed)
+    plant = km.discretize(km.load_problem("pendulum").dynamics, 0.1)
+    clean = km.collect(plant, km.Uniform([-1, -2], [1, 2]), km.Noise(-4, 4, hold=3), episodes=30, steps=steps, rng=seed)
+    noisy = [km.Episode(X=e.X + noise * rng.normal(size=e.X.shape), U=e.U) for e in clean]
+    data = km.Episodes(noisy, clean.dt, clean.states, clean.inputs)
+    return km.edmd(data, lifting), data
+
+
+@pytest.mark.parametrize("rated", [False, True])
+@pytest.mark.parametrize("noise", [1e-3, 3e-2])
+def test_the_tail_of_a_learned_model_ends_where_its_gain_rests_as_far_as_the_model_is_accurate(noise, rated):
+    lifting = km.State() + km.Constant() + km.Monomials(3)
+    model, data = learned(0, noise, lifting)
+    cost = {"Q": np.diag([10, 1.0]), "R": [[0.1]], "R_delta": [[0.3]] if rated else None}
+    X, Y, U = data.snapshots().X, data.snapshots().X_next, data.snapshots().U
+    Z = model.lifting(X)
+    spread = (Z - Z.mean(axis=0)).T
+    misses = Y - (Z @ model.A.T + U @ model.B.T) @ model.C.T
+    accuracy = np.sqrt((misses**2).mean(axis=0) / X.var(axis=0))
+    accuracy = np.sqrt((accuracy**2).mean())
+    nz, A, B, Q = model.nz, model.A, model.B, model.C.T @ cost["Q"] @ model.C
+    S = np.zeros((nz, 1))  # the stage cost is z'Qz + (u − v)'R_delta (u − v) + u'R u on ξ = [z; v]
+    weight, R, P = Q, np.array(cost["R"]), Q
+    if rated:
+        D = np.array(cost["R_delta"])
+        A, B = scipy.linalg.block_diag(A, 0), np.vstack([B, 1])
+        weight, P = scipy.linalg.block_diag(Q, D), scipy.linalg.block_diag(Q, 0)
+        S, R = np.vstack([S, -D]), R + D
+    changes, K = [], np.zeros((1, len(A)))
+    for _ in range(200):
+        H = R + B.T @ P @ B
+        K_next = np.linalg.solve(H, B.T @ P @ A + S.T)
+        P = weight + A.T @ P @ A - K_next.T @ H @ K_next
+        changes.append(np.linalg.norm((K_next - K)[:, :nz] @ spread) / np.linalg.norm(K_next[:, :nz] @ spread))
+        K = K_next
+    met = np.array(changes) <= accuracy
+    n = 2 + int(np.flatnonzero(met[1:] & met[:-1])[0])  # two steps in a row, for two states
+
+    def moved(tail):
+        mpc = km.KoopmanMPC(model, km.Cost(**cost, tail=tail), horizon=8)
+        return mpc([0.7, -0.3], [0.2, 0.0]).u
+
+    np.testing.assert_allclose(moved(None), moved(n), rtol=1e-12)
+    assert not np.allclose(moved(None), moved(n + 1), rtol=1e-9)
+    assert n < 80
+
+
+def test_a_model_without_errors_has_the_tail_of_a_given_one():
+    rng = np.random.default_rng(1)
+    A, B = random_pair(rng, 3, 1, radius=1.1)
+    X = np.zeros((61, 3))
+    U = rng.normal(size=(60, 1))
+    for k in range(60):
+        X[k + 1] = A @ X[k] + B @ U[k] if k % 6 else rng.normal(size=3)
+    parts = [km.Episode(X=X[k + 1 : k + 6], U=U[k + 1 : k + 5]) for k in range(0, 54, 6)]
+    fitted = km.edmd(km.Episodes(parts, 0.1), km.State())
+    cost = km.Cost(Q=[1, 2, 0.5], R=0.3)
+    x, r = [1.0, -0.5, 0.2], [0.3, 0.0, 0.0]
+    short, given = (km.KoopmanMPC(model, cost, horizon=4)(x, r).u for model in (fitted, linear(A, B)))
+    np.testing.assert_allclose(short, given, rtol=1e-6)
+
+
 def test_update_goes_on_with_the_tail_of_the_new_model():
     rng = np.random.default_rng(0)
     old, new = (linear(*random_pair(rng, 2, 1)) for _ in range(2))

@@ -18,7 +18,7 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking
 from koopmpc.control.riccati import Stage
 from koopmpc.control.target import Targets
-from koopmpc.control.terminal_cost import tail_of, tail_stage
+from koopmpc.control.terminal_cost import learned_steps, tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
@@ -195,8 +195,8 @@ class Terminal(NamedTuple):
 def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, targets: Targets) -> Terminal:
     """Return the terminal cost that `cost` asks for.
 
-    The default tail of a model with a fit report or a scale is as long as the horizon. Its small errors grow in many
-    tail steps to eigenvalues beyond 1 that rule the plan.
+    The default tail of a model with a fit report or a scale is no longer than the model is accurate, see
+    `learned_steps`; that of a given model goes on until it rests.
 
     Raises
     ------
@@ -207,10 +207,10 @@ def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, target
         return _given(predictor, cost, horizon, targets)
     h, signals = horizon, horizon.signals
     D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
-    steps = cost.tail
+    stage, steps = tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), cost.tail
     if steps is None and not (predictor.report is None and predictor.scale is None):
-        steps = h.N
-    tail = tail_of(tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), steps)
+        steps = learned_steps(stage, predictor, h.N)
+    tail = tail_of(stage, steps)
     n, nr = len(tail.P), len(h.C)
     P, p_g = np.zeros((h.size, h.size)), np.zeros((h.size, tail.p.shape[1]))
     P[:n, :n], p_g[:n] = tail.P, tail.p  # u_{N−1} may be there for its limits alone
