@@ -2,9 +2,8 @@
 
 import copy
 from collections import deque
-from collections.abc import Sequence
 from time import perf_counter
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
-from koopmpc.control.cost import Cost, Tracking, checked
-from koopmpc.control.limits import Limits, admitted
+from koopmpc.control.cost import Tracking
+from koopmpc.control.limits import admitted
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
@@ -41,12 +40,20 @@ class InitialCondition:
     _VIEWS = ("z", "u_prev", "drive", "W", "d")
 
     def __init__(
-        self, model: StateModel, observer: StateObserver, N: int, latency: int, *, with_rates: bool, estimated: bool
+        self,
+        model: LinearPredictor | StateModel,
+        observer: StateObserver,
+        N: int,
+        latency: int,
+        *,
+        with_rates: bool,
+        estimated: bool,
     ) -> None:
-        self._model, self.observer, self._latency = model, observer, latency
+        self._model, self.observer, self._latency = state_model(model), observer, latency
         self._sizes = model.nz, model.nu, model.nw, N
         self._with_rates, self._estimated = with_rates, estimated
-        self._plain = not (estimated or latency or with_rates or model.nw or model.embedding is not None)
+        more = estimated or latency or with_rates or model.nw or model.embedding is not None
+        self._measured = None if more or not isinstance(observer, Measured) else observer  # where y is all that counts
         self._shape = (observer.ny,)
         self.known = np.zeros(model.nz + model.nu * with_rates + N * model.nw + model.nz * estimated + 1)
         self.known[-1] = 1.0
@@ -100,9 +107,15 @@ class InitialCondition:
         got = None if applied is None else numbers(applied, "applied")
         if got is not None and got.shape != last.shape:
             raise ShapeError(f"applied has shape {got.shape}, expected {last.shape}")
-        if self._plain and w is None and measured.shape == self._shape:  # y is all that counts
-            observer.observe(measured, last, self._w)
-            self.z[:] = observer.z
+        plain = self._measured
+        if plain is not None and w is None and measured.shape == self._shape:
+            if plain.lift is None:
+                self.z[:] = measured
+            else:
+                plain.lift.arguments[0][:] = measured
+                plain.lift.evaluate()
+                self.z[:] = plain.lift.results[0]
+            plain.z = self.z
             return
         if measured.shape != self._shape:
             what = "measurement of the estimator" if self._estimated else "state"
@@ -145,21 +158,27 @@ class InitialCondition:
 class MPCBase:
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
-    A subclass calls `_begin` once, `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step
-    returns the next input of the last good plan, then the unconstrained input clipped, then the last input.
+    A subclass calls `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step returns the
+    next input of the last good plan, then the unconstrained input clipped, then the last input.
 
     Parameters
     ----------
-    dt, nu
-        Sampling time [s], number of inputs.
-    cost, limits
-        What to minimise, within what; None for no limits.
-    horizon, latency
-        Steps of the plan, and until its first input acts.
-    moves
-        See `blocked`.
+    dt
+        Sampling time [s].
+    model
+        What the plan is made with.
+    tracking
+        What is tracked and limited.
+    blocks, move_of
+        Lengths of the blocks of held inputs, and which of a plan's moves each of the N steps takes.
+    observer, estimator
+        The observer of this controller, and the rule that started it, None where y is the state.
+    latency
+        Steps until the first input of a plan acts.
     time_limit
         Wall-clock time of a step [s].
+    with_rates
+        Whether the last input counts.
     """
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
@@ -168,43 +187,28 @@ class MPCBase:
     def __init__(
         self,
         dt: float,
-        nu: int,
-        cost: Cost,
-        limits: Limits | None,
-        horizon: int,
-        latency: int,
-        moves: int | Sequence[int] | None,
-        time_limit: float | None,
-    ) -> None:
-        self.cost, self.limits = checked(cost, limits)
-        if nu == 0:
-            raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
-        self.dt, self.nu = dt, nu
-        self._N, self._latency = checks.count(horizon, "horizon"), checks.count(latency, "latency", 0)
-        self.horizon = self._N + self._latency  # steps of preview
-        self._blocks = blocked(moves, self._N)
-        self._time_limit = time_limit
-        self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
-
-    def _begin(
-        self,
         model: LinearPredictor | StateModel,
         tracking: Tracking[Any],
+        blocks: tuple[int, ...],
+        observer: StateObserver,
         estimator: Estimator | None,
+        latency: int,
+        time_limit: float | None,
         *,
         with_rates: bool,
-        move_of: Int[np.ndarray, " N"] | None = None,
+        move_of: Int[np.ndarray, " N"],
     ) -> None:
-        """Set up the initial condition and the fallback; `move_of` says which of a plan's moves each step takes."""
-        if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator | None):
-            raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
-        self._estimator = estimator
+        self.cost, self.limits = tracking.cost, tracking.limits
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
-        self._with_rates = with_rates
-        self._move_of = np.arange(self._N) if move_of is None else move_of
-        observer, estimated = (Measured(model), False) if estimator is None else (estimator.start(model, self._N), True)
+        self.dt, self.nu, self._N = dt, len(self._inputs.low), len(move_of)
+        self._latency = checks.count(latency, "latency", 0)
+        self.horizon = self._N + self._latency  # steps of preview
+        self._blocks, self._move_of, self._with_rates = blocks, move_of, with_rates
+        self._time_limit = time_limit
+        self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
+        self._estimator = estimator
         self._initial = InitialCondition(
-            state_model(model), observer, self._N, self._latency, with_rates=with_rates, estimated=estimated
+            model, observer, self._N, self._latency, with_rates=with_rates, estimated=estimator is not None
         )
         MPCBase.reset(self)
 
@@ -282,26 +286,3 @@ class MPCBase:
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
         return Move(self._given.copy(), status, fallback, taken, iterations, solver=solver)
-
-
-def blocked(moves: int | Sequence[int] | None, N: int) -> tuple[int, ...]:
-    """Return the lengths of the blocks: N ones, M moves of which the last is held, or `moves` itself.
-
-    Raises
-    ------
-    DataError
-        There are more moves than steps, or the lengths do not sum to N.
-    """
-    if moves is None:
-        return (1,) * N
-    if isinstance(moves, Sequence):
-        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
-        if sum(lengths) != N:
-            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
-        return lengths
-    if not isinstance(cast(object, moves), int | np.integer):
-        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
-    M = checks.count(moves, "moves")
-    if M > N:
-        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
-    return (1,) * (M - 1) + (N - M + 1,)

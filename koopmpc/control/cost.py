@@ -125,7 +125,7 @@ class Cost(Value):
 
 @dataclass(frozen=True)
 class Tracking(Generic[Read]):
-    """The weights and limits of a problem, on what `tracked` and `limited` read from the model's state.
+    """The weights and limits of a cost and its limits, on what `tracked` and `limited` read from the model's state.
 
     Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
     `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. R_delta and
@@ -134,6 +134,8 @@ class Tracking(Generic[Read]):
     and `R_root` are S with SᵀS = Q and R.
     """
 
+    cost: Cost
+    limits: Limits
     tracked: Read
     limited: Read
     Q: Float[np.ndarray, "nr nr"]
@@ -155,7 +157,7 @@ LiftedTracking: TypeAlias = Tracking[np.ndarray]
 StateTracking: TypeAlias = Tracking[ca.Function]
 
 
-def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> LiftedTracking:
+def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | None) -> LiftedTracking:
     """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
 
     Raises
@@ -165,6 +167,7 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> L
     ShapeError
         A weight or a limit has another size than what it weighs or limits.
     """
+    cost, limits = checked(cost, limits)
     C, G, nx = observed(predictor, cost.of), predictor.C, predictor.nx
     if limits.of is not None:
         G = np.vstack([G, observed(predictor, limits.of)])
@@ -173,12 +176,13 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits) -> L
 
 
 def state_tracking(
-    states: tuple[str, ...], nu: int, cost: Cost, limits: Limits, size: int | None = None
+    states: tuple[str, ...], nu: int, cost: Cost, limits: Limits | None, size: int | None = None
 ) -> StateTracking:
     """Return what `cost` tracks and `limits` bound, as functions of these states.
 
     The functions take `size` values, the states first; by default the states alone.
     """
+    cost, limits = checked(cost, limits)
     nx = len(states)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
@@ -213,6 +217,8 @@ def _tracking(
         A row of u_target is outside the limits of the inputs.
     """
     nu = sizes[2]
+    if nu == 0:
+        raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
     Q_root, R_root = root(Q), root(R)
     sized = limits.sized(*sizes)
@@ -227,6 +233,8 @@ def _tracking(
                 " pass inputs that the limits allow"
             )
     return Tracking(
+        cost,
+        limits,
         tracked,
         limited(sized.rows.kept),
         Q,

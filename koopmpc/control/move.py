@@ -1,13 +1,16 @@
-"""What a controller returns: a Move, with a Status for every outcome; the protocol of a controller."""
+"""What a controller returns, a Move with a Status for every outcome; move blocking; the protocol of a controller."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc import checks
+from koopmpc.errors import DataError
 from koopmpc.values import Value
 
 
@@ -123,3 +126,29 @@ class Controller(Protocol):
             (nw,) measured disturbances, or rows from step k on, the last repeated; zero by default.
         """
         ...
+
+
+def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
+    """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
+
+    They are N ones, or M moves of which the last is held, or `moves` itself.
+
+    Raises
+    ------
+    DataError
+        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
+    """
+    N = checks.count(horizon, "horizon")
+    if moves is None:
+        return (1,) * N
+    if isinstance(moves, Sequence):
+        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
+        if sum(lengths) != N:
+            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
+        return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
+    M = checks.count(moves, "moves")
+    if M > N:
+        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
+    return (1,) * (M - 1) + (N - M + 1,)

@@ -7,7 +7,6 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from koopmpc import checks
@@ -89,21 +88,6 @@ def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     _require(float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1)
     return Gain(K, P)
-
-
-def one_step(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    R_delta: Float[np.ndarray, "nu nu"] | None,
-) -> Stage:
-    """Return one step with the cost ‖z‖²_Q + ‖u‖²_R, on [z; u_{k−1}] with ‖u − u_{k−1}‖²_{R_delta} where given."""
-    nz, nu = B.shape
-    if R_delta is None:
-        return Stage(A, B, Q, None, R)
-    M = np.vstack([np.zeros((nz, nu)), -R_delta])
-    return Stage(block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)]), block_diag(Q, R_delta), M, R + R_delta)
 
 
 def recursion(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"]) -> Law:

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
+from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv
 
-from koopmpc.control.riccati import Gain, Stage, gain, one_step, recursion, solved, step
+from koopmpc.control.riccati import Gain, Stage, gain, recursion, solved, step
 from koopmpc.errors import DefinitenessError
 from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
@@ -30,6 +31,21 @@ class Tail(NamedTuple):
     p: Float[np.ndarray, "nx ng"]
     K: Float[np.ndarray, "nu nx"]
     v: Float[np.ndarray, "nu ng"]
+
+
+def one_step(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    R_delta: Float[np.ndarray, "nu nu"] | None,
+) -> Stage:
+    """Return one step with the cost ‖z‖²_Q + ‖u‖²_R, on [z; u_{k−1}] with ‖u − u_{k−1}‖²_{R_delta} where given."""
+    nz, nu = B.shape
+    if R_delta is None:
+        return Stage(A, B, Q, None, R)
+    M = np.vstack([np.zeros((nz, nu)), -R_delta])
+    return Stage(block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)]), block_diag(Q, R_delta), M, R + R_delta)
 
 
 def tail_stage(

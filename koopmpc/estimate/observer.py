@@ -3,13 +3,14 @@
 The observer here takes the state as it was measured, without a disturbance.
 """
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.data.delay import Delay
+from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, buffered
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -184,11 +185,12 @@ class Measured:
 
     def __init__(self, model: LinearPredictor | StateModel) -> None:
         self._model = model = state_model(model)
-        self._lift = None if model.lifting is None else buffered(model.lifting)
+        self.lift = None if model.lifting is None else buffered(model.lifting)
         self._history = None if model.embedding is None else History(model.embedding)
         self.ny = model.ny
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
+        Measured.reset(self)
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget d and the past; x0 will come as the first measurement."""
@@ -204,10 +206,25 @@ class Measured:
         """Take y as it is; where it is lifted, a bad entry makes all of z NaN, which shows in every plan."""
         if self._history is not None:
             y = self._history.take(y, u)
-        if self._lift is None:
+        if self.lift is None:
             self.z = y
             return True
-        self._lift.arguments[0][:] = y
-        self._lift.evaluate()
-        self.z = self._lift.results[0]
+        self.lift.arguments[0][:] = y
+        self.lift.evaluate()
+        self.z = self.lift.results[0]
         return True
+
+
+def started(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:
+    """Return the observer of one controller with plans of this many steps; without an estimator y is the state.
+
+    Raises
+    ------
+    DataError
+        The estimator is something else, perhaps a class.
+    """
+    if estimator is None:
+        return Measured(model)
+    if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator):
+        raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
+    return estimator.start(model, horizon)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import Stage, one_step, recursion
-from koopmpc.control.terminal_cost import _iterate, _leap, stationary
+from koopmpc.control.riccati import Stage, recursion
+from koopmpc.control.terminal_cost import _iterate, _leap, one_step, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)

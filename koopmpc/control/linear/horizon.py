@@ -205,19 +205,20 @@ def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, target
     """
     if cost.Q_N is not None:
         return _given(predictor, cost, horizon, targets)
-    h, signals = horizon, horizon.signals
+    h, signals, size = horizon, horizon.signals, horizon.size
+    last, d = signals.w(h.N - 1), signals.d
     D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
     stage, steps = tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), cost.tail
     if steps is None and not (predictor.report is None and predictor.scale is None):
         steps = learned_steps(stage, predictor, h.N)
     tail = tail_of(stage, steps)
     n, nr = len(tail.P), len(h.C)
-    P, p_g = np.zeros((h.size, h.size)), np.zeros((h.size, tail.p.shape[1]))
+    P, p_g = np.zeros((size, size)), np.zeros((size, tail.p.shape[1]))
     P[:n, :n], p_g[:n] = tail.P, tail.p  # u_{N−1} may be there for its limits alone
     of_e, of_r, of_u = np.split(p_g, [D.shape[1], D.shape[1] + nr], axis=1)
     p = of_u @ input_target(h, targets)
-    p[:, signals.w(h.N - 1)] += of_e[:, : signals.nw]
-    p[:, signals.d] += of_e[:, signals.nw :]
+    p[:, last] += of_e[:, : signals.nw]
+    p[:, d] += of_e[:, signals.nw :]
     return Terminal(P, p, of_r, of_u @ targets.W, of_u)
 
 

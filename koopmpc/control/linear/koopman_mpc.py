@@ -16,13 +16,13 @@ from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates, condense, scaled
 from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
 from koopmpc.control.linear.plan import PlanMap
-from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.errors import DataError
-from koopmpc.estimate.observer import Estimator
+from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -102,11 +102,20 @@ class KoopmanMPC(MPCBase):
         if settings is not None:
             checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
-        super().__init__(predictor.dt, predictor.nu, cost, limits, horizon, latency, moves, time_limit)
+        track, blocks = lifted_tracking(predictor, cost, limits), blocked(moves, horizon)
+        super().__init__(
+            predictor.dt,
+            predictor,
+            track,
+            blocks,
+            started(estimator, predictor, sum(blocks)),
+            estimator,
+            latency,
+            time_limit,
+            with_rates=track.with_rates,
+            move_of=np.repeat(np.arange(len(blocks)), blocks),
+        )
         self.predictor, self._disturbed = predictor, estimator is not None
-        track = lifted_tracking(predictor, self.cost, self.limits)
-        move_of = np.repeat(np.arange(len(self._blocks)), self._blocks)
-        self._begin(predictor, track, estimator, with_rates=track.with_rates, move_of=move_of)
         asked = SOLVERS[solver]
         self._map = self._plan_map(predictor, track, self._wanted or asked.coordinates)
         exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]

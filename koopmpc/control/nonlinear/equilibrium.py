@@ -13,8 +13,7 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, StateTracking, root
 from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.problem import LearnedMap
-from koopmpc.control.riccati import one_step
-from koopmpc.control.terminal_cost import stationary, tail_of, tail_stage
+from koopmpc.control.terminal_cost import one_step, stationary, tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.plants.compiled import Buffered

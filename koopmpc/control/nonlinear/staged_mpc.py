@@ -13,11 +13,11 @@ from koopmpc import checks
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
-from koopmpc.control.move import Move, Plan, Status
+from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.target import reference_rows
-from koopmpc.estimate.observer import Estimator
+from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 
@@ -66,13 +66,25 @@ class StagedMPC(MPCBase):
         time_limit: float | None,
     ) -> None:
         self._map = given = learned_map(model)
-        super().__init__(model.dt, given.nu, cost, limits, horizon, latency, moves, time_limit)
-        self._outputs = o = state_tracking(model.states, given.nu, self.cost, self.limits, given.nx)
-        self._problem = staged_problem(given.F, o, self._blocks)
+        self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx)
+        blocks = blocked(moves, horizon)
+        self._problem = staged_problem(given.F, o, blocks)
+        N = sum(blocks)
+        super().__init__(
+            model.dt,
+            given,
+            o,
+            blocks,
+            started(estimator, given, N),
+            estimator,
+            latency,
+            time_limit,
+            with_rates=self._problem.with_rates,
+            move_of=np.arange(N),
+        )
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._row = 0  # of a u_target that is given in rows, for the next call
         self._disturbed = estimator is not None or given.nw > 0
-        self._begin(given, o, estimator, with_rates=self._problem.with_rates)
 
     @property
     def model(self) -> ModelOrMap:

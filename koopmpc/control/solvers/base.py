@@ -156,10 +156,10 @@ class StepSolver:
 
     def __init__(self, qp: StepQP, choices: Sequence[Choice]) -> None:
         self._choices = choices
-        self._solvers = [None if choice.late else choice.solver(qp, choice.settings) for choice in choices]
         self._turn = 0
         self._last: QPSolution | None = None
         self._hold(qp)
+        self._solvers = [None if choice.late else choice.solver(qp, choice.settings) for choice in choices]
 
     def _hold(self, qp: StepQP) -> None:
         """Make this the QP; its rows are often those of the plan, one after the other."""
