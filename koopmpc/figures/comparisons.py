@@ -17,6 +17,7 @@ from koopmpc.figures.style import (
     band,
     chosen_states,
     figure,
+    followed,
     interval,
     legend,
     line,
@@ -217,9 +218,7 @@ def _trajectories(
         panel.plot(t, truth[:, i], **_BENEATH, label="truth")
         for name, curve in curves.items():
             panel.plot(t, curve[:, i], **line(names.index(name), len(t)), label=name)
-        low, high = float(truth[:, i].min()), float(truth[:, i].max())
-        shown = [v for curve in curves.values() for v in curve[np.isfinite(curve[:, i]), i]]
-        panel.set_ylim(*interval(low, high, min(shown, default=low), max(shown, default=high), _LEAVES))
+        panel.set_ylim(*followed(truth[:, i], [curve[:, i] for curve in curves.values()], _LEAVES))
 
 
 def _relative_errors(

@@ -15,7 +15,7 @@ from koopmpc.figures.style import (
     band,
     chosen_states,
     figure,
-    interval,
+    followed,
     legend,
     line,
     styled,
@@ -71,7 +71,8 @@ def rollout(
             band(panel, t, *_within(ahead.low[:, i], ahead.high[:, i]), 0, ahead.band)
         panel.plot(t, ahead.truth[:, i], **TRUTH, label="truth")
         panel.plot(t, ahead.predicted[:, i], **line(0, len(t)), label="prediction")
-        panel.set(ylabel=ahead.states[i], ylim=_followed(ahead.truth[:, i], ahead.predicted[:, i]))
+        shown = followed(ahead.truth[:, i], [ahead.predicted[:, i]], _BEYOND)
+        panel.set(ylabel=ahead.states[i], ylim=shown)
     for panel, name, u in zip(axes[len(chosen) :], ahead.inputs, ahead.U.T, strict=True):
         panel.stairs(u, t, baseline=None, **TRUTH)
         panel.set_ylabel(name)
@@ -130,13 +131,6 @@ def _within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the band where it is finite, NaN elsewhere."""
     finite = np.isfinite(low) & np.isfinite(high)
     return np.where(finite, low, np.nan), np.where(finite, high, np.nan)
-
-
-def _followed(truth: np.ndarray, predicted: np.ndarray) -> tuple[float, float]:
-    """Return an axis that shows the truth, and a prediction that does not run away from it."""
-    low, high = float(truth.min()), float(truth.max())
-    shown = predicted[np.isfinite(predicted)]
-    return interval(low, high, float(shown.min(initial=low)), float(shown.max(initial=high)), _BEYOND)
 
 
 def _box(run: Run, what: str, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -81,13 +81,12 @@ def styled(plot: Callable[P, T]) -> Callable[P, T]:
     return within
 
 
-@styled
 def figure(
-    rows: int = 1,
+    rows: int,
     columns: int = 1,
     *,
-    width: Width = "one column",
-    height: float | None = None,
+    width: Width,
+    height: float,
     **more: Any,
 ) -> "tuple[Figure, np.ndarray]":
     """Return a figure and its (rows, columns) axes, an array of objects.
@@ -99,7 +98,7 @@ def figure(
     width
         "one column" or "two columns" of a page.
     height
-        [in]; 1.5 in a row by default, and 0.6 for what is around them.
+        Of the figure [in].
     more
         For `Figure.subplots`: ``sharex``, ``height_ratios``, …
 
@@ -112,8 +111,7 @@ def figure(
 
     if width not in WIDTHS:
         raise DataError(f"width is {width!r}; pass one of {', '.join(WIDTHS)}")
-    size = (WIDTHS[width], 0.6 + 1.5 * rows if height is None else checks.positive(height, "height", "in"))
-    made = Figure(figsize=size, layout="constrained")
+    made = Figure(figsize=(WIDTHS[width], height), layout="constrained")
     return made, made.subplots(rows, columns, squeeze=False, **more)
 
 
@@ -160,6 +158,13 @@ def interval(low: float, high: float, lowest: float, highest: float, beyond: flo
     bottom, top = max(min(low, lowest), low - beyond * span), min(max(high, highest), high + beyond * span)
     margin = 0.06 * ((top - bottom) or span)
     return bottom - margin, top + margin
+
+
+def followed(truth: np.ndarray, curves: Iterable[np.ndarray], beyond: float) -> tuple[float, float]:
+    """Return an axis for the truth, and for curves that do not run away from it by more than `beyond` of its spans."""
+    low, high = float(truth.min()), float(truth.max())
+    shown = np.concatenate([[low, high], *(curve[np.isfinite(curve)] for curve in curves)])
+    return interval(low, high, float(shown.min()), float(shown.max()), beyond)
 
 
 def chosen_states(states: Chosen | None, names: Sequence[str]) -> list[int]:

@@ -219,33 +219,9 @@ class SimulatedPlant:
     """x⁺ = F(x, u) + w, y = h(x): a `StepMap`, or the map of a `black_box`, that remembers its state."""
 
     def __init__(self, step_map: Transition) -> None:
-        self.step_map = step_map
+        self.step_map, self.dt, self.scene = step_map, step_map.dt, step_map.scene
+        self.states, self.inputs, self.outputs = step_map.states, step_map.inputs, step_map.outputs
         self._x: Float[np.ndarray, " nx"] | None = None
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.step_map.dt
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of x."""
-        return self.step_map.states
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of u."""
-        return self.step_map.inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of y."""
-        return self.step_map.outputs
-
-    @property
-    def scene(self) -> Scene | None:
-        """scene(x, u) → shapes of the step map, None where it has none."""
-        return self.step_map.scene
 
     @property
     def state(self) -> Float[np.ndarray, " nx"] | None:
