@@ -38,14 +38,14 @@ def test_real_eigenfunctions_are_one_picture_each_and_pairs_stand_side_by_side(t
     a = np.tile(np.linspace(-1, 1, 11), 11)
     drawn = _mesh(made.axes[0])
     assert drawn * np.sign(drawn[-1]) == pytest.approx(a)
-    km.figures.save(made, tmp_path / "a.pdf")
+    km.plot.save(made, tmp_path / "a.pdf")
     only = km.plot.eigenfunctions(model, [0], ("a", "b"), [(-1, 1), (0, 1)], points=5)
     assert [axes.get_ylabel() for axes in only.axes] == ["b", "φ₀"]
 
 
 def test_a_picture_of_shades_keeps_its_colours_and_its_labels_stay_inside(tmp_path) -> None:
     made = km.plot.eigenfunctions(turning(), 1, (0, 1), SQUARE)
-    km.figures.save(made, tmp_path / "a.png")
+    km.plot.save(made, tmp_path / "a.png")
     picture = Image.open(tmp_path / "a.png")
     assert len(picture.convert("RGB").getcolors(1 << 24)) > 1000
     labels = [(axes, text) for axes in made.axes for text in axes.texts if "π" in text.get_text()]

@@ -61,7 +61,7 @@ def test_a_prediction_that_runs_away_leaves_the_picture_and_not_the_truth(tmp_pa
     assert low < episode.X[:, 0].min() < episode.X[:, 0].max() < high
     assert high - low < 4 * np.ptp(episode.X[:, 0])
     assert np.isnan(km.validate.forecast(turning(1e12), episode, 30).predicted).any()
-    km.figures.save(made, tmp_path / "a.png")
+    km.plot.save(made, tmp_path / "a.png")
 
 
 def test_relifted_forecasts_and_parts_of_the_state() -> None:
@@ -102,8 +102,8 @@ def test_a_run_is_drawn_whole(tmp_path) -> None:
     shown = [label.get_text() for label in made.axes[-1].get_yticklabels()]
     assert {name.upper().replace(" ", "_") for name in shown} == {status.name for status in run.status}
     assert sum(len(one.get_xdata()) for one in made.axes[-1].get_lines()) == run.steps
-    km.figures.save(made, tmp_path / "run.svg")
-    km.figures.save(km.plot.run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
+    km.plot.save(made, tmp_path / "run.svg")
+    km.plot.save(km.plot.run(make_run(T=3, cost=False, limits=False)), tmp_path / "bare.png")
 
 
 def test_a_model_with_a_memory_forecasts_from_the_first_known_past() -> None:

@@ -20,17 +20,17 @@ def _drawn():
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_the_same_figure_is_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     first, second = tmp_path / "a" / "b" / f"one{suffix}", tmp_path / f"two{suffix}"
-    km.figures.save(_drawn(), first)
-    km.figures.save(_drawn(), second)
+    km.plot.save(_drawn(), first)
+    km.plot.save(_drawn(), second)
     assert first.read_bytes() == second.read_bytes()
     assert len(first.read_bytes()) > 1000
 
 
 def test_pictures_of_lines_are_small_and_look_the_same(tmp_path: Path) -> None:
     made = _drawn()
-    km.figures.save(made, tmp_path / "a.png")
+    km.plot.save(made, tmp_path / "a.png")
     made.axes[0].scatter([], [], c=[])  # a picture with shades keeps all colours
-    km.figures.save(made, tmp_path / "full.png")
+    km.plot.save(made, tmp_path / "full.png")
     small, full = Image.open(tmp_path / "a.png"), Image.open(tmp_path / "full.png")
     assert (tmp_path / "a.png").stat().st_size < 0.6 * (tmp_path / "full.png").stat().st_size
     assert small.size == full.size
@@ -40,9 +40,9 @@ def test_pictures_of_lines_are_small_and_look_the_same(tmp_path: Path) -> None:
 
 
 def test_a_users_settings_change_nothing_and_come_back(tmp_path: Path) -> None:
-    km.figures.save(_drawn(), tmp_path / "a.png")
+    km.plot.save(_drawn(), tmp_path / "a.png")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 30.0}):
-        km.figures.save(_drawn(), tmp_path / "b.png")
+        km.plot.save(_drawn(), tmp_path / "b.png")
         assert (mpl.rcParams["lines.linewidth"], mpl.rcParams["font.size"]) == (9.0, 30.0)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
