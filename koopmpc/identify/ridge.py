@@ -1,4 +1,8 @@
-"""cross_validated: the ridge by generalised cross-validation."""
+"""cross_validated: the ridge of one fit by generalised cross-validation, ``ridge="gcv"``.
+
+It weighs the errors of one step. `select` chooses a ridge by the errors over a horizon on held-out folds:
+synthesis/cross_validation.py.
+"""
 
 import numpy as np
 from jaxtyping import Float

@@ -1,5 +1,5 @@
 # pyright: basic
-"""view opens logs in one Rerun viewer; screenshot draws a picture of a log without a screen."""
+"""view opens logs in one Rerun viewer; a running loop finds the viewer that is up, or opens one."""
 
 import os
 import socket
@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from time import sleep
 
 from koopmpc.errors import LogError
 from koopmpc.recording.format.rrd import check_log
@@ -88,9 +87,6 @@ def program() -> Path:
     return folder / ("rerun.exe" if sys.platform.startswith("win") else "rerun")
 
 
-_SETTLE = 2.5  # until plots have found their ranges [s]
-
-
 def view(logs: str | Path | Sequence[str | Path]) -> None:
     """Open one log, or several, in one viewer; it stays open by itself.
 
@@ -107,33 +103,6 @@ def view(logs: str | Path | Sequence[str | Path]) -> None:
         )
     if not open_viewer(paths, free_port()):
         raise LogError(f"the viewer did not start; run `{program()} {paths[0]}` to see what it says")
-
-
-def screenshot(log: str | Path, picture: str | Path, *, time: float, size: tuple[int, int] = (1600, 1000)) -> None:
-    """Write `picture` (.png) of `log` at `time` [s], as its blueprint lays it out; needs no screen, but Vulkan.
-
-    Raises
-    ------
-    LogError
-        The log does not exist or is no .rrd file, or there is no Vulkan driver (Debian: mesa-vulkan-drivers).
-    """
-    from rerun.experimental import ViewerClient
-
-    (path,) = _existing(log)
-    port = free_port()
-    viewer = start_viewer("--headless", "--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", port=port)
-    if viewer is None:
-        raise LogError(f"no picture of {path}: the viewer did not start; is a Vulkan driver installed?")
-    try:
-        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-        client.open(path)
-        client.set_time("sim_time", duration=time, play_state="paused")
-        client.save_screenshot(str(picture))  # lays the plots out
-        sleep(_SETTLE)
-        client.save_screenshot(str(picture))
-    finally:
-        viewer.terminate()
-        viewer.wait(5.0)
 
 
 def _existing(logs: str | Path | Sequence[str | Path]) -> list[str]:

@@ -1,4 +1,7 @@
-"""One candidate, cross-validated: fitted without each fold and rolled out over it, for every ridge at once."""
+"""One candidate, cross-validated: fitted without each fold and rolled out over it, for every ridge at once.
+
+This is how `select` chooses a ridge; the ``ridge="gcv"`` of a single fit is in identify/ridge.py.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

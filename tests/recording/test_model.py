@@ -8,9 +8,9 @@ import pytest
 import koopmpc as km
 from koopmpc.figures.plane import eigenfunctions_on, plane_through
 from koopmpc.recording.format.rrd import LogColumns, read_columns
-from koopmpc.recording.viewer import free_port, screenshot, start_viewer
 from koopmpc.recording.views.eigenvalues import circle, sequence
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
+from tests.recording.viewing import drawn
 
 DATA = episodes(24, noise=0.05)
 BILINEAR = km.BilinearPredictor(
@@ -118,23 +118,9 @@ def test_what_has_no_eigenfunctions_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_viewer_draws_every_view(log: Path, tmp_path: Path) -> None:
-    from rerun.experimental import ViewerClient
-
-    port = free_port()
-    process = start_viewer("--headless", "--hide-welcome-screen", port=port)
-    if process is None:
-        pytest.skip("the viewer does not start here: no Vulkan driver (Debian's is mesa-vulkan-drivers)")
-    try:
-        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-        client.open(str(log))
-        client.save_screenshot(str(tmp_path / "first.png"))
-        views = client.get_state().views
-    finally:
-        process.kill()
-        process.wait()
+    views = drawn(log, tmp_path / "model.png", at=0.5)
     assert {v.name for v in views} >= {STATES[0], INPUTS[0], "Eigenvalues of A and the unit circle", "Report"}
     assert [v for v in views if v.reports] == []
-    screenshot(log, tmp_path / "model.png", time=0.5)
     assert (tmp_path / "model.png").stat().st_size > 20_000
 
 
