@@ -14,13 +14,13 @@ from koopmpc.errors import DataError, KoopmpcError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-AHEAD = 2  # tasks a worker that may be under way or done before their turn
+AHEAD = 2  # tasks for each worker that may be under way, or done before their turn
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 _SHOWN = 200  # characters of a task that a message shows
-_PATIENCE = 30.0  # [s] without any worker
-_ANSWER = 10.0  # [s] for a scheduler to answer
+_PATIENCE = 30.0  # longest wait for a cluster without any worker [s]
+_ANSWER = 10.0  # longest wait for a scheduler to answer [s]
 _ANY_PORT = "127.0.0.1:0"
 
 
@@ -103,7 +103,7 @@ def _awaited(job: Job[Any], future: Any, client: Any) -> Any:
             return future.result(timeout=_PATIENCE)
         except TimeoutError:
             if future.done():
-                raise  # the function's own
+                raise  # the function itself raised it
             if not client.nthreads():
                 raise KoopmpcError(
                     f"{job}: the cluster has had no worker for {_PATIENCE:g} s; start some with `dask worker ADDRESS`"

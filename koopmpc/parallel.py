@@ -20,10 +20,12 @@ from koopmpc.cluster import AHEAD, ONE_THREAD, Job, Result, Task, address_of, di
 from koopmpc.errors import DataError, KoopmpcError
 
 Progress = Callable[[int, int | None], None]
-StageProgress = Callable[[str, int, int | None], None]  # the same of work in several stages, each with its name
+StageProgress = Callable[
+    [str, int, int | None], None
+]  # the same for work in several stages, the name of the stage first
 
-_TRIES = 3  # how often a task may take its worker with it when it is done alone
-_GRACE = 5.0  # [s] for a process to end
+_TRIES = 3  # how often a task that runs alone may kill its worker before it is named
+_GRACE = 5.0  # time that a process gets to end [s]
 _GUARD = 'put what the script runs under `if __name__ == "__main__":`, for each worker imports the script first'
 _UNSENDABLE = (AttributeError, TypeError, pickle.PicklingError)
 
@@ -201,7 +203,7 @@ def _one_thread() -> Generator[None]:
                 os.environ[name] = value
 
 
-_function: Callable[[Any], Any] | None = None  # what a worker does; None in the parent
+_function: Callable[[Any], Any] | None = None  # the function that this worker calls; None in the parent
 
 
 def _begin(function: Callable[[Any], Any]) -> None:

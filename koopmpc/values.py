@@ -183,7 +183,7 @@ def class_of(name: str) -> type[Value] | None:
 def _check_types(value: Value) -> None:
     """Raise where a field is of another type than its class declares."""
     hints = _hints(type(value))
-    with jaxtyped("context"):  # one size for each letter in the shapes of a class
+    with jaxtyped("context"):  # so that a letter in the shapes of a class has one size
         for name in _fields(value):
             got = getattr(value, name)
             if not _is_a(got, hints[name]):
@@ -197,7 +197,7 @@ def _hints(cls: type[Value]) -> dict[str, Any]:
     return get_type_hints(cls)
 
 
-@no_type_check  # a check of its own would open a new context, in which no letter has its size yet
+@no_type_check  # not a checked function of its own, because in that no letter would have its size yet
 def _is_a(value: Any, hint: Any) -> bool:
     """Return True where `value` is of the type that `hint` declares; an int passes for a float.
 

@@ -54,7 +54,7 @@ def load_problem(problem: str | Path) -> Problem:
     text = str(problem)
     path, case = _find(text), ""
     name, colon, last = text.rpartition(":")
-    if path is None and colon and last[:1] not in ("/", "\\"):  # the colon of C:\spring.py is a drive's
+    if path is None and colon and last[:1] not in ("/", "\\"):  # the colon in C:\spring.py belongs to the drive
         path, text, case = _find(name), name, last
     if path is None:
         raise ProblemError(_unknown(text))
@@ -108,7 +108,7 @@ def _load(path: Path) -> Problem:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     module.__file__ = str(path)
-    sys.modules[module_name] = module  # dataclasses look their module up
+    sys.modules[module_name] = module  # dataclasses look up their module by name
     try:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:  # a file that calls exit() must not end the program

@@ -86,7 +86,7 @@ def failures(run: Run, steps: int) -> list[str]:
     return found
 
 
-@np.errstate(invalid="ignore", over="ignore")  # a state that diverged reaches nothing
+@np.errstate(invalid="ignore", over="ignore")  # a state that diverged does not reach the reference
 def reached(run: Run) -> bool:
     """Return True where √(eᵀQe) stays below 5 % of its first value over the last tenth of the run.
 

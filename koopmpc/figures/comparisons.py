@@ -30,11 +30,11 @@ from koopmpc.validate.scoring import Score
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BEYOND = 3.5  # sizes of the best model's errors that the errors of others are followed beyond them
-_LEAVES = 0.5  # spans of the truth, or of the median run, that a curve is followed beyond it
-_LEAST, _HIGHEST = 1e-13, 1e3  # relative errors below the first are rounding, above the second all alike
+_BEYOND = 3.5  # how far the axis follows other models beyond the best one's errors, in spans of those
+_LEAVES = 0.5  # how far the axis follows a curve beyond the truth or the median run, in spans of those
+_LEAST, _HIGHEST = 1e-13, 1e3  # relative errors below the first are rounding, and those above the second look alike
 _TICKS = 5  # ticks of the relative error, at most
-_BENEATH: dict[str, Any] = TRUTH | {"linewidth": 2.4}  # wide, to be seen on both sides of a curve that lies on it
+_BENEATH: dict[str, Any] = TRUTH | {"linewidth": 2.4}  # wide enough to show on both sides of a curve that lies on it
 
 
 @styled

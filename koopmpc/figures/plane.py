@@ -129,8 +129,8 @@ def eigenfunctions_on(
     return phi / largest[:, None, None]
 
 
-_CUT = 0.8 * np.pi  # no lines of equal phase near ±π, where it jumps
-_EDGE = 0.08  # of the width: no label nearer to the side, where it would be cut
+_CUT = 0.8 * np.pi  # lines of equal phase end here, because the phase jumps at ±π
+_EDGE = 0.08  # share of the width next to each side that stays free of labels, which would be cut there
 _PAPER: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 _QUARTERS = {-np.pi / 2: "−π/2", 0.0: "0", np.pi / 2: "π/2"}
 
@@ -147,8 +147,8 @@ def eigenfunctions(
 ) -> "Figure":
     """Draw φ_j(x) = ξ_jᴴ ψ(x) over two states: |φ_j| and its phase; of a real eigenvalue φ_j itself.
 
-    The largest |φ_j| of the plane is 1. Level sets of |φ_j| are where the motion goes in step, of the phase where
-    it goes at one time.
+    The largest |φ_j| of the plane is 1. Without input, states on one line of equal |φ_j| move to another such line
+    together, and so do states on one line of equal phase.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) ->
             "linestyles": ["--", "-", ":"],
         }
         lines = axes.contour(plane.across, plane.up, inner, **look)
-        halo = withStroke(linewidth=2.0, foreground="white")  # the darkest shade is as dark as the line
+        halo = withStroke(linewidth=2.0, foreground="white")  # a halo, because the darkest shade is as dark as the line
         lines.set_path_effects([halo])
         across = np.quantile(plane.across, [_EDGE, 1 - _EDGE])
         texts: Any = axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)

@@ -28,7 +28,7 @@ from koopmpc.validate.scoring import AnyPredictor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BEYOND = 1.0  # spans of the truth that a prediction is followed beyond it
+_BEYOND = 1.0  # how far the axis follows a prediction beyond the truth, in spans of the truth
 _STATE, _INPUT = 1.05, 0.75  # heights of a panel [in]
 
 

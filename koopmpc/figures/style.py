@@ -27,7 +27,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Width = Literal["one column", "two columns"]
 
-WIDTHS: dict[str, float] = {"one column": 3.5, "two columns": 7.16}  # of a page in two columns [in]
+WIDTHS: dict[str, float] = {"one column": 3.5, "two columns": 7.16}  # widths on a page in two columns [in]
 TRUTH: dict[str, Any] = {"color": "#000000", "linestyle": "-", "linewidth": 1.4}
 REFERENCE: dict[str, Any] = {"color": "#000000", "linestyle": ":", "linewidth": 1.1}
 LIMIT: dict[str, Any] = {"color": "#8c1d18", "linestyle": (0, (6, 2)), "linewidth": 0.9}
@@ -35,7 +35,7 @@ SEQUENTIAL = "viridis"  # its lightness grows evenly, so it reads in grey
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # colour-blind readers can tell them
 _DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "x")
-_MOST = 12  # states that one figure has panels for
+_MOST = 12  # states in one figure, at most
 _SUFFIXES = (".png", ".pdf", ".svg")
 _RC: dict[str, Any] = {
     "font.size": 8.0,
@@ -59,9 +59,9 @@ _RC: dict[str, Any] = {
     "ytick.major.width": 0.7,
     "figure.dpi": 200.0,
     "savefig.dpi": 200.0,
-    "pdf.fonttype": 42,  # text stays text
+    "pdf.fonttype": 42,  # fonts are embedded, so that text can be selected
     "svg.fonttype": "path",
-    "svg.hashsalt": "koopmpc",  # or ids are random
+    "svg.hashsalt": "koopmpc",  # without it, ids are random
 }
 _METADATA: dict[str, dict[str, Any]] = {
     ".png": {"Software": None},

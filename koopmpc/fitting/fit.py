@@ -143,7 +143,7 @@ def fit_data(
         selection.linear.save(place / LINEAR)
     chosen = "\n".join([str(selection), *(f"! {doubt}" for doubt in doubts)])
     tell(chosen)
-    with noted([]):  # the same doubts again
+    with noted([]):  # the fits repeat the doubts that were told above
         report = trust(selection.predictor, split.held_out, split.horizon, train=split.seen, rng=draw)
         plain = score(edmd(split.seen, State() + Constant()), split.held_out, split.horizon)
     judged = f"{report}\n\n{_beside(report.score, plain)}"

@@ -1,4 +1,4 @@
-"""Logs before a fit: what no model can use is put right and said, and episodes are held out to judge by."""
+"""Logs before a fit: useless columns are left out, angles unwrapped, and episodes held out to judge the model."""
 
 import warnings
 from collections.abc import Generator, Iterable, Sequence
@@ -116,7 +116,7 @@ _SHOWN = 6  # files of which a report says what each of them needs
 def noted(notes: list[str]) -> Generator[None]:
     """Collect the text of each FitWarning, once, instead of showing it.
 
-    A ColumnWarning is left out: one file says nothing of all, over which `needed` decides.
+    A ColumnWarning is about one file and is dropped: `needed` judges each column by all files.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FitWarning)
@@ -155,7 +155,7 @@ def shortened(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
 
 IN_MEMORY = 150_000_000  # bytes of files that are read as a whole
 PAST = 2  # steps that a model may look back
-_SHARE = 0.2  # of the episodes that are held out
+_SHARE = 0.2  # share of the episodes that is held out
 _ENOUGH = 12  # held-out episodes from which on bands are finite
 _JUDGED = 10_000  # steps that a report is made of
 

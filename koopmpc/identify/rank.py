@@ -16,7 +16,7 @@ from koopmpc.identify.solve import RegressionRows, cutoff
 
 Rank = int | float | Literal["hard-threshold"] | None
 
-_NODES = 200  # of the quadrature of the Marchenko–Pastur law, smooth in the angle
+_NODES = 200  # nodes of the quadrature of the Marchenko–Pastur law, which is smooth in the angle
 _HALVINGS = 60
 
 
@@ -105,7 +105,7 @@ def optimal_factor(beta: float) -> float:
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
 
-    def above(phi: float) -> float:  # the share of the law with t above t(φ)
+    def above(phi: float) -> float:  # the share of the law's mass with t above t(φ)
         angles = 0.5 * phi * (nodes + 1)
         t = 1 + beta + 2 * np.sqrt(beta) * np.cos(angles)
         return float(0.5 * phi * weights @ (2 * np.sin(angles) ** 2 / (np.pi * t)))

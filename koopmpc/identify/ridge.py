@@ -10,8 +10,8 @@ from jaxtyping import Float
 _ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
 _NOTHING = 1e-14  # share of the smallest σ² below which a ridge changes nothing
 _LARGEST = 1e3  # share of σ₁² above which a ridge leaves next to nothing of K
-_POINTS = 300  # of the first grid, about ten a decade
-_ZOOMS = 5  # each ten times finer than the one before
+_POINTS = 300  # points of the first grid, about ten a decade
+_ZOOMS = 5  # refinements of the grid, each ten times finer than the one before
 
 
 def cross_validated(

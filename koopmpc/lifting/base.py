@@ -125,7 +125,7 @@ class Lifting(Value, ABC):
 
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return both liftings one under the other; an observable that both name is held once."""
-        from koopmpc.lifting.algebra import Sum  # which is a Lifting itself
+        from koopmpc.lifting.algebra import Sum  # here, because that file imports this one
 
         other = lifting_of(other)
         parts = [part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))]
@@ -136,7 +136,7 @@ class Lifting(Value, ABC):
 
     def __mul__(self, other: "Lifting") -> "Lifting":
         """Return all products of this lifting's observables with the other's."""
-        from koopmpc.lifting.algebra import Product  # which is a Lifting itself
+        from koopmpc.lifting.algebra import Product  # here, because that file imports this one
 
         product = Product(self, lifting_of(other))
         bound = self._common(other)
@@ -146,7 +146,7 @@ class Lifting(Value, ABC):
         """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
         if Value._kinds.get(type(self).__name__) is type(self):
             return self
-        from koopmpc.lifting.expressions import Traced  # which is a Lifting itself
+        from koopmpc.lifting.expressions import Traced  # here, because that file imports this one
 
         return Traced(self._graph, self.names, bound=self.bound_states)
 

@@ -104,7 +104,7 @@ class Gaussian(Lifting):
         return -0.5 / self.width**2
 
 
-_TINY = 1e-100  # keeps ln, its first and its second derivative finite at the centre; no other value feels it
+_TINY = 1e-100  # keeps ln and its first two derivatives finite at the centre, and is below rounding elsewhere
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -92,7 +92,7 @@ class Standardized(Lifting):
         return bound
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the inner names with ``~`` and a sum over mean and scale: other numbers are other observables."""
+        """Return the inner names with ``~`` and a checksum of mean and scale: other numbers give other observables."""
         tag = f"~{crc32(self.mean.tobytes() + self.scale.tobytes()):08x}"
         return tuple(name if name == CONSTANT else name + tag for name in self.lifting.bind(states).names)
 

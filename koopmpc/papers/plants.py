@@ -19,7 +19,7 @@ from koopmpc.plants.dynamics import Dynamics, right_side
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import StepMap
 
-SUBSTEPS = 8  # of RK4 in a sample of 0.01 s, for an error below 1e-12
+SUBSTEPS = 8  # RK4 steps in a sample of 0.01 s, for an error below 1e-12
 
 
 @dataclass(frozen=True)

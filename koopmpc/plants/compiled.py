@@ -24,7 +24,7 @@ Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]],
 
 # No fused multiply-adds and no -march: the interpreter's numbers, on any machine of this kind.
 _FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
-_STEPS_A_THREAD = 50_000  # some 5 ms, against 0.1 ms for a thread
+_STEPS_A_THREAD = 50_000  # they take about 5 ms, and starting a thread 0.1 ms
 _LOOP = """
 #ifdef _WIN32
 __declspec(dllexport)
@@ -92,7 +92,7 @@ def source(F: ca.Function) -> str:
     generator = ca.CodeGenerator("koopmpc", {"with_header": False})
     generator.add(step)
     sizes = {f"sz_{name}": getattr(step, f"sz_{name}")() + 1 for name in ("arg", "res", "iw", "w")}
-    # Static: an exported name could be taken by one of the same name elsewhere in the process.
+    # Static, because an exported name could clash with the same name elsewhere in the process.
     return (
         "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump() + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
     )
@@ -127,14 +127,14 @@ def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
         The compiler fails or its output does not load.
     """
     if cache is None:
-        with tempfile.TemporaryDirectory() as folder:  # mapped code outlives its file
+        with tempfile.TemporaryDirectory() as folder:  # code that is loaded outlives its file
             return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
     key = "\0".join([text, *command, *_FLAGS, platform.machine(), platform.system()])
     path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     if path.is_file():
         try:
             return ctypes.CDLL(str(path))
-        except OSError:  # of another kind of machine: write it again
+        except OSError:  # the file is of another kind of machine: write it again
             path.unlink()
     return ctypes.CDLL(str(_compile(text, command, path)))
 
@@ -191,7 +191,7 @@ def _bound(code: ctypes.CDLL) -> Kernel:
         if threads > 1:
             ends = [episodes * i // threads for i in range(threads + 1)]
             parts = [slice(*pair) for pair in pairwise(ends)]
-            with ThreadPoolExecutor(threads) as pool:  # ctypes lets go of the interpreter's lock
+            with ThreadPoolExecutor(threads) as pool:  # ctypes releases the interpreter's lock
                 list(pool.map(march, [X[part] for part in parts], [U[part] for part in parts]))
         else:
             march(X, U)

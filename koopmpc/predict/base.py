@@ -61,7 +61,7 @@ def load_value(path: str | Path, *kinds: type[V]) -> V:
         value = from_data(node.get("value"), arrays)
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
-    except Exception as error:  # a class met something that it was never meant to hold
+    except Exception as error:  # a damaged file gave a class something that it was never meant to hold
         raise LogError(f"{path} is damaged, or was made by hand: {error}") from error
     if not isinstance(value, kinds):
         raise LogError(f"{path} holds a {type(value).__name__}, not a {wanted}")

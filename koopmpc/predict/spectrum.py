@@ -54,7 +54,7 @@ def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, 
         z = lifting(checks.array(states, "x", (width,)))
         return lstsq(modes, z.astype(complex), cond=_ROUNDING * max(modes.shape), lapack_driver="gelsy")[0]
     Z = lifting(checks.array(states, "x", (None, width)))
-    basis, small = np.linalg.qr(modes)  # what lies outside of Φ no b can reach
+    basis, small = np.linalg.qr(modes)  # no b can reach what lies outside the span of Φ
     powers = np.power(predictor.eigenvalues, np.arange(len(Z))[:, None])
     stacked = (small * powers[:, None, :]).reshape(-1, modes.shape[1])
     seen = (Z @ basis.conj()).ravel()

@@ -58,7 +58,7 @@ def empty_regions(
     last = last + 1
     total = np.zeros((len(held), bins + 1, bins + 1), dtype=np.int64)
     total[:, 1:, 1:] = held.cumsum(axis=1).cumsum(axis=2)
-    strips = total[:, last] - total[:, first]  # of each interval of the first coordinate
+    strips = total[:, last] - total[:, first]  # samples in each interval of the first coordinate
     area = np.outer(last - first, last - first)
     box = list(zip(low.tolist(), high.tolist(), strict=True))
     found: list[Region] = []
@@ -86,7 +86,7 @@ def _interval(low: float, high: float) -> str:
 
 
 _ROWS = 4096  # samples that are binned at once
-_BINS = 10  # per coordinate
+_BINS = 10  # bins of a coordinate, at most
 _IN_CELL = 10  # samples that a cell of a pair holds on average, at least
 _PAIRED = 40  # coordinates up to which pairs are looked at
 

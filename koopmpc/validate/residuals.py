@@ -133,9 +133,9 @@ def eigen_residuals(predictor: AnyPredictor, total: Moments, tolerance: float = 
     P, T, _ = both_sides(total)
     with np.errstate(over="ignore", invalid="ignore"):
         gap = _sizes((T - P @ _one_step(predictor, total)) @ V)
-    gap[np.isnan(gap)] = np.inf  # of an A beyond the finite numbers
+    gap[np.isnan(gap)] = np.inf  # A held entries so large that the product is no number
     size = _sizes(P[:, : total.nz] @ V)
-    floor = np.finfo(float).eps * _sizes(np.abs(P[:, : total.nz]) @ np.abs(V))  # below it φ is 0 but for rounding
+    floor = np.finfo(float).eps * _sizes(np.abs(P[:, : total.nz]) @ np.abs(V))  # a φ below it is 0 but for rounding
     live = size > floor
     residuals = np.divide(gap, size, out=np.full(len(size), np.inf), where=live)
     return ResidualDMD(values, residuals, tolerance, total.samples)
@@ -147,7 +147,7 @@ def _one_step(predictor: AnyPredictor, total: Moments) -> Float[np.ndarray, "n n
     if not isinstance(predictor, BilinearPredictor):
         return np.vstack([A, predictor.B.T, predictor.E.T])
     products = total.products
-    constant = np.setdiff1d(np.arange(total.nz), products)  # u times 1 is among the inputs already
+    constant = np.setdiff1d(np.arange(total.nz), products)  # u times the Constant is u, which stands among the inputs
     B = predictor.B.T + predictor.N[:, :, constant].sum(axis=2)
     N = predictor.N[:, :, products].transpose(0, 2, 1).reshape(-1, total.nz)
     return np.vstack([A, B, N])

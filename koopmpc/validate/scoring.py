@@ -19,7 +19,7 @@ AnyPredictor = LinearPredictor | BilinearPredictor
 _STARTS = 4096  # starts that are rolled out at once
 _FORECAST = 2**22  # numbers of one block of forecasts, 32 MB
 _KEPT = 2**20  # errors that the quantiles are taken of, over all states and steps
-_LEAST = 256  # starts that the quantiles are taken of at least
+_LEAST = 256  # starts that the quantiles are taken of, at least
 BAND = (0.05, 0.5, 0.95)  # the quantiles of a score
 
 
@@ -167,7 +167,7 @@ def forecast_errors(
         yield gap, truth
 
 
-_Slice = tuple[Episode, Int[np.ndarray, "_"]]  # and the starts in it
+_Slice = tuple[Episode, Int[np.ndarray, "_"]]  # an episode and the starts in it
 
 
 class _Block(NamedTuple):

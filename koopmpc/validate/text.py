@@ -11,7 +11,7 @@ from rich.table import Table
 WIDTH = 100  # columns of a report
 _WIDEST = 200  # columns of its tables, at most
 _LONG = 32  # characters of an observable's name in a sentence
-_HEADED = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)  # also Rerun's font has this line
+_HEADED = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)  # Rerun's font has this line too
 _SCALED = re.compile(r"~[0-9a-f]{8}")  # how names tell one standardization from another
 
 

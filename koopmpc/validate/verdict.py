@@ -89,12 +89,12 @@ class Evidence(Value):
         return int(self.usable.min())
 
 
-_INVARIANT = 0.1  # one-step error of an observable, as a share of its size
-_OVERFIT = 2.0  # held-out over training error
-_UNSEEN = 0.05  # share of the held-out samples
-_GROWS = 2.0  # of a spurious eigenfunction over the horizon
-_EXPLAINED = 0.9  # share of an input's energy
-_NAMED = 3  # names in a sentence
+_INVARIANT = 0.1  # one-step error of an observable above which the dictionary is not invariant, as a share of its size
+_OVERFIT = 2.0  # ratio of held-out to training error above which a model is overfitted
+_UNSEEN = 0.05  # share of held-out samples in unseen cells that asks for care
+_GROWS = 2.0  # growth of a spurious eigenfunction over the horizon that is worth a word
+_EXPLAINED = 0.9  # share of an input's energy that ψ(x) explains, above which it counts as feedback
+_NAMED = 3  # names that one sentence lists
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ def optimum(
         bounds += _coupling(cp, prior, X, scale, size / np.sqrt(rows.samples))
     problem = cp.Problem(cp.Minimize(misfit + ridge * cp.sum_squares(X)), bounds)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is said in the report
+        warnings.simplefilter("ignore")  # the report tells of an inaccurate solution
         try:
             problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11, max_iter=200)
         except cp.SolverError as error:

@@ -124,7 +124,7 @@ def _regression(
     nx, nu = source.nx, len(inputs)
     episodes = source.episodes if isinstance(source, Held) and options.get("weights") is None else ()
     pairs = sum(len(e) for e in episodes)
-    if 0 < pairs <= 2 * nx + nu:  # the snapshots themselves are no more rows than their moments
+    if 0 < pairs <= 2 * nx + nu:  # few snapshots have no more rows than their moments would
         X, X_next = _stacked([e.X[:-1] for e in episodes]), _stacked([e.X[1:] for e in episodes])
         P = np.hstack([X, _stacked([e.U for e in episodes])]) if nu else X
         rows = RegressionRows(P, X_next, np.zeros(nx), pairs)

@@ -156,7 +156,7 @@ class OnlineEDMD:
         count = 1 if single else len(now)
         Z = self._lifted(now, after) if single else None
         if Z is None or not np.isfinite(Z).all():  # many rows, or one that the fast path cannot lift
-            with np.errstate(all="ignore"):  # an observable that is not finite is named below
+            with np.errstate(all="ignore"):  # the check below names an observable that is not finite
                 Z = self._full(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
             if not np.isfinite(Z).all():
                 bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]

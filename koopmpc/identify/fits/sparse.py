@@ -20,7 +20,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Picked
 from koopmpc.predict.predictors import LinearPredictor
 
-_STEPS = 20_000  # of the proximal gradient method, at most
+_STEPS = 20_000  # steps of the proximal gradient method, at most
 
 
 @dataclass(frozen=True, eq=False)

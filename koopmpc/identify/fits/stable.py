@@ -135,7 +135,7 @@ def _stabilised(
 
     asked = misfit(K, ridge)
     candidates = [_nearest(asked, rho)]
-    if ridge < _HELP and np.linalg.cond(asked.G) > 1 / _HELP:  # too steep a valley for the descent
+    if ridge < _HELP and np.linalg.cond(asked.G) > 1 / _HELP:  # the misfit is too steep a valley for the descent
         candidates.append(_nearest(misfit(solve(rows, ridge=_HELP).K, _HELP), rho))
     choices = [_refitted(rows, K, moving, A / scale, rho, ridge) for A in candidates]
     return min(choices, key=lambda K: relative_misfit(rows, K))

@@ -16,7 +16,7 @@ from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Value
 
-_PANEL = 4, 16  # columns that dtpqrt eliminates at once: fastest for few rows, for many
+_PANEL = 4, 16  # columns that dtpqrt eliminates at once: the fastest for few rows and for many
 _MANY = 256
 
 Triangle = Float[np.ndarray, "nd nd"]
@@ -61,7 +61,7 @@ class Gram:
             self._add_weighted(chunk.pairs())
             return
         P, first, last, nz, _ = chunk
-        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs of a first or a last state
+        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs that hold the first or the last state of a piece
         now, after = P[at_ends], P[at_ends + 1, :nz]
         starts, stops = P[first], P[last, :nz]
         P[first] = P[last] = 0.0
@@ -183,7 +183,7 @@ class Moments(Value):
         unit = P[:, size > 0] / size[size > 0]
         if self.samples < unit.shape[1]:
             return np.inf
-        if self.route == "gram":  # the rows are orthogonal
+        if self.route == "gram":  # the rows of Gram sums are orthogonal
             s = np.sort(np.sqrt(np.einsum("ij,ij->i", unit, unit)))[::-1][: unit.shape[1]]
         else:
             s = np.linalg.svd(unit, compute_uv=False)

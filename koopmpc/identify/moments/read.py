@@ -23,7 +23,7 @@ from koopmpc.values import Arrays, from_data, to_data
 
 Route = Literal["gram", "qr"]
 Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
-Steps = list[Float[np.ndarray, " T"]]  # of each episode, one a step
+Steps = list[Float[np.ndarray, " T"]]  # the weights of each episode, one for each step
 
 _WELL_CONDITIONED = 1e6  # scaled cond(Z) up to which normal equations lose nothing
 _PILOT = 4  # parts, and least number of chunks, that choose the route
@@ -194,7 +194,7 @@ def _summed(reading: _Reading, episodes: Episodes, which: Sequence[int] | None) 
         count = len(chunk.P) - len(chunk.last)
         samples += count if chunk.weights is None else int(np.count_nonzero(chunk.weights))
         weight += count if chunk.weights is None else float(chunk.weights.sum())
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is named below
+        with np.errstate(invalid="ignore", over="ignore"):  # the check below names an observable that is not finite
             total.add(chunk)
         bad = np.flatnonzero(~np.isfinite(total.size))
         if bad.size:

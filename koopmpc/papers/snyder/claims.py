@@ -11,13 +11,13 @@ from koopmpc.papers.snyder.settings import FIGURES, Shown
 
 Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by setting, then by method and whether at full rank
 
-SMALL = 0.05  # relative: two curves that a reader takes for one
+SMALL = 0.05  # relative error up to which a reader takes two curves for one
 SAME = 1.25  # errors within this factor are no change in a picture
 MARGINAL = 3.0  # a gain below this factor is marginal
 BETTER = 10.0  # a gain above this factor is plain
 PLAIN = 1e-3  # costs that differ by less, relative, are alike
-GOOD = 1.1  # a cost below this factor of the best is control
-GENERAL = 0.05  # on trajectories that were not fitted
+GOOD = 1.1  # a controller works where its cost is below this factor of the best
+GENERAL = 0.05  # relative error on trajectories that were not fitted, up to which a model generalises
 
 
 def of_figure(shown: Shown, setting: str, says: str, fits: Fits) -> Claim:
