@@ -11,6 +11,7 @@ from koopmpc.control.cost import state_tracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria, TerminalTargets
 from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.control.terminal_cost import stationary
+from tests.closed_loop.tasks import TASKS
 from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
 from tests.control.test_nonlinear_mpc import pendulum as hinge
 
@@ -113,3 +114,18 @@ def test_the_terminal_target_of_a_periodic_reference_is_not_the_stationary_point
     read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
     target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
     assert np.cos(target.equilibrium.x[0]) < -0.99
+
+
+def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equilibrium():
+    """A reactor has several equilibria, and from a wall at 0 K, which is far off the data, the wrong one is found."""
+    task = TASKS["stiff"]
+    data = task.data(0)
+    lifting = km.State() + km.Constant() + km.Standardized.of(data, km.Monomials(2))
+    model = km.bilinear_edmd(data, lifting, ridge=1e-8, difference=True)
+    cost = km.Cost(Q=task.Q, R=task.R)
+    tracking = state_tracking(model.states, 1, cost, task.limits)
+    silent, told = (
+        Equilibria(learned_map(model), cost, tracking).find(np.array([0.676, 340.0, wall])) for wall in (0.0, 302.8)
+    )
+    np.testing.assert_allclose(silent.u, told.u, rtol=1e-6)
+    assert abs(silent.x[1] - 340.0) < 0.2

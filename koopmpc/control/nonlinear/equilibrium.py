@@ -165,7 +165,9 @@ class Equilibria:
         nx, u = model.nx, np.clip(np.zeros(model.nu), *inputs)
         x, e = np.zeros(nx), np.zeros(nx) if e is None else e
         if self.of_state:
-            x = row if model.embedding is None else model.embedding.held(row, u)
+            weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
+            x = row if center is None else np.where(weighed, row, center)
+            x = x if model.embedding is None else model.embedding.held(x, u)
         guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
         if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
             scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, nx))

@@ -58,6 +58,14 @@ class LearnedMap:
         return self.nx
 
     @property
+    def center(self) -> Float[np.ndarray, " ny"] | None:
+        """The mean of the plant's states over the data that the model was fitted to, None where it is not known."""
+        model = self.model
+        if isinstance(model, StepMap) or model.scale is None or model.lifting.constant_index is None:
+            return None
+        return model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
+
+    @property
     def lifting(self) -> None:
         """None: a plan is made of states, and none of them is lifted."""
         return None
