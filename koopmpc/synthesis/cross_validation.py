@@ -20,6 +20,7 @@ from koopmpc.identify.regression import Regression, regression_of
 from koopmpc.identify.solve import RegressionRows, path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
+from koopmpc.synthesis.folds import only
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 from koopmpc.values import Value
 
@@ -47,6 +48,8 @@ class Trial:
         so that every one is judged on the same forecasts.
     ridges
         Weights to try, the least first.
+    relift
+        Lift the forecasts of bilinear models anew at every step, as BilinearMPC does.
     """
 
     candidate: Candidate
@@ -55,6 +58,7 @@ class Trial:
     horizon: int
     first: int
     ridges: tuple[float, ...]
+    relift: bool = False
 
     def __str__(self) -> str:
         return f"{self.candidate.kind} {self.candidate.name}"
@@ -114,7 +118,7 @@ def tried(trial: Trial) -> Tried:
     """
     begun = perf_counter()
     count = max(trial.fold) + 1
-    folds = [_only(trial, i) for i in range(count)]
+    folds = [only(trial.episodes, trial.fold, i) for i in range(count)]
     parts = [_moments(trial.candidate, fold) for fold in folds]
     total, spread = reduce(Moments.__add__, parts), _spread(trial.episodes)
     errors = np.empty((len(trial.ridges), count, trial.horizon))
@@ -170,11 +174,6 @@ def _solutions(candidate: Candidate, task: Regression, ridges: Sequence[float]) 
     return [solution.K + start for solution in path(rows, ridges)]
 
 
-def _only(trial: Trial, fold: int) -> Episodes:
-    of = trial.episodes
-    return of.with_episodes([episode for episode, own in zip(of, trial.fold, strict=True) if own == fold])
-
-
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
     """Return triangular factors, whatever the condition: which route a fold takes must not depend on the fold."""
     return second_moments(
@@ -204,7 +203,9 @@ def _errors(
     result = np.empty((len(models), trial.horizon))
     for row, model in zip(result, models, strict=True):
         total, count = np.zeros(trial.horizon), 0
-        for gap, _ in forecast_errors(model, points, starts, trial.horizon):
+        for gap, _ in forecast_errors(
+            model, points, starts, trial.horizon, relift=trial.relift and trial.candidate.bilinear
+        ):
             with np.errstate(over="ignore"):
                 total += ((gap / spread) ** 2).mean(axis=2).sum(axis=1)
             count += gap.shape[1]

@@ -1,6 +1,6 @@
 """Episodes for cross-validation: a part of the data that memory holds, in folds of whole episodes or of blocks."""
 
-from collections.abc import Sized
+from collections.abc import Sequence, Sized
 from itertools import islice, pairwise
 from typing import NamedTuple
 
@@ -142,6 +142,16 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
     if fold.max() == 0:
         raise DataError(f"all {len(long)} episodes fell into one fold; pass more of them, or a shorter horizon")
     return Folds(kept, tuple(fold.tolist()), tuple(notes))
+
+
+def only(episodes: Episodes, fold: Sequence[int], wanted: int) -> Episodes:
+    """Return the episodes of one fold."""
+    return episodes.with_episodes([episode for episode, own in zip(episodes, fold, strict=True) if own == wanted])
+
+
+def without(episodes: Episodes, fold: Sequence[int], out: int) -> Episodes:
+    """Return the episodes of all folds but one."""
+    return episodes.with_episodes([episode for episode, own in zip(episodes, fold, strict=True) if own != out])
 
 
 def blocks(episode: Episode, steps: int) -> list[Episode]:

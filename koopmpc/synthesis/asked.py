@@ -1,0 +1,206 @@
+"""What a design is asked for: cost, limits, horizon, reference and starts, checked against the data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.cost import Cost, checked
+from koopmpc.control.limits import Limits
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import short
+from koopmpc.lifting.state import State
+from koopmpc.validate.text import quantity
+from koopmpc.values import Value
+
+RUN = 3  # horizons that a run lasts
+STARTS = 4  # of episodes that are tried where nobody names any
+ROOM = 0.5  # share of the data's range by which a run may leave the data
+
+
+@dataclass(frozen=True, eq=False)
+class Asked(Value):
+    """A control task on the plant of some data.
+
+    Attributes
+    ----------
+    cost, limits, horizon
+        Of every controller.
+    reference
+        (T+1, nr) rows, T at least `steps`.
+    starts
+        (n, nx).
+    steps
+        Of a run: three horizons, or what the reference has.
+    angles
+        Indices of states whose errors wrap.
+    low, high
+        (nx,) range of the data.
+    limit_sizes
+        (nx + ny,) what violations are shares of: the range between two limits, else that of the data.
+    """
+
+    cost: Cost
+    limits: Limits
+    horizon: int
+    reference: Float[np.ndarray, "T1 nr"]
+    starts: Float[np.ndarray, "n nx"]
+    steps: int
+    angles: tuple[int, ...]
+    low: Float[np.ndarray, " nx"]
+    high: Float[np.ndarray, " nx"]
+    limit_sizes: Float[np.ndarray, " n"]
+
+    @property
+    def moves(self) -> bool:
+        """Whether the reference changes."""
+        return bool((self.reference != self.reference[0]).any())
+
+    @property
+    def late(self) -> int:
+        """The last reference row at which a run can begin."""
+        return len(self.reference) - 1 - self.steps
+
+    def beyond(self, X: Float[np.ndarray, "T nx"], states: Sequence[str]) -> Float[np.ndarray, " T"]:
+        """Return by what share of its size the limit that each state breaks most is broken."""
+        values, (low, high) = X, self.limits.states(X.shape[1])
+        if self.limits.of is not None:
+            Y = self.limits.of.bind(states)(X)
+            y_low, y_high = self.limits.outputs(Y.shape[1])
+            values, low, high = np.hstack([X, Y]), np.concatenate([low, y_low]), np.concatenate([high, y_high])
+        return (np.maximum(np.maximum(low - values, values - high), 0.0) / self.limit_sizes).max(axis=1)
+
+    def hull(self, free: Sequence[int], tracked: Sequence[int]) -> tuple[Float[np.ndarray, " nx"], ...]:
+        """Return the box that a run must not leave: data, starts and reference with half of the data's range around.
+
+        The states `free` are free; the columns of the reference are of the states `tracked`, of none where it is empty.
+        """
+        low, high = np.minimum(self.low, self.starts.min(axis=0)), np.maximum(self.high, self.starts.max(axis=0))
+        for column, i in enumerate(tracked):
+            low[i] = min(low[i], self.reference[:, column].min())
+            high[i] = max(high[i], self.reference[:, column].max())
+        room = ROOM * (self.high - self.low)
+        low, high = low - room, high + room
+        low[list(free)], high[list(free)] = -np.inf, np.inf
+        return low, high
+
+
+def asked_of(
+    data: Episodes,
+    cost: Cost,
+    limits: Limits | None,
+    horizon: int,
+    reference: ArrayLike,
+    starts: ArrayLike | None,
+    angles: Sequence[int],
+) -> Asked:
+    """Return the task, checked.
+
+    Raises
+    ------
+    DataError, ShapeError
+        A size does not fit, NaN, an angle that is no state, no horizon.
+    """
+    cost, limits = checked(cost, limits)
+    nx, states = data.nx, data.states
+    of = cost.of.bind(states)
+    cost.matrices(of.nz, data.nu)
+    ny = 0 if limits.of is None else limits.of.bind(states).nz
+    limits.sized(nx, ny, data.nu)
+    rows = checks.array(reference, "reference")
+    if rows.ndim > 2 or (rows.shape or (1,))[-1] != of.nz or not rows.size:
+        raise ShapeError(
+            f"reference has shape {rows.shape}, expected ({of.nz},) or rows (T+1, {of.nz}), one column for each "
+            f"output that the cost tracks: {', '.join(of.names)}"
+        )
+    rows = rows.reshape(-1, of.nz)
+    outside = [i for i in angles if not 0 <= i < nx]
+    if outside:
+        raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
+    horizon = checks.count(horizon, "horizon")
+    steps = RUN * horizon
+    if len(rows) == 1:
+        rows = np.repeat(rows, steps + 1, axis=0)
+    X = np.concatenate([episode.X for episode in data])
+    low, high = X.min(axis=0), X.max(axis=0)
+    if starts is None:
+        points = _first_states(data, limits)
+    else:
+        points = checks.array(starts, "starts")
+        points = checks.array(
+            points.reshape(-1, nx) if points.ndim < 2 and points.size == nx else points, "starts", (None, nx)
+        )
+        if not len(points):
+            raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
+    ends = [limits.states(nx)] + ([] if limits.of is None else [limits.outputs(ny)])
+    values = X if limits.of is None else np.hstack([X, limits.of.bind(states)(X)])
+    sizes = np.concatenate([end.high - end.low for end in ends])
+    sizes = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.maximum(np.ptp(values, axis=0), 1e-300))
+    return Asked(
+        cost=cost,
+        limits=limits,
+        horizon=horizon,
+        reference=rows,
+        starts=points,
+        steps=min(steps, max(len(rows) - 1, 1)),
+        angles=tuple(angles),
+        low=low,
+        high=high,
+        limit_sizes=sizes,
+    )
+
+
+def outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
+    """Return a sentence for each state whose start or reference lies outside the data, where no model was fitted."""
+    said: list[str] = []
+    room = 0.01 * (asked.high - asked.low)
+    targets = {i: asked.reference[:, column] for column, i in enumerate(tracked)}
+    for i, name in enumerate(data.states):
+        low, high = asked.low[i], asked.high[i]
+        for what, values in (("a start", asked.starts[:, i]), ("the reference", targets.get(i, np.zeros(0)))):
+            far = values[(values < low - room[i]) | (values > high + room[i])]
+            if far.size and i not in free:
+                said.append(
+                    f"{what} has {quantity(name, f'= {far[np.abs(far - (low + high) / 2).argmax()]:.4g}')}, outside "
+                    f"the data, which go from {low:.4g} to {high:.4g}: no model was fitted there; collect data there, "
+                    "or ask for less"
+                )
+    return said
+
+
+def unweighted(asked: Asked, data: Episodes) -> list[str]:
+    """Return a sentence for each limited state that the cost does not weigh."""
+    of = asked.cost.of.bind(data.states)
+    if not isinstance(of, State):
+        return []
+    Q, _ = asked.cost.matrices(of.nz, data.nu)
+    weighed = {i for column, i in enumerate(of.chosen) if Q[column, column] > 0}
+    box = asked.limits.states(data.nx)
+    idle = [i for i in range(data.nx) if i not in weighed and (np.isfinite(box.low[i]) or np.isfinite(box.high[i]))]
+    if not idle:
+        return []
+    names = ", ".join(short(data.states[i]) for i in idle)
+    return [
+        f"{names} {'has' if len(idle) == 1 else 'have'} limits and no weight in Q: only the limit itself keeps the "
+        "loop away from it; a small weight would make it keep a distance"
+    ]
+
+
+def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
+    """Return first states of episodes inside the limits: of the half nearest to their median, far from each other."""
+    points = np.unique(np.array([episode.X[0] for episode in data]), axis=0)
+    low, high = limits.states(data.nx)
+    inside = points[((points >= low) & (points <= high)).all(axis=1)]
+    points = inside if len(inside) >= STARTS else points
+    size = np.ptp(points, axis=0)
+    Z = (points - np.median(points, axis=0)) / np.where(size > 0, size, 1.0)
+    central = np.argsort((Z**2).sum(axis=1), kind="stable")[: max(-(-len(Z) // 2), min(STARTS, len(Z)))]
+    picked = [int(central[-1])]
+    while len(picked) < min(STARTS, len(central)):
+        apart = np.min([((Z[central] - Z[i]) ** 2).sum(axis=1) for i in picked], axis=0)
+        picked.append(int(central[apart.argmax()]))
+    return points[picked]

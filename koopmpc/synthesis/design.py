@@ -1,0 +1,360 @@
+"""design: a controller with a learned model, chosen by closed loop from data, a cost and limits alone."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError, FitWarning
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import State
+from koopmpc.parallel import StageProgress, map_tasks
+from koopmpc.synthesis.asked import Asked, asked_of, outside_data, unweighted
+from koopmpc.synthesis.candidates import Candidate, expanded, usual
+from koopmpc.synthesis.candidates import angles as angular
+from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
+from koopmpc.synthesis.designed import Design, DesignRow, Expected, place_of
+from koopmpc.synthesis.folds import Folds, folded, only, sampled, without
+from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, judged, ratios, scores
+from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
+from koopmpc.synthesis.select import RIDGES
+from koopmpc.synthesis.surrogates import Holding, Surrogate, stand_ins, surrogate, unfelt, unheld
+from koopmpc.validate.text import percent
+
+FOLDS = 3
+OFF = 0.2  # share by which inputs act more or less in half of the final runs
+_SCREENED = 5  # models of each kind that are judged by closed loop
+_LINEAR, _BILINEAR = 2, 3  # of these those that are tried with estimators, ends of the horizon and weights
+_GAINS = (None, 0.5)  # of the estimators
+_STRETCHES = 4  # of a long reference
+_TURNS = 0.9 * 2 * np.pi  # an angle that went further in the data makes whole turns
+
+
+def design(
+    data: Episodes | Source,
+    cost: Cost,
+    limits: Limits | None = None,
+    *,
+    horizon: int,
+    reference: ArrayLike,
+    starts: ArrayLike | None = None,
+    angles: Sequence[int] = (),
+    candidates: Sequence[Candidate | Lifting] | None = None,
+    delays: Sequence[int] = (0, 1, 2),
+    bilinear: bool = True,
+    sample: int = 30_000,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: StageProgress | None = None,
+    rng: np.random.Generator | int = 0,
+) -> Design:
+    """Choose model and controller by closed loop on learned stand-ins of the plant, and fit them to all data.
+
+    1. The episodes are cut into three folds. Every candidate model is fitted to two of them and forecasts the third
+       over the horizon, a bilinear one lifted anew at every step, as its controller does. This chooses ridges, the
+       five models of each kind that go on, and the two that stand in for the plant.
+    2. Surrogates: the bilinear model of the least error and the best one of another family of observables, each
+       fitted to each two folds. They measure with the noise that their one-step errors show.
+    3. Controllers: each model, fitted to two folds, controls surrogates that know the fold which it does not, for three
+       horizons from several starts: BilinearMPC, KoopmanMPC, and plain KoopmanMPC with Q_N = Q.
+    4. The best go on with every estimator and end of the horizon, one with weights around what its loops visit, and are
+       also judged on surrogates whose inputs act 20 % more and 20 % less: a plant is never quite the one of its logs.
+    5. A run's score is its cost × (1 + 10 max(0, violation − 0.5 %)) over the best on the same surrogate and start, at
+       most 20, and 20 where it leaves the data by half of their range. The least geometric mean wins; of all within
+       0.5 % of it the simplest is taken, and fitted to all data.
+
+    The choice depends on the data and `rng` alone, never on time or on the number of workers.
+
+    Parameters
+    ----------
+    data
+        Episodes, or a Source that can be read again; of one larger than memory a sample is judged on.
+    cost, limits
+        What to minimise, within what.
+    horizon
+        Steps that the controllers look ahead.
+    reference
+        (nr,) of the tracked outputs, or rows (T+1, nr), of which the runs take stretches of three horizons.
+    starts
+        (nx,) or (n, nx) states from which runs begin; by default first states of four episodes, inside the limits.
+    angles
+        Indices of states whose errors wrap at ±π. They may leave the data; so may angles that made whole turns in the
+        data, and positions that nothing depends on.
+    candidates
+        Models to try, as for `select`.
+    delays
+        Past steps to try in an embedding.
+    bilinear
+        Try bilinear models too, where there are no measured disturbances; the surrogates are then bilinear.
+    sample
+        Snapshot pairs to judge on, about.
+    workers, scheduler
+        As in `koopmpc.parallel.map_tasks`: a model is a task, and then a controller with all its runs.
+    progress
+        Called with what is done, how many of it are, and how many there are.
+    rng
+        Deals out the episodes, draws centres and features.
+
+    Raises
+    ------
+    DataError
+        Fewer than three folds of episodes that are long enough; no inputs; NaN; a stream that can be read once only.
+    ShapeError
+        Reference, starts, weights or limits have other sizes than the data.
+    DefinitenessError
+        A weight is indefinite.
+
+    Warns
+    -----
+    FitWarning
+        No input inside the limits holds the reference; the reference or a start lies outside the data.
+    """
+    ahead, draw = checks.count(horizon, "horizon"), checks.generator(rng)
+    source = source_of(data)
+    if source.nu == 0:
+        raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
+    held, notes = sampled(source, checks.count(sample, "sample"))
+    asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
+    past = sorted({checks.count(d, "delays", 0) for d in delays})
+    models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
+    first = max(one.delays for one in models)
+    room = int(np.median([len(episode) for episode in held])) - first
+    forecast = min(ahead, max(room, 1))
+    short: list[str] = []
+    if forecast < ahead:
+        short = [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
+    folds = folded(held, forecast + first, FOLDS, draw)
+    if folds.number < FOLDS:
+        raise DataError(
+            f"{len(held)} episodes give {folds.number} folds, and a design needs {FOLDS}: one to judge on and two to "
+            f"learn from; pass more episodes of {forecast + first} steps or more, or a shorter horizon"
+        )
+    spread = partial(map_tasks, workers=workers, scheduler=scheduler)
+    trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
+    told = None if progress is None else partial(progress, "models")
+    results = list(spread(tried, trials, progress=told))
+    floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
+    test, doubts = _test(folds, asked, results, floor)
+    for sentence in doubts:
+        warnings.warn(sentence, FitWarning, stacklevel=2)
+
+    run = partial(judged, test)
+    screened = _screened(results, floor)
+    told = None if progress is None else partial(progress, "closed loops")
+    first_round = list(spread(run, [Job(one, test.nominal) for one in screened], progress=told))
+    chosen = _finalists(screened, first_round)
+    told = None if progress is None else partial(progress, "closed loops of the best")
+    every = tuple(range(len(test.conditions)))
+    last_round = list(spread(run, [Job(one, every) for one in chosen], progress=told))
+    rows, outcomes = _leaderboard((screened, first_round), (chosen, last_round))
+    best, linear = place_of(rows), place_of(rows, "linear")
+    assert best is not None, "the last round is never empty"
+
+    def made(place: int) -> Designed:
+        recipe, near = rows[place].recipe, None
+        if recipe.weighted:
+            near = Nearness.of(outcomes[place].visited, test.episodes)
+        model = recipe.fit(source, near, workers=workers, scheduler=scheduler)
+        return recipe.controller(model, asked.cost, asked.limits, ahead)
+
+    controller = made(best)
+    simple = controller if linear == best else (None if linear is None else made(linear))
+    expected = _expected(test, outcomes[best])
+    return Design(
+        controller=controller,
+        linear=simple if isinstance(simple, KoopmanMPC) else None,
+        leaderboard=rows,
+        chosen=best,
+        chosen_linear=linear,
+        expected=expected,
+        advice=(*doubts, *_advice(rows, best, linear, expected), *unweighted(asked, held)),
+        notes=(*notes, *short, *folds.notes),
+    )
+
+
+def _models(
+    held: Episodes,
+    asked: Asked,
+    given: Sequence[Candidate | Lifting] | None,
+    past: Sequence[int],
+    both: bool,
+    draw: np.random.Generator,
+) -> list[Candidate]:
+    """Return the models to try; each lifting also has the observables that cost and limits are of."""
+    models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
+    needed = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
+    if not needed:
+        return models
+    added: list[Candidate] = []
+    for one in models:
+        lifting = one.lifting
+        for of in needed:
+            lifting = lifting + of.bind(held.states)
+        added.append(replace(one, lifting=lifting).bind(held.states, held.inputs))
+    return added
+
+
+def _test(folds: Folds, asked: Asked, results: Sequence[Tried], floor: float) -> tuple[LoopTest, list[str]]:
+    """Return the conditions of all closed loops, and doubts about what is asked.
+
+    Each fold has a surrogate of either family that is fitted to the two others. The model that does not know fold k
+    meets surrogates of which one does not know fold k + 1, the other fold k + 2.
+    """
+    data, fold = folds.episodes, folds.fold
+    pair = stand_ins(results, floor)
+    parts = [(without(data, fold, i), only(data, fold, i)) for i in range(FOLDS)]
+    surrogates = [surrogate(recipe, *part) for part in parts for recipe in pair]
+    X = np.concatenate([episode.X for episode in data])
+    turning = [i for i in angular(data.states, X) if asked.high[i] - asked.low[i] > _TURNS]
+    free = sorted({*asked.angles, *turning, *unfelt(surrogates[0], X)})
+    of = asked.cost.of.bind(data.states)
+    tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
+    low, high = asked.hull(free, tracked)
+    inputs = _FreeInputs(asked, surrogates)
+    conditions: list[Condition] = []
+    for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
+        for k in range(FOLDS):
+            for family in families:
+                number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(conditions)
+                row = asked.late * (j % _STRETCHES) // (_STRETCHES - 1)
+                start = asked.starts[j % len(asked.starts)]
+                conditions.append(Condition(k, number, gain, start, row, inputs(number, gain, row)))
+    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high)
+    return test, [*unheld(surrogates[0], asked), *outside_data(asked, data, tracked, free)]
+
+
+class _FreeInputs:
+    """The inputs that cost nothing in a run: those that hold the reference on its surrogate, or those of the cost."""
+
+    def __init__(self, asked: Asked, surrogates: Sequence[Surrogate]) -> None:
+        self._asked, self._surrogates = asked, surrogates
+        self._holding: dict[tuple[int, float], Holding] = {}
+
+    def __call__(self, number: int, gain: float, row: int) -> Float[np.ndarray, "T nu"]:
+        asked, one = self._asked, self._surrogates[number]
+        steps, nu, cost = asked.steps, one.model.nu, asked.cost
+        given = cost.given_inputs(nu)
+        if given is not None:
+            return given[np.minimum(np.arange(steps), len(given) - 1)]
+        if cost.u_target != "equilibrium":
+            return np.zeros((steps, nu))
+        key = number, gain
+        if key not in self._holding:
+            self._holding[key] = one.holding(cost, asked.limits, gain)
+        return np.array([self._holding[key](each).u for each in asked.reference[row : row + steps]])
+
+
+def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
+    """Return the recipes of the first round: the five best models of each kind, and plain linear ones with Q_N = Q."""
+    places = [tried.best(floor) for tried in results]
+    worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
+    ranked = sorted(range(len(results)), key=lambda i: (worst[i], i))
+    found: list[Recipe] = []
+    for kind in ("linear", "bilinear"):
+        own = [i for i in ranked if results[i].candidate.kind == kind][:_SCREENED]
+        found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in own]
+    plain = [
+        i for i in range(len(results)) if results[i].candidate.name == "x, 1" and not results[i].candidate.bilinear
+    ]
+    return found + [Recipe(results[i].candidate, results[i].ridges[places[i]], tail=0) for i in plain]
+
+
+def _finalists(recipes: Sequence[Recipe], outcomes: Sequence[Outcome]) -> list[Recipe]:
+    """Return the recipes of the last round: the best models with every estimator and end, and one with weights."""
+    score = scores(ratios(outcomes))
+    ranked = [recipes[i] for i in sorted(range(len(recipes)), key=lambda i: (score[i], i))]
+    estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
+    found: list[Recipe] = []
+    linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
+    bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
+    for one in linear:
+        ends = (None, 0) if one.tail is None else (0,)
+        found += [replace(one, estimator=estimator, tail=tail) for tail in ends for estimator in estimators]
+    for one in bilinear:
+        found += [replace(one, estimator=estimator) for estimator in estimators]
+    if bilinear:
+        found += [replace(bilinear[0], estimator=estimators[i], weighted=True) for i in (0, 2)]
+    return found
+
+
+def _leaderboard(
+    screened: tuple[Sequence[Recipe], Sequence[Outcome]], last: tuple[Sequence[Recipe], Sequence[Outcome]]
+) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
+    """Return the rows, the best first, those of the last round before the others, and the outcome of each."""
+    both: list[tuple[DesignRow, Outcome]] = []
+    for off, (recipes, outcomes) in ((True, last), (False, screened)):
+        part: list[tuple[DesignRow, Outcome]] = []
+        each = ratios(outcomes)
+        for recipe, outcome, ratio, score in zip(recipes, outcomes, each, scores(each), strict=True):
+            known = outcome.violation[np.isfinite(outcome.violation)]
+            row = DesignRow(
+                recipe=recipe,
+                score=float(score),
+                worst=float(ratio.max()),
+                violation=float(known.max(initial=0.0)),
+                lost=int(np.sum(~np.isfinite(outcome.cost))),
+                runs=len(ratio),
+                off=off,
+            )
+            part.append((row, outcome))
+        both += sorted(part, key=lambda pair: pair[0].score)
+    return tuple(row for row, _ in both), [outcome for _, outcome in both]
+
+
+def _expected(test: LoopTest, outcome: Outcome) -> Expected:
+    as_learned = np.array([one.gain == 1.0 for one in test.conditions])
+    near = [one for one in test.conditions if one.gain == 1.0]
+    known = outcome.broken[np.isfinite(outcome.cost)]
+    return Expected(
+        cost=outcome.cost[as_learned],
+        cost_off=outcome.cost[~as_learned],
+        violation=outcome.violation[as_learned],
+        violation_off=outcome.violation[~as_learned],
+        broken=float(known.mean()) if known.size else 1.0,
+        starts=np.array([one.x0 for one in near]),
+        surrogate=tuple(one.surrogate for one in near),
+        steps=test.asked.steps,
+    )
+
+
+def _advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: Expected) -> list[str]:
+    """Return what limits the closed loop, and which data would help."""
+    said: list[str] = []
+    row, runs = rows[best], len(expected.cost) + len(expected.cost_off)
+    if expected.lost:
+        said.append(
+            f"{expected.lost} of {runs} runs were lost: the loop went where there are no data, or fell over; collect "
+            "episodes around the reference and on the way to it, ask for less, or start nearer"
+        )
+    known = expected.cost[np.isfinite(expected.cost)]
+    if not known.size:
+        said.append("every run with inputs as in the data was lost: trust no controller of these data")
+    if row.violation > 0.01:
+        said.append(
+            f"limits are violated by up to {percent(row.violation)} of their range; collect data near the limits, or "
+            "ask for limits further inside"
+        )
+    if row.worst > 2 and not expected.lost:
+        said.append(
+            f"in its worst run the controller costs {row.worst:.2g} times the best of all in that run: what is best "
+            "differs from surrogate to surrogate; more episodes would make them agree"
+        )
+    if linear is None:
+        said.append("no linear model came through")
+    elif linear != best and rows[linear].score > 1.2 * row.score:
+        said.append(
+            f"the best linear controller costs about {rows[linear].score / row.score:.2g} times as much: what an input "
+            "does depends on the state"
+        )
+    return said

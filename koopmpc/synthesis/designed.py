@@ -1,0 +1,198 @@
+"""Design: the controller that was chosen by closed loop, what to expect of it, and how all others did."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import RenderableType
+
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.synthesis.recipes import Designed, Recipe
+from koopmpc.validate.text import labelled, percent, table, written
+from koopmpc.values import Value
+
+_SHOWN = 15  # rows of the leaderboard that are printed
+
+
+@dataclass(frozen=True, eq=False)
+class DesignRow(Value):
+    """A line of the leaderboard: one recipe.
+
+    Attributes
+    ----------
+    recipe
+        Model and controller.
+    score
+        Mean over its runs of cost × (1 + 10 max(0, violation − 0.5 %)), over the best on the same surrogate and start.
+    worst
+        The largest of these; 20 is a lost run.
+    violation
+        Largest violation of a limit in any run that was not lost, as a share of its range.
+    lost
+        How many runs were lost: they left the data by more than half of its range, or ended in no number.
+    runs
+        How many runs it was judged by.
+    off
+        Whether runs with inputs 20 % off are among them; such scores compare with each other, others with others.
+    """
+
+    recipe: Recipe
+    score: float
+    worst: float
+    violation: float
+    lost: int
+    runs: int
+    off: bool
+
+    @property
+    def title(self) -> str:
+        """The recipe in words."""
+        return str(self.recipe)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected(Value):
+    """What the closed loop of a design is expected to be: runs on surrogates that know data which it does not.
+
+    An estimate from data alone, and no promise: what all models have learned wrongly shows on no surrogate.
+
+    Attributes
+    ----------
+    cost
+        (runs,) cost of each run in which the inputs act as in the data; infinite where it was lost.
+    cost_off
+        (runs,) the same with inputs that act 20 % more or less.
+    violation, violation_off
+        (runs,) largest violation of a limit, as a share of its range.
+    broken
+        Share of all steps that violate a limit by more than 0.1 % of its range.
+    starts
+        (runs, nx) where the runs of `cost` began.
+    surrogate
+        (runs,) on which surrogate each was.
+    steps
+        Of a run.
+    """
+
+    cost: Float[np.ndarray, " runs"]
+    cost_off: Float[np.ndarray, " off"]
+    violation: Float[np.ndarray, " runs"]
+    violation_off: Float[np.ndarray, " off"]
+    broken: float
+    starts: Float[np.ndarray, "runs nx"]
+    surrogate: tuple[int, ...]
+    steps: int
+
+    @property
+    def lost(self) -> int:
+        """How many of all runs were lost."""
+        return int(np.sum(~np.isfinite(np.concatenate([self.cost, self.cost_off]))))
+
+    def __str__(self) -> str:
+        """Return what to expect in words."""
+        pairs = [
+            ("cost", _spread(self.cost, "{:.4g}")),
+            ("with inputs 20 % off", _spread(self.cost_off, "{:.4g}")),
+            ("largest violation", f"{_worst(self.violation)}; with inputs 20 % off {_worst(self.violation_off)}"),
+            ("steps that violate", f"{percent(self.broken)}, an estimate from held-out surrogates and no promise"),
+            ("lost runs", f"{self.lost} of {len(self.cost) + len(self.cost_off)}"),
+        ]
+        return written(labelled(pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A controller that was chosen by closed loop from data alone; `print` shows it with its evidence.
+
+    Attributes
+    ----------
+    controller
+        KoopmanMPC or BilinearMPC, fitted to all data.
+    linear
+        The best KoopmanMPC; `controller` itself where that is one, None where none came through.
+    leaderboard
+        All recipes, the best first; those that were judged in all conditions stand before those that were screened.
+    chosen, chosen_linear
+        Places of the two in the leaderboard.
+    expected
+        What to expect of `controller`.
+    advice
+        What limits the closed loop, and which data would help, in sentences.
+    notes
+        What was done to the data, in sentences.
+    """
+
+    controller: Designed
+    linear: KoopmanMPC | None
+    leaderboard: tuple[DesignRow, ...]
+    chosen: int
+    chosen_linear: int | None
+    expected: Expected
+    advice: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def best(self) -> DesignRow:
+        """The row of `controller`."""
+        return self.leaderboard[self.chosen]
+
+    def __str__(self) -> str:
+        """Return the choice, what to expect of it, advice, and the first rows of the leaderboard."""
+        parts: list[RenderableType] = [f"chosen: {self.best.title}"]
+        place = self.chosen_linear
+        if place is not None and place != self.chosen:
+            parts.append(f"best linear: {self.leaderboard[place].title}")
+        parts += ["", "expected", str(self.expected), ""]
+        marked = {self.chosen, *(() if place is None else (place,))}
+        shown = sorted({*range(min(_SHOWN, len(self.leaderboard))), *marked})
+        rows: list[list[str]] = []
+        for i in shown:
+            row = self.leaderboard[i]
+            mark = "→" if i == self.chosen else ("l" if i == place else "")
+            figures = [f"{row.score:.3f}", f"{row.worst:.3f}", percent(row.violation), f"{row.lost} of {row.runs}"]
+            rows.append([mark, row.title, *figures])
+        parts.append(table(["", "controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"], rows, left=2))
+        parts += [
+            "",
+            "A score is the mean over closed loops on surrogates of the cost, with a price on violations, relative to "
+            "the best controller in the same loop. → marks the chosen controller, the simplest within 0.5 % of the "
+            "best; l the best linear one. Rows without inputs 20 % off are of the first round and stand last.",
+        ]
+        said = [written(*parts)]
+        if self.advice:
+            said += ["", written(*(f"- {sentence}" for sentence in self.advice))]
+        if self.notes:
+            said += ["", *self.notes]
+        return "\n".join(said)
+
+
+def _spread(values: Float[np.ndarray, " runs"], form: str) -> str:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "every run was lost"
+    ends = [form.format(float(value)) for value in (np.median(known), known.min(), known.max())]
+    return f"median {ends[0]}, from {ends[1]} to {ends[2]} over surrogates and starts"
+
+
+def _worst(values: Float[np.ndarray, " runs"]) -> str:
+    known = values[np.isfinite(values)]
+    return f"{percent(known.max())} of the range" if known.size else "unknown"
+
+
+def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
+    """Return the simplest row within 0.5 % of the best of those that were judged in all conditions.
+
+    A linear model is simpler than a bilinear one, then come weights, delays, and the number of observables.
+    """
+    places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
+    if not places:
+        return None
+    best = min(rows[i].score for i in places)
+    near = [i for i in places if rows[i].score <= 1.005 * best]
+
+    def simple(i: int) -> tuple[object, ...]:
+        one = rows[i].recipe
+        return one.candidate.bilinear, one.weighted, one.candidate.delays, one.candidate.lifting.nz, rows[i].score, i
+
+    return min(near, key=simple)

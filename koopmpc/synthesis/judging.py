@@ -1,0 +1,228 @@
+"""Recipes judged by closed loop: each is made of some folds, and controls surrogates that were made of others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import KoopmpcError
+from koopmpc.loop.metrics import metrics
+from koopmpc.loop.run import Run
+from koopmpc.loop.simulate import simulate
+from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.synthesis.asked import Asked
+from koopmpc.synthesis.folds import without
+from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
+from koopmpc.synthesis.surrogates import Surrogate
+
+LOST = 20.0  # what a lost run counts, and the most that one counts: times the best on the same surrogate and start
+FREE = 0.005  # violation that costs nothing, as a share of the limits' range
+PRICE = 10.0  # a violation of 1 % beyond costs a tenth of the cost
+LITTLE = 0.01  # of the usual cost: so much more is no loss, as where a run starts at its goal
+BROKEN = 1e-3  # share of the range beyond which a step counts as one that violates
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """One run of a controller whose model was fitted without a fold.
+
+    Attributes
+    ----------
+    fold
+        The fold that the model does not know.
+    surrogate
+        Which one is driven; it knows that fold.
+    gain
+        How much of their action in the data the inputs have.
+    x0
+        (nx,) start.
+    first
+        Row of the reference at which the run begins.
+    u_reference
+        (T, nu) inputs that cost nothing: those that hold the reference on this surrogate, unless the cost names others.
+    """
+
+    fold: int
+    surrogate: int
+    gain: float
+    x0: Float[np.ndarray, " nx"]
+    first: int
+    u_reference: Float[np.ndarray, "T nu"]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopTest:
+    """What all runs share: the task, the data in folds, the surrogates, and the conditions.
+
+    A run that leaves the box from `low` to `high` is lost.
+    """
+
+    asked: Asked
+    episodes: Episodes
+    fold: tuple[int, ...]
+    surrogates: tuple[Surrogate, ...]
+    conditions: tuple[Condition, ...]
+    low: Float[np.ndarray, " nx"]
+    high: Float[np.ndarray, " nx"]
+
+    @property
+    def nominal(self) -> tuple[int, ...]:
+        """The conditions in which the inputs act as in the data."""
+        return tuple(i for i, condition in enumerate(self.conditions) if condition.gain == 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A recipe, and the conditions that it is judged in."""
+
+    recipe: Recipe
+    conditions: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return str(self.recipe)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of a job.
+
+    Attributes
+    ----------
+    cost
+        Of each run; infinite where it was lost.
+    violation
+        Largest violation of a limit in each run, as a share of its range.
+    broken
+        Share of each run's steps that violate a limit by more than 0.1 % of its range.
+    visited
+        (n, nx) states of the runs in which the inputs act as in the data.
+    failure
+        Why there is no controller; empty where there is one.
+    """
+
+    cost: Float[np.ndarray, " runs"]
+    violation: Float[np.ndarray, " runs"]
+    broken: Float[np.ndarray, " runs"]
+    visited: Float[np.ndarray, "n nx"]
+    failure: str = ""
+
+
+class _LostError(Exception):
+    """The run has left what the surrogates were fitted to."""
+
+
+class _Fenced(SimulatedPlant):
+    """A plant that ends the run where its state leaves the box from low to high."""
+
+    def __init__(self, step_map: StepMap, low: Float[np.ndarray, " nx"], high: Float[np.ndarray, " nx"]) -> None:
+        super().__init__(step_map)
+        self._low, self._high = low, high
+
+    def step(self, u: ArrayLike, disturbance: ArrayLike | None = None) -> Float[np.ndarray, " ny"]:
+        """Return y of the next step, or end the run."""
+        y = super().step(u, disturbance)
+        if not ((y >= self._low) & (y <= self._high)).all():
+            raise _LostError
+        return y
+
+
+def judged(test: LoopTest, job: Job) -> Outcome:
+    """Return what came of a job, run by run.
+
+    The model of a weighted recipe is first fitted without weights, and its runs on the same surrogates with unchanged
+    inputs show which states to weigh; then again.
+    """
+    recipe = job.recipe
+    near: Nearness | None = None
+    try:
+        if recipe.weighted:
+            for _ in range(2):
+                seen = _outcome(test, replace(recipe, weighted=False), test.nominal, near)
+                if len(seen.visited):
+                    near = Nearness.of(seen.visited, test.episodes)
+        return _outcome(test, recipe, job.conditions, near)
+    except (KoopmpcError, ArithmeticError, np.linalg.LinAlgError) as error:
+        n = len(job.conditions)
+        nothing = np.full(n, np.inf)
+        return Outcome(
+            nothing, nothing, np.ones(n), np.zeros((0, test.episodes.nx)), f"{type(error).__name__}: {error}"
+        )
+
+
+def _outcome(test: LoopTest, recipe: Recipe, conditions: Sequence[int], near: Nearness | None) -> Outcome:
+    controllers: dict[int, Designed] = {}
+    plants: dict[tuple[int, float], StepMap] = {}
+    n, asked = len(conditions), test.asked
+    cost, violation, broken = np.full(n, np.inf), np.full(n, np.inf), np.ones(n)
+    visited: list[Float[np.ndarray, "T nx"]] = []
+    for j, place in enumerate(conditions):
+        one = test.conditions[place]
+        if one.fold not in controllers:
+            model = recipe.fit(without(test.episodes, test.fold, one.fold), near)
+            controllers[one.fold] = recipe.controller(model, asked.cost, asked.limits, asked.horizon)
+        key = one.surrogate, one.gain
+        if key not in plants:
+            plants[key] = test.surrogates[one.surrogate].plant(one.gain)
+        try:
+            run = _run(test, one, plants[key], controllers[one.fold], place)
+        except _LostError:
+            continue
+        total = metrics(run).cost
+        if not np.isfinite(total):
+            continue
+        over = asked.beyond(run.X[1:], run.states)
+        cost[j], violation[j], broken[j] = total, over.max(), np.mean(over > BROKEN)
+        if one.gain == 1.0:
+            visited.append(run.X)
+    return Outcome(cost, violation, broken, np.concatenate(visited) if visited else np.zeros((0, test.episodes.nx)))
+
+
+def _run(test: LoopTest, one: Condition, plant: StepMap, controller: Designed, seed: int) -> Run:
+    """Return the closed loop, with the states without their past."""
+    asked, surrogate = test.asked, test.surrogates[one.surrogate]
+    run = simulate(
+        _Fenced(plant, test.low, test.high),
+        controller,
+        x0=surrogate.start(one.x0),
+        reference=asked.reference[one.first : one.first + asked.steps + 1],
+        steps=asked.steps,
+        noise=surrogate.noise,
+        measured=surrogate.w if len(surrogate.w) else None,
+        rng=seed,
+    )
+    nx = test.episodes.nx
+    return replace(
+        run,
+        X=run.X[:, :nx],
+        states=test.episodes.states,
+        cost=asked.cost,
+        limits=asked.limits,
+        angles=asked.angles,
+        u_reference=one.u_reference,
+    )
+
+
+def ratios(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
+    """Return cost × (1 + 10 max(0, violation − 0.5 %)) of each run over the best of its condition, at most 20.
+
+    A violation counts as far as it is beyond the least of that condition: from some starts nobody can keep a limit. A
+    condition in which every run is lost has 20 throughout.
+    """
+    cost, violation = (np.array([getattr(each, name) for each in outcomes]) for name in ("cost", "violation"))
+    least = np.where(np.isfinite(violation), violation, np.inf).min(axis=0)
+    with np.errstate(invalid="ignore"):
+        priced = cost * (1 + PRICE * np.maximum(violation - least - FREE, 0.0))
+        priced = np.where(np.isfinite(priced), priced, np.inf)
+        best = priced.min(axis=0)
+        known = best[np.isfinite(best)]
+        little = LITTLE * float(np.median(known)) if known.size else 0.0
+        ratio = (priced + little) / np.maximum(best + little, 1e-300)
+    return np.where(np.isfinite(ratio), np.minimum(ratio, LOST), LOST)
+
+
+def scores(ratio: Float[np.ndarray, "jobs runs"]) -> Float[np.ndarray, " jobs"]:
+    """Return the geometric mean of each job's ratios: one lost run of twelve counts as 28 % more cost in all."""
+    return np.exp(np.log(ratio).mean(axis=1))

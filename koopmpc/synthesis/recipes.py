@@ -1,0 +1,138 @@
+"""Recipe: a model and a controller of it, which can be made of any episodes of one plant."""
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Source
+from koopmpc.errors import FitWarning
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.identify.fits.bilinear import bilinear_edmd
+from koopmpc.identify.fits.edmd import edmd
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.synthesis.candidates import Candidate
+from koopmpc.validate.scoring import AnyPredictor
+from koopmpc.values import Value
+
+Designed = KoopmanMPC | BilinearMPC
+_FLOOR = 1e-3  # weight of data that are far from every visited state
+_NEAR = 0.3  # this quantile of the squared distances is the square of the weights' width
+_VISITED = 300  # visited states that distances are taken to, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Nearness(Value):
+    """Weight 1e-3 + exp(−d²/2h²) of each step of an episode, d the distance to the nearest visited state.
+
+    Attributes
+    ----------
+    visited
+        (n, nx) states, over `scale`.
+    scale
+        (nx,) standard deviation of each state in the data.
+    width
+        h, in units of `scale`.
+    """
+
+    visited: Float[np.ndarray, "n nx"]
+    scale: Float[np.ndarray, " nx"]
+    width: float
+
+    @staticmethod
+    def of(X: Float[np.ndarray, "m nx"], data: Episodes) -> "Nearness":
+        """Return the weights around the states X for these data: h² is the 0.3-quantile of their d²."""
+        scale = np.concatenate([episode.X for episode in data]).std(axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        apart = -(-len(X) // _VISITED)
+        around = Nearness(X[::apart] / scale, scale, 1.0)
+        squares = np.concatenate([around.squares(episode) for episode in data])
+        return replace(around, width=float(np.sqrt(max(np.quantile(squares, _NEAR), 1e-12))))
+
+    def squares(self, episode: Episode) -> Float[np.ndarray, " T"]:
+        """Return d² of each step."""
+        X = episode.X[:-1, : len(self.scale)] / self.scale  # under an embedding the state comes first
+        return np.min([((X - point) ** 2).sum(axis=1) for point in self.visited], axis=0)
+
+    def __call__(self, episode: Episode) -> Float[np.ndarray, " T"]:
+        """Return the weight of each step."""
+        return _FLOOR + np.exp(-self.squares(episode) / (2 * self.width**2))
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe(Value):
+    """How a controller is made of data.
+
+    Attributes
+    ----------
+    candidate
+        Lifting, embedding and kind of the model: a linear one gives a KoopmanMPC, a bilinear one a BilinearMPC.
+    ridge
+        Weight on unit-norm columns.
+    estimator
+        Of the controller; None for none.
+    tail
+        Steps of the cost's tail where the cost names neither a tail nor Q_N; None for the default, 0 is Q_N = Q.
+    weighted
+        Fit the model again with weights around the states that its closed loops visit.
+    """
+
+    candidate: Candidate
+    ridge: float
+    estimator: LiftedDisturbance | None = None
+    tail: int | None = None
+    weighted: bool = False
+
+    def __str__(self) -> str:
+        """Return kind, name and delays of the model, and what is special about the controller."""
+        one, estimator = self.candidate, self.estimator
+        parts = [f"{one.kind}: {one.name}"]
+        if one.delays:
+            parts.append(f"{one.delays} delay{'s' * (one.delays > 1)}")
+        if self.tail == 0:
+            parts.append("Q_N = Q")
+        if estimator is not None:
+            parts.append("offset-free" + ("" if estimator.gain is None else f" (gain {estimator.gain:g})"))
+        if self.weighted:
+            parts.append("weighted")
+        return ", ".join(parts)
+
+    def fit(
+        self,
+        data: Episodes | Source,
+        near: Nearness | None = None,
+        *,
+        workers: int | None = None,
+        scheduler: str | None = None,
+    ) -> AnyPredictor:
+        """Return the model of these data, with the weights `near`; its report has the doubts."""
+        one = self.candidate
+        options = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FitWarning)
+            if not one.bilinear:
+                return edmd(data, one.lifting, embedding=one.embedding, ridge=self.ridge, **options)
+            return bilinear_edmd(
+                data, one.lifting, embedding=one.embedding, ridge=self.ridge, difference=True, **options
+            )
+
+    def controller(self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int) -> Designed:
+        """Return the controller of a model.
+
+        Raises
+        ------
+        KoopmpcError
+            The model and the cost do not go together.
+        """
+        if self.tail is not None and cost.Q_N is None and cost.tail is None:
+            cost = replace(cost, tail=self.tail)
+        if isinstance(model, BilinearPredictor):
+            return BilinearMPC(model, cost, limits, horizon, estimator=self.estimator)
+        return KoopmanMPC(model, cost, limits, horizon, estimator=self.estimator)

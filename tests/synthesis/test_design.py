@@ -1,0 +1,222 @@
+"""design: what it chooses, what it says of what is asked, and that time and workers do not count."""
+
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+import koopmpc as km
+from koopmpc.synthesis.designed import place_of
+from koopmpc.synthesis.judging import LOST, Outcome, ratios, scores
+from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
+
+A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
+COST = km.Cost(Q=[1.0, 0.1], R=0.1)
+LIMITS = km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, -0.5], x_max=[np.inf, 0.5])
+
+
+def mass(x, u):
+    return A @ x + B @ u
+
+
+def closed(x, u):
+    return np.array([0.7 * x[0] + 0.4 * u[0], 0.7 * x[1] + 0.5 * x[0] ** 2])
+
+
+@cache
+def data(count=9, steps=30):
+    return episodes_of(mass, count=count, steps=steps)
+
+
+def designed(episodes, cost=COST, limits=LIMITS, **more):
+    asked = {"horizon": 8, "reference": [0.0, 0.0], "candidates": [PLAIN], "delays": [0], "bilinear": False} | more
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", km.FitWarning)
+        return km.design(episodes, cost, limits, **asked)
+
+
+@cache
+def usual():
+    return designed(data())
+
+
+def least_cost(x0, steps):
+    """The least cost of a whole run of the mass with |u| ≤ 1, by bounded least squares."""
+    powers, rows, right = [np.eye(2)], [], []
+    for _ in range(steps):
+        powers.append(A @ powers[-1])
+    root = np.sqrt(np.diag(COST.Q)) if np.ndim(COST.Q) == 2 else np.diag(np.sqrt(COST.Q))
+    for k in range(1, steps + 1):
+        gains = np.hstack([powers[k - 1 - j] @ B if j < k else np.zeros((2, 1)) for j in range(steps)])
+        rows.append(root @ gains)
+        right.append(-root @ powers[k] @ x0)
+    rows.append(np.sqrt(0.1) * np.eye(steps))
+    right.append(np.zeros(steps))
+    return 2 * lsq_linear(np.vstack(rows), np.concatenate(right), bounds=(-1, 1)).cost
+
+
+def test_on_a_plant_whose_dynamics_the_lifting_holds_the_design_costs_the_optimum():
+    found = designed(data(), limits=km.Limits(u_min=-1, u_max=1), horizon=25, bilinear=True)
+    start, steps = np.array([2.0, 0.0]), 60
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    plant = km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u]), 0.1)
+    run = km.simulate(plant, found.controller, x0=start, reference=[0, 0], steps=steps, cost=COST)
+    assert np.abs(run.U).max() == pytest.approx(1.0)  # the limits are active
+    assert km.metrics(run).cost == pytest.approx(least_cost(start, steps), rel=2e-3)
+    assert np.median(found.expected.cost) > 0
+    assert found.expected.lost == 0
+
+
+def test_a_model_that_cannot_follow_the_plant_is_not_chosen():
+    episodes = episodes_of(closed, count=9, steps=30)
+    found = designed(
+        episodes,
+        km.Cost(Q=[0.0, 1.0], R=0.01),
+        km.Limits(u_min=-1, u_max=1),
+        reference=[0.0, 0.6],
+        candidates=[SQUARES, PLAIN],
+    )
+    assert "Monomials" in found.best.title
+    assert found.best.score == pytest.approx(min(row.score for row in found.leaderboard if row.off), rel=0.005)
+
+
+def test_the_same_data_and_seed_give_the_same_design_whoever_works():
+    again, other = designed(data()), designed(data(), workers=2)
+    for one in (again, other):
+        assert one.leaderboard == usual().leaderboard
+        assert one.controller.predictor == usual().controller.predictor
+        assert one.expected == usual().expected
+
+
+def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        n = int(rng.integers(2, 6))
+        costs = rng.uniform(1, 3, (n, 12))
+        costs[rng.uniform(size=costs.shape) < 0.5] = np.inf
+        lost = int(rng.integers(n))
+        costs[lost] = np.inf
+        costs[(lost + 1) % n, 0] = 1.0
+        outcomes = [Outcome(c, np.where(np.isfinite(c), 0.0, np.inf), np.zeros(12), np.zeros((0, 2))) for c in costs]
+        each = ratios(outcomes)
+        assert (each[lost] == LOST).all()
+        rows = [replace(usual().best, score=float(score), off=True) for score in scores(each)]
+        assert place_of(rows) != lost
+
+
+def test_violations_count_beyond_half_a_percent_and_beyond_what_nobody_avoids():
+    ones, none = np.ones(2), np.zeros((0, 2))
+    kept, broken = np.array([0.0, 0.3]), np.array([0.105, 0.4])
+    each = ratios([Outcome(ones, kept, ones, none), Outcome(ones, broken, ones, none)])
+    np.testing.assert_allclose(each[0], 1.0)
+    np.testing.assert_allclose(each[1], 1 + 0.99**-1 * 0.99 * np.array([1.0, 0.95]) / 1.01, rtol=1e-9)
+
+
+def test_a_position_that_nothing_depends_on_may_leave_the_data():
+    found = designed(data(), reference=[8.0, 0.0], horizon=40)
+    assert found.expected.lost == 0
+    assert not any("outside the data" in sentence for sentence in found.advice)
+
+
+def test_noise_in_the_data_is_in_the_runs_too():
+    clean, rough = usual().expected, designed(noisy(data(), 0.05)).expected
+    assert np.median(rough.cost) > np.median(clean.cost)
+
+
+def test_measured_disturbances_reach_surrogates_and_controllers():
+    rng = np.random.default_rng(0)
+    episodes = []
+    for _ in range(9):
+        W, U, X = rng.uniform(0, 1, (30, 1)), rng.uniform(-1, 1, (30, 1)), [rng.uniform(-1, 1, 2)]
+        for u, w in zip(U, W, strict=True):
+            X.append(A @ X[-1] + B @ u + np.array([0.0, 0.05]) * w)
+        episodes.append(km.Episode(X=np.array(X), U=U, W=W))
+    found = designed(km.Episodes(episodes, 0.1))
+    assert found.controller.predictor.nw == 1
+    assert found.expected.lost == 0
+
+
+def test_a_cost_on_observables_is_designed_for():
+    rotor = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.1 * u[0]]), count=9, steps=30)
+    cost = km.Cost(Q=[1.0, 1.0], R=0.1, of=km.Fourier(1, [0]))
+    found = designed(rotor, cost, km.Limits(u_min=-2, u_max=2), reference=[np.sin(0.3), np.cos(0.3)], angles=[0])
+    assert found.expected.lost == 0
+
+
+def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():
+    text = str(usual())
+    assert text.startswith(f"chosen: {usual().best.title}")
+    assert "no promise" in text
+    assert "lost runs             0 of 12" in text
+    assert max(map(len, text.splitlines())) <= 200
+
+
+def test_a_goal_that_no_input_holds_is_told_with_the_limit_in_the_way_and_the_nearest_that_can_be_held():
+    spring = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.8 * x[1] - 0.1 * x[0] + 0.1 * u[0]]), count=9)
+    with pytest.warns(km.FitWarning, match="no input inside the limits holds") as caught:
+        found = km.design(
+            spring, km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-0.3, u_max=0.3), horizon=8, reference=[0.5, 0.0],
+            candidates=[PLAIN], delays=[0], bilinear=False,
+        )  # fmt: skip
+    said = str(caught[0].message)
+    assert "u0 = 0.5, and its limit is 0.3" in said
+    assert "the nearest that can be held is x0 = 0.3" in said
+    assert said in found.advice
+
+
+def test_a_moving_state_is_no_equilibrium_to_rest_at():
+    with pytest.warns(km.FitWarning, match="this is no equilibrium of the plant"):
+        km.design(data(), COST, LIMITS, horizon=8, reference=[0.0, 0.4], candidates=[PLAIN], delays=[0], bilinear=False)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"starts": [0.0, 3.0]}, r"a start has x1 = 3, outside the data"),
+        ({"reference": np.column_stack([np.zeros(40), np.linspace(0, 3, 40)])}, r"the reference has x1 = 3, outside"),
+    ],
+)
+def test_a_start_or_a_reference_outside_the_data_is_told(more, sentence):
+    asked = {"horizon": 8, "reference": [0.0, 0.0], "candidates": [PLAIN], "delays": [0], "bilinear": False} | more
+    with pytest.warns(km.FitWarning, match=sentence):
+        km.design(data(), COST, LIMITS, **asked)
+
+
+def test_a_limited_state_without_weight_is_told():
+    found = designed(data(), km.Cost(Q=[1.0, 0.0], R=0.1))
+    assert any("x1 has limits and no weight in Q" in sentence for sentence in found.advice)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"reference": [0.0]}, r"reference has shape \(1,\), expected \(2,\)"),
+        ({"reference": [0.0, np.nan]}, "reference holds 1 NaN"),
+        ({"starts": [[0.0]]}, r"starts has shape"),
+        ({"angles": [2]}, "angles holds 2"),
+        ({"horizon": 0}, "horizon"),
+    ],
+)
+def test_what_cannot_be_designed_for_is_refused_in_a_sentence(more, sentence):
+    with pytest.raises(km.KoopmpcError, match=sentence):
+        designed(data(), **more)
+
+
+def test_too_few_episodes_for_three_folds_are_refused():
+    with pytest.raises(km.KoopmpcError, match=r"2 episodes give 2 folds, and a design needs 3: one to judge on"):
+        designed(data(count=2, steps=15), horizon=12)
+
+
+def test_a_horizon_beyond_the_episodes_is_told():
+    found = designed(data(), horizon=40)
+    assert any("judged 30 steps ahead" in note for note in found.notes)
+
+
+def test_data_without_inputs_are_refused():
+    free = km.Episodes([km.Episode(X=e.X, U=np.zeros((len(e), 0))) for e in data()], 0.1)
+    with pytest.raises(km.KoopmpcError, match="no inputs"):
+        designed(free)
