@@ -79,7 +79,8 @@ class InitialCondition:
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
-        self.observer.reset(x0)
+        if self._measured is None:  # else there is nothing that it remembers
+            self.observer.reset(x0)
         self.drive[:] = 0.0
         self._sent.extend([last.copy()] * (self._latency + 1))
         self._w = np.zeros(self._sizes[2])

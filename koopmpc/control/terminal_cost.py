@@ -117,7 +117,7 @@ def learned_steps(stage: Stage, predictor: LinearPredictor, N: int) -> int:
     missed: Float[np.ndarray, " n"] = report.residual[sizes > 0] / sizes[sizes > 0]
     enough = max(float(np.sqrt(np.mean(missed**2))) if missed.size else 0.0, SETTLED)
     A, B, P, M, R = stage.A, stage.B, _last(stage), stage.M, stage.R
-    (nz, _), needed, rested = scale.shape, len(predictor.point_names), 0
+    (nz, _), needed, rested = scale.shape, len(predictor.lifting.bound or ()), 0
     K = np.zeros((B.shape[1], len(A)))
     for n in range(1, AHEAD * N + 1):
         try:

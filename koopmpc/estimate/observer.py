@@ -185,12 +185,11 @@ class Measured:
 
     def __init__(self, model: LinearPredictor | StateModel) -> None:
         self._model = model = state_model(model)
-        self.lift = None if model.lifting is None else buffered(model.lifting)
         self._history = None if model.embedding is None else History(model.embedding)
         self.ny = model.ny
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
-        Measured.reset(self)
+        self.lift = None if model.lifting is None else buffered(model.lifting)
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget d and the past; x0 will come as the first measurement."""

@@ -110,15 +110,20 @@ def simulate(
     checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
     if isinstance(plant, StepMap):
         plant = SimulatedPlant(plant)
-    require_plant(plant)
+    else:
+        require_plant(plant)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
         raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
     first = plant.reset(x0, rng)
-    nx, ny, nu, N = len(plant.states), len(first), controller.nu, controller.horizon
-    if nu != len(plant.inputs):
-        raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(plant.inputs)} ({plant.inputs})")
+    states, inputs, outputs, state = tuple(plant.states), tuple(plant.inputs), tuple(plant.outputs), plant.state
+    nx, ny, nu, N = len(states), len(first), controller.nu, controller.horizon
+    if state is not None and np.shape(state) != (nx,):
+        raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
+    scene = getattr(plant, "scene", None)
+    if nu != len(inputs):
+        raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(inputs)} ({inputs})")
     rows = _rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
-    nr = rows.shape[1] if cost is None else cost.of.bind(plant.states).nz
+    nr = rows.shape[1] if cost is None else cost.of.bind(states).nz
     if rows.shape[1] != nr:
         raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
     outside = [i for i in angles if not 0 <= i < nx]
@@ -153,8 +158,6 @@ def simulate(
     hidden = np.full(nx, np.nan)
     look_ahead = getattr(controller, "plan", None) if plans or observers else None
     x, y, applied = known(), sensed(0, first), None
-    if x.shape != (nx,):
-        raise ShapeError(f"the plant's state has shape {x.shape}, its states name {nx}; they must agree")
     controller.reset(x0)
     ask = cast("Callable[..., Move]", controller)
     for k in range(steps):
@@ -196,13 +199,13 @@ def simulate(
         cost=cost,
         limits=limits,
         dt=plant.dt,
-        states=tuple(plant.states),
-        inputs=tuple(plant.inputs),
-        outputs=tuple(plant.outputs),
+        states=states,
+        inputs=inputs,
+        outputs=outputs,
         plans=Plans.of([step.plan for step in taken]),
         angles=tuple(angles),
         metadata=metadata,
-        scene=getattr(plant, "scene", None),
+        scene=scene,
         model=getattr(controller, "predictor", None),
     )
 

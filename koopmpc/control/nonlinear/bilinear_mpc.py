@@ -206,7 +206,7 @@ class BilinearMPC(StagedMPC):
         yield rest, U
         end = (self._target or self._preview.target).equilibrium.x
         yield rest + np.linspace(0.0, 1.0, N + 1)[:, None] * (end - x), U
-        if not isinstance(self.model, StepMap):
+        if not isinstance(self._map.model, StepMap):
             return
         motion = rest.copy()
         for k in range(N):

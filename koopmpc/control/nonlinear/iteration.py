@@ -61,7 +61,10 @@ class RealTimeIteration:
         N, nx, nu = len(problem.free), problem.nx, problem.F.size1_in(1)
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
-        self._sides = sides(problem)
+        self._sides, cost, R = sides(problem), plan_cost(problem), weights(problem)
+        sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
+        free = unconstrained(sweeps, R)
+        interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
         self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
         self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)
         self._free_stages = problem.free
@@ -79,24 +82,23 @@ class RealTimeIteration:
         Q, q, r = zeros((N, nx, nx)), zeros((N, nx)), zeros((N, nu))
         self._g, self._G = zeros((N, ng)), zeros((N, nx, ng))
         self._F, self._c, self._x0 = F, zeros((N, nx)), zeros(nx)
+        self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
+        self._next, after = _views([each.shape for each in state])
         plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta]
         self._A = A
         self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
-        self._simulate = Routine(simulation(problem), [*self._ahead, self.theta], [self._trial])
-        self._linearise = Routine(linearisation(problem), plan, [A, B, F, Q, q, r, self._g, self._G])
-        sweeps, curvature, R = RiccatiSweeps(nx, nu, N), zeros((N, nu)), weights(problem)
+        self._simulate = Routine(simulate, [*self._ahead, self.theta], [self._trial])
+        self._linearise = Routine(linearise, plan, [A, B, F, Q, q, r, self._g, self._G])
+        curvature = zeros((N, nu))
         stages = [A, B, self._c, Q, q, r, self._x0]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
-        self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
-        self._next, after = _views([each.shape for each in state])
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
-        self._cost = plan_cost(problem)
-        self._free = Routine(unconstrained(sweeps, R), stages, [self._dX, self._dU, curvature])
+        self._cost = cost
+        self._free = Routine(free, stages, [self._dX, self._dU, curvature])
         self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
         self._centring = zeros(1)
         held = nu + problem.with_rates * (nu + len(problem.soft_rates))  # limits of inputs and rates, never in conflict
         self._hard_states = bool((self._sides.row[: ns - nsoft] >= held).any())
-        interior = interior_step(sweeps, R, self._sides, ng) if ns else None
         self._interior = interior and Routine(
             interior, [*stages, self._G, self._d, self._centring, *state], [*after, self._measures]
         )

@@ -1,6 +1,6 @@
 """From a model, a cost and limits to the problem of a horizon: x⁺ = F(x, u, θ), then stages s⁺ = F(s, v, θ)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -51,11 +51,11 @@ class LearnedMap:
     nu: int
     nw: int
     embedding: Delay | None
+    lifting: None = None  # a plan is made of states, and none of them is lifted
+    nz: int = field(init=False)  # a plan is made of x
 
-    @property
-    def nz(self) -> int:
-        """Number of entries of the state that a plan is made of: of x."""
-        return self.nx
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nz", self.nx)
 
     @property
     def center(self) -> Float[np.ndarray, " ny"] | None:
@@ -64,11 +64,6 @@ class LearnedMap:
         if isinstance(model, StepMap) or model.scale is None or model.lifting.constant_index is None:
             return None
         return model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
-
-    @property
-    def lifting(self) -> None:
-        """None: a plan is made of states, and none of them is lifted."""
-        return None
 
     def updated(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.
@@ -125,7 +120,8 @@ def learned_map(model: ModelOrMap) -> LearnedMap:
         F = ca.Function("F", [x, u, none], [ca.densify(model.F(x, u))])
         F = F.expand("F") if model.F.is_a("SXFunction") else F
         return LearnedMap(model, F, np.zeros(0), np.zeros((ny, 0)), ny, ny, model.nu, 0, None)
-    nu, nz, nx = model.nu, model.nz, len(model.point_names)
+    nu, nz = model.nu, model.nz
+    nx = ny if model.embedding is None else len(model.embedding.names)
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
     A, B = ca.SX.sym("CA", ny, nz), ca.SX.sym("CB", ny, nu)
     theta, z = [A, B], model.lifting.symbolic(x)
@@ -163,6 +159,8 @@ class StagedProblem(NamedTuple):
 
     Attributes
     ----------
+    nx
+        Entries of s.
     inputs
         Limits of v, which are hard.
     box, softness
@@ -185,11 +183,7 @@ class StagedProblem(NamedTuple):
     held_from: Int[np.ndarray, " N"]
     with_rates: bool
     soft_rates: Int[np.ndarray, " nsoft"]
-
-    @property
-    def nx(self) -> int:
-        """Entries of s."""
-        return self.F.size1_in(0)
+    nx: int
 
 
 class StageTargets(NamedTuple):
@@ -209,12 +203,12 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
     free = np.zeros(N, dtype=np.bool_)
     free[starts] = True
     held_from = np.repeat(starts, blocks)
+    nx, nu = F.size1_in(0), F.size1_in(1)
     if not o.with_rates and len(blocks) == N:
         none = np.zeros(0, dtype=np.intp)
         return StagedProblem(
-            F, o.tracked, o.limited, o.Q, o.R, o.inputs, o.outputs, o.softness, free, held_from, False, none
+            F, o.tracked, o.limited, o.Q, o.R, o.inputs, o.outputs, o.softness, free, held_from, False, none, nx
         )
-    nx, nu = F.size1_in(0), F.size1_in(1)
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates
     given = np.isfinite(rates.low) | np.isfinite(rates.high)
@@ -242,4 +236,5 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
         held_from,
         True,
         soft,
+        ns,
     )

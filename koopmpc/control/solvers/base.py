@@ -33,7 +33,7 @@ class QPSolver(ABC):
     """The coordinates of the condensed QP that suit it: in "riccati" the Hessian is the identity; see `condense`."""
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
-        self._settings = dict(settings or {})
+        self._settings, self._stale = dict(settings or {}), False
         self._hold(qp)
         self._setup()
 
@@ -111,8 +111,12 @@ class QPSolver(ABC):
     def update(self, qp: QP) -> None:
         """Go on with another QP of the same size."""
 
-    @abstractmethod
     def reset(self) -> None:
+        """Have the next solve forget what earlier ones left behind."""
+        self._stale = True
+
+    @abstractmethod
+    def _forget(self) -> None:
         """Forget what earlier solves left behind."""
 
     def solve(
@@ -124,6 +128,9 @@ class QPSolver(ABC):
             raise ShapeError(f"the warm start has shapes {v.shape} and {y.shape}, the QP is {shapes}")
         if time_limit is not None and not time_limit > 0:
             return QPSolution(v.copy(), y.copy(), Status.TIME_LIMIT, 0, self.name)
+        if self._stale:
+            self._forget()
+            self._stale = False
         return self._solve(v, y, time_limit)
 
     @abstractmethod

@@ -81,7 +81,7 @@ class DAQP(QPSolver):
         flag, _ = self._model.setup(self._H, self._f, self._M, free, -free, self._sense)
         if flag < 0:
             raise DataError(f"DAQP refuses the problem, exit flag {flag}; pass a convex QP, P ⪰ 0")
-        self._mixed = self._unmet = self._soft and not self._sense.all()
+        self._mixed, self._unmet = self._soft and not self._sense.all(), False
         self._hard: DAQP | None = None  # the hard rows alone, set up when they are asked for
         self._is_steep: bool | None = None  # found out when it is asked
         self._far = (
@@ -92,7 +92,11 @@ class DAQP(QPSolver):
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
 
     def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool]]:
-        return type(self), (self._qp, self._settings), (Interval(self.low, self.high), self._far)
+        return (
+            type(self),
+            (self._qp, self._settings),
+            (Interval(self.low, self.high), bool(self._far and not self._stale)),
+        )
 
     def __setstate__(self, state: tuple[Interval, bool]) -> None:
         """Take over the limits that the original had, and how far from them its last solution was."""
@@ -103,7 +107,7 @@ class DAQP(QPSolver):
         """Go on with another QP of the same size: DAQP's setup is one factorisation."""
         self.__init__(qp, self._settings)
 
-    def reset(self) -> None:
+    def _forget(self) -> None:
         """Forget how hard the last solve was: a solve starts from its y alone."""
         self._far = False
 

@@ -113,7 +113,8 @@ class OSQP(QPSolver):
 
     def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Interval, float]]:
         limits = Interval(self.low, self.high)
-        return type(self), (self._qp, self._settings), (limits, self._solver.get_settings().rho)
+        rho = self._rho if self._stale else self._solver.get_settings().rho
+        return type(self), (self._qp, self._settings), (limits, rho)
 
     def __setstate__(self, state: tuple[Interval, float]) -> None:
         """Take over the limits, and the step size ρ that the original had adapted: a copy has the same iterates."""
@@ -138,7 +139,7 @@ class OSQP(QPSolver):
         if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
             raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
 
-    def reset(self) -> None:
+    def _forget(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""
         self._solver.update_rho(self._rho)
 
