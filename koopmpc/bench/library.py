@@ -43,8 +43,11 @@ def list_problems() -> tuple[Entry, ...]:
 def load_problem(problem: str | Path) -> Problem:
     """Load a problem by path or name; ``"cart_pole:recover"`` keeps one of its cases.
 
-    A name is looked up as a path, then in ./problems, then among the shipped problems. The file is run as Python:
-    load only files that you trust.
+    Parameters
+    ----------
+    problem
+        A path, or a name: it is looked up as a path, then in ./problems, then among the shipped problems. The file is
+        run as Python: load only files that you trust.
 
     Raises
     ------

@@ -179,6 +179,13 @@ def chosen_states(states: Chosen | None, names: Sequence[str]) -> list[int]:
 def save(made: "Figure", path: str | PathLike[str]) -> None:
     """Write the figure as .png, .pdf or .svg, by the path's ending: the same figure, the same bytes.
 
+    Parameters
+    ----------
+    made
+        A figure of `km.plot`, or any `matplotlib.figure.Figure`.
+    path
+        The file to write; its folders are made.
+
     Raises
     ------
     DataError

@@ -31,7 +31,13 @@ class Euler(Integrator):
 
 @dataclass(frozen=True)
 class RK4(Integrator):
-    """The classical Runge–Kutta method: order 4, `substeps` equal steps a sample."""
+    """The classical Runge–Kutta method, explicit, of order 4 (Hairer, Nørsett & Wanner 1993, II.1).
+
+    Parameters
+    ----------
+    substeps
+        Equal steps in one sample, at least 1.
+    """
 
     substeps: int = 1
 
@@ -62,7 +68,13 @@ class ImplicitMidpoint(Integrator):
 
 @dataclass(frozen=True)
 class Collocation(Integrator):
-    """Collocation at `degree` Gauss points: order 2·degree, A-stable (Hairer & Wanner 1996, IV.5)."""
+    """Collocation at Gauss points: order 2·degree, A-stable (Hairer & Wanner 1996, IV.5).
+
+    Parameters
+    ----------
+    degree
+        Number of Gauss points in one sample, at least 1.
+    """
 
     degree: int = 3
 
@@ -76,7 +88,13 @@ class Collocation(Integrator):
 
 @dataclass(frozen=True)
 class CVODES(Integrator):
-    """Variable order and step to the stated local tolerances, for stiff plants (Hindmarsh et al. 2005)."""
+    """Variable order and step to the stated local tolerances, for stiff plants (Hindmarsh et al. 2005).
+
+    Parameters
+    ----------
+    rtol, atol
+        Relative tolerance, and absolute tolerance in the units of the states; both above zero.
+    """
 
     rtol: float = 1e-9
     atol: float = 1e-9

@@ -263,7 +263,16 @@ class SimulatedPlant:
 
 
 def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008
-    """Return x⁺ = F(x, u) of ẋ = f(x, u) over dt [s], u held.
+    """Return x⁺ = F(x, u) of ẋ = f(x, u) over one sample, u held.
+
+    Parameters
+    ----------
+    dynamics
+        ẋ = f(x, u), y = h(x), with the names of states and inputs.
+    dt
+        Sample time [s].
+    integrator
+        Euler, RK4, ImplicitMidpoint, Collocation or CVODES.
 
     Raises
     ------

@@ -47,6 +47,11 @@ def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, 
     x
         (nx,), or (steps, nx): x_0, x_1, … of a run without input, one `dt` apart; with an embedding points ζ, as
         ``predictor.embed(episodes)`` has them.
+
+    Raises
+    ------
+    ShapeError
+        x has another number of columns than the predictor has states.
     """
     states, width = checks.array(x, "x"), len(predictor.point_names)
     modes, lifting = _lifted_modes(predictor)
@@ -73,6 +78,11 @@ def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> 
         embedding points ζ.
     times
         (steps,) [s].
+
+    Raises
+    ------
+    ShapeError
+        x0 has another number of columns than the predictor has states, or the times are no vector.
     """
     t = checks.array(times, "times", (None,))
     b = amplitudes(predictor, x0)

@@ -118,6 +118,11 @@ def feedback_share(
         ψ; or a predictor, for its lifting and embedding.
     embedding
         What a lifting of the state and its past acts on.
+
+    Raises
+    ------
+    ShapeError, DataError
+        The episodes and the predictor differ in states, inputs, disturbances or dt.
     """
     return explained_inputs(moments_of(episodes, lifting, embedding=embedding))
 

@@ -238,6 +238,11 @@ def invariance(
     bilinear
         Predict with u⊗ψ(x) too, as a bilinear model does.
 
+    Raises
+    ------
+    ShapeError, DataError
+        The episodes and the predictor differ in states, inputs, disturbances or dt.
+
     References
     ----------
     Haseli & Cortés, "Temporal forward-backward consistency, not residual error, measures the prediction accuracy
