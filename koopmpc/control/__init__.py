@@ -9,5 +9,6 @@ if TYPE_CHECKING:
     from koopmpc.control.move import Fallback as Fallback
     from koopmpc.control.move import Plan as Plan
     from koopmpc.control.riccati import Gain as Gain
+    from koopmpc.control.saved import SavedController as SavedController
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -5,12 +5,16 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.synthesis.asked import Asked as Asked
     from koopmpc.synthesis.candidates import Candidate as Candidate
     from koopmpc.synthesis.designed import Design as Design
     from koopmpc.synthesis.designed import DesignRow as DesignRow
+    from koopmpc.synthesis.designed import Evidence as Evidence
     from koopmpc.synthesis.designed import Expected as Expected
+    from koopmpc.synthesis.designed import SavedDesign as SavedDesign
     from koopmpc.synthesis.recipes import Recipe as Recipe
     from koopmpc.synthesis.selection import LeaderboardRow as LeaderboardRow
     from koopmpc.synthesis.selection import Selection as Selection
+    from koopmpc.synthesis.surrogates import Surrogate as Surrogate
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

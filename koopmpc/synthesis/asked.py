@@ -34,6 +34,8 @@ class Asked(Value):
         (T+1, nr) rows, T at least `steps`.
     starts
         (n, nx).
+    first_states
+        (m, nx) of all episodes, those inside the limits where there are enough; random starts are drawn from these.
     steps
         Of a run: three horizons, or what the reference has.
     angles
@@ -49,11 +51,12 @@ class Asked(Value):
     horizon: int
     reference: Float[np.ndarray, "T1 nr"]
     starts: Float[np.ndarray, "n nx"]
+    first_states: Float[np.ndarray, "m nx"]
     steps: int
     angles: tuple[int, ...]
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
-    limit_sizes: Float[np.ndarray, " n"]
+    limit_sizes: Float[np.ndarray, " nl"]
 
     @property
     def moves(self) -> bool:
@@ -127,8 +130,9 @@ def asked_of(
         rows = np.repeat(rows, steps + 1, axis=0)
     X = np.concatenate([episode.X for episode in data])
     low, high = X.min(axis=0), X.max(axis=0)
+    firsts = _first_states(data, limits)
     if starts is None:
-        points = _first_states(data, limits)
+        points = _spread(firsts)
     else:
         points = checks.array(starts, "starts")
         points = checks.array(
@@ -146,6 +150,7 @@ def asked_of(
         horizon=horizon,
         reference=rows,
         starts=points,
+        first_states=firsts,
         steps=min(steps, max(len(rows) - 1, 1)),
         angles=tuple(angles),
         low=low,
@@ -191,11 +196,15 @@ def unweighted(asked: Asked, data: Episodes) -> list[str]:
 
 
 def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
-    """Return first states of episodes inside the limits: of the half nearest to their median, far from each other."""
+    """Return the first states of episodes, those inside the limits alone where there are as many as starts."""
     points = np.unique(np.array([episode.X[0] for episode in data]), axis=0)
     low, high = limits.states(data.nx)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
-    points = inside if len(inside) >= STARTS else points
+    return inside if len(inside) >= STARTS else points
+
+
+def _spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx"]:
+    """Return a few of the points: of the half nearest to their median, far from each other."""
     size = np.ptp(points, axis=0)
     Z = (points - np.median(points, axis=0)) / np.where(size > 0, size, 1.0)
     central = np.argsort((Z**2).sum(axis=1), kind="stable")[: max(-(-len(Z) // 2), min(STARTS, len(Z)))]

@@ -24,7 +24,7 @@ from koopmpc.synthesis.asked import Asked, asked_of, outside_data, unweighted
 from koopmpc.synthesis.candidates import Candidate, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
-from koopmpc.synthesis.designed import Design, DesignRow, Expected, place_of
+from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
 from koopmpc.synthesis.folds import Folds, folded, only, sampled, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, judged, ratios, scores
 from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
@@ -177,7 +177,7 @@ def design(
         leaderboard=rows,
         chosen=best,
         chosen_linear=linear,
-        expected=expected,
+        evidence=Evidence(asked, test.surrogates, test.low, test.high, expected),
         advice=(*doubts, *_advice(rows, best, linear, expected), *unweighted(asked, held)),
         notes=(*notes, *short, *folds.notes),
     )

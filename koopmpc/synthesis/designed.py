@@ -2,13 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from rich.console import RenderableType
 
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.saved import SavedController
+from koopmpc.predict.base import save_value
+from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.recipes import Designed, Recipe
+from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.text import labelled, percent, table, written
 from koopmpc.values import Value
 
@@ -102,6 +107,37 @@ class Expected(Value):
 
 
 @dataclass(frozen=True, eq=False)
+class Evidence(Value):
+    """What a design rests on: the task, the stand-ins of the plant, and what is expected.
+
+    Attributes
+    ----------
+    asked
+        Cost, limits, reference and starts.
+    surrogates
+        Learned stand-ins of the plant.
+    low, high
+        (nx,) a run that leaves this box is lost.
+    expected
+        Of the chosen controller.
+    """
+
+    asked: Asked
+    surrogates: tuple[Surrogate, ...]
+    low: Float[np.ndarray, " nx"]
+    high: Float[np.ndarray, " nx"]
+    expected: Expected
+
+
+@dataclass(frozen=True, eq=False)
+class SavedDesign(Value):
+    """A designed controller in a file, with the evidence on which it can be checked."""
+
+    controller: SavedController
+    evidence: Evidence
+
+
+@dataclass(frozen=True, eq=False)
 class Design:
     """A controller that was chosen by closed loop from data alone; `print` shows it with its evidence.
 
@@ -115,8 +151,8 @@ class Design:
         All recipes, the best first; those that were judged in all conditions stand before those that were screened.
     chosen, chosen_linear
         Places of the two in the leaderboard.
-    expected
-        What to expect of `controller`.
+    evidence
+        The task, the stand-ins of the plant, and what to expect of `controller`.
     advice
         What limits the closed loop, and which data would help, in sentences.
     notes
@@ -128,7 +164,7 @@ class Design:
     leaderboard: tuple[DesignRow, ...]
     chosen: int
     chosen_linear: int | None
-    expected: Expected
+    evidence: Evidence
     advice: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -136,6 +172,21 @@ class Design:
     def best(self) -> DesignRow:
         """The row of `controller`."""
         return self.leaderboard[self.chosen]
+
+    @property
+    def expected(self) -> Expected:
+        """What to expect of `controller`: an estimate, no promise."""
+        return self.evidence.expected
+
+    def save(self, path: str | Path) -> None:
+        """Write the controller and its evidence as data; `km.load_controller` and ``koopmpc check`` read it.
+
+        Raises
+        ------
+        LogError
+            The path cannot be written.
+        """
+        save_value(SavedDesign(self.controller.as_data(), self.evidence), path)
 
     def __str__(self) -> str:
         """Return the choice, what to expect of it, advice, and the first rows of the leaderboard."""

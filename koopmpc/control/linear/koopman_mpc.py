@@ -18,6 +18,7 @@ from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
 from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.riccati import recursion
+from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows, targets_of
@@ -116,6 +117,7 @@ class KoopmanMPC(MPCBase):
             move_of=np.repeat(np.arange(len(blocks)), blocks),
         )
         self.predictor, self._disturbed = predictor, estimator is not None
+        self._options = {"solver": solver, "settings": dict(settings or {})}
         asked = SOLVERS[solver]
         self._map = self._plan_map(predictor, track, self._wanted or asked.coordinates)
         exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
@@ -151,6 +153,9 @@ class KoopmanMPC(MPCBase):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._see()
+
+    def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:
+        return "KoopmanMPC", self.predictor, self._options
 
     @property
     def coordinates(self) -> str:

@@ -15,6 +15,7 @@ from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
+from koopmpc.control.saved import Kind
 from koopmpc.estimate.observer import Estimator
 from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
@@ -108,6 +109,9 @@ class BilinearMPC(StagedMPC):
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._trajectory(self._iteration.X, self._iteration.U)
         self.reset()
+
+    def _made_of(self) -> tuple[Kind, ModelOrMap, dict[str, Any]]:
+        return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}
 
     def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...], dict[str, Any]]:
         build = partial(

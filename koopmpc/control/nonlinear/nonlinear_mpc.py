@@ -14,6 +14,7 @@ from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver, Shooting, Start
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
+from koopmpc.control.saved import Kind
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
 
@@ -85,9 +86,13 @@ class NonlinearMPC(StagedMPC):
         self._starts = checks.count(starts, "starts")
         limited = {"ipopt.max_wall_time": self._allowed} if solver == "ipopt" and time_limit is not None else {}
         self._options = solver, limited | dict(settings or {})
+        self._own = {"solver": solver, "starts": self._starts, "settings": dict(settings or {})}
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
         self._e = np.zeros((self._N, self._map.nx))
         self.reset()
+
+    def _made_of(self) -> tuple[Kind, ModelOrMap, dict[str, Any]]:
+        return "NonlinearMPC", self.model, self._own
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "NonlinearMPC":
         """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process."""
