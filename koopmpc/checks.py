@@ -1,18 +1,14 @@
-"""Checks of arguments and files, with the messages about shapes, dtypes, NaN, definiteness and paths."""
+"""Checks of arguments, with the messages about shapes, dtypes, NaN and definiteness."""
 
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from os import PathLike
-from pathlib import Path
-from typing import BinaryIO, cast
-from zipfile import is_zipfile
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.errors import DataError, DefinitenessError, LogError, ShapeError
+from koopmpc.errors import DataError, DefinitenessError, ShapeError
 
 
 def array(
@@ -176,30 +172,6 @@ def generator(rng: np.random.Generator | int) -> np.random.Generator:
     return np.random.default_rng(rng)
 
 
-def existing(path: str | PathLike[str], advice: str) -> Path:
-    """Return the path of a file that is there; `advice` ends the message where it is not."""
-    file = Path(path)
-    if file.is_dir():
-        raise LogError(f"{file} is a folder; {advice}")
-    if not file.exists():
-        raise LogError(f"{file} does not exist; {advice}")
-    return file
-
-
-@contextmanager
-def writing(path: str | PathLike[str], mode: str = "wb") -> Generator[BinaryIO]:
-    """Open the file for writing, its folders made; what the system refuses becomes a LogError with the path."""
-    file = Path(path)
-    if file.is_dir():
-        raise LogError(f"{file} is a folder; pass the path of a file in it")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with file.open(mode) as stream:
-            yield cast(BinaryIO, stream)
-    except OSError as error:
-        raise LogError(f"{file} cannot be written: {error.strerror or error}; pass another path") from error
-
-
 def _written(shape: Sequence[int | None]) -> str:
     sizes = ["any" if n is None else str(n) for n in shape]
     return "(" + ", ".join(sizes) + (",)" if len(sizes) == 1 else ")")
@@ -225,26 +197,3 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
     except (TypeError, ValueError):
         pass
     return array(value, name, finite=False)  # pyright: ignore[reportArgumentType]
-
-
-def read_arrays(file: Path, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return all arrays of a .npz file, those that are `needed` among them; a pickle in it is never opened.
-
-    Raises
-    ------
-    ValueError
-        The file cannot be read, or lacks an array; the message says why.
-    """
-    if not is_zipfile(file):
-        raise ValueError("it is no .npz file, or was cut")
-    try:
-        # Opened here, for numpy leaves a file that it refuses open.
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
-            arrays = {name: held[name] for name in held.files}
-    except Exception as error:  # numpy and zipfile raise a dozen kinds, and some advise to trust the file
-        raise ValueError("it is damaged, or holds something other than arrays of numbers") from error
-    missing = [name for name in needed if name not in arrays]
-    if missing:
-        names = ", ".join(arrays) or "nothing"
-        raise ValueError(f"it is of another program: it holds {names}, and lacks {', '.join(missing)}")
-    return arrays

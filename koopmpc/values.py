@@ -257,11 +257,12 @@ def _array_to_data(array: Array, arrays: Arrays | None) -> dict[str, Any]:
 
 
 def _array(node: dict[str, Any], arrays: Mapping[str, Array]) -> Array:
-    dtype = np.asarray(arrays[node["key"]]).dtype if "key" in node else np.dtype(node["dtype"])
+    held = np.asarray(arrays[node["key"]]) if "key" in node else None
+    dtype = np.dtype(node["dtype"]) if held is None else held.dtype
     if dtype.kind not in "fiubc":
         raise LogError(f"the file holds an array of {dtype}; only numbers are read")
-    if "key" in node:
-        return np.asarray(arrays[node["key"]])
+    if held is not None:
+        return held
     return np.array(node["values"], dtype=_parts(dtype)).view(dtype).reshape(node["shape"])
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from koopmpc import checks
+from koopmpc import disk
 from koopmpc.figures.style import save
 from koopmpc.recording.views.curves import Curves
 from koopmpc.validate.text import markdown_table
@@ -90,6 +90,6 @@ class Page:
             The file cannot be written.
         """
         path = self.folder / name
-        with checks.writing(path) as stream:
+        with disk.writing(path) as stream:
             stream.write(self.markdown.encode())
         return path

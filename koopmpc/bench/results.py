@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc import disk
 from koopmpc.control.move import Fallback, Status
 from koopmpc.loop.metrics import Metrics, tracking_error
 from koopmpc.loop.run import Run
@@ -129,7 +130,9 @@ def write_results(rows: Sequence[RunRow], path: Path) -> None:
     columns += [("status", pa.struct([(s.name, whole) for s in Status]))]
     columns += [("fallback", pa.struct([(f.name, whole) for f in Fallback]))]
     columns += [("reached", pa.bool_()), ("training_time", number), ("log", text), ("failure", text)]
-    pq.write_table(pa.Table.from_pylist([_record(row) for row in rows], schema=pa.schema(columns)), path)
+    table = pa.Table.from_pylist([_record(row) for row in rows], schema=pa.schema(columns))
+    with disk.writing(path) as stream:
+        pq.write_table(table, stream, write_page_checksum=True)
 
 
 def _record(row: RunRow) -> dict[str, Any]:

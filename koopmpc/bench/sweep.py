@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from koopmpc import disk
 from koopmpc.bench.controllers import CONTROLLERS, LEARNED, Prepared, controller_names
 from koopmpc.bench.problem import Case, Problem
 from koopmpc.bench.results import RunRow, failures, reached, write_results
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
-from koopmpc.errors import ProblemError
+from koopmpc.errors import FullDiskError, ProblemError
 from koopmpc.loop.faults import (
     ActuatorDelay,
     ActuatorLoss,
@@ -87,6 +88,8 @@ def sweep(
     ------
     ProblemError
         There is no such controller, or a case is given twice.
+    FullDiskError
+        The disk is full; the runs that are finished, and their results.parquet, are kept.
     """
     asked, problems, folder = controller_names(controllers), list(problems), Path(folder)
     cases = [f"{problem.name}:{case}" for problem in problems for case in problem.cases]
@@ -105,6 +108,7 @@ def sweep(
         for name in (asked if controllers else controller_names(problem.controllers))
     ]
     rows: list[RunRow] = []
+    write_results(rows, folder / RESULTS)  # and after every run: what interrupts the next one finds these on the disk
     parts: Prepared | None = None
     for problem, task in tasks:
         if parts is None or parts.problem is not problem:
@@ -112,9 +116,9 @@ def sweep(
         if progress is not None:
             progress(f"{problem.name}:{' '.join(filter(None, task))}", len(rows), len(tasks))
         rows.append(_row(parts, task, folder, live))
+        write_results(rows, folder / RESULTS)
     if progress is not None:
         progress("done", len(tasks), len(tasks))
-    write_results(rows, folder / RESULTS)
     return rows
 
 
@@ -131,16 +135,18 @@ def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> RunRow:
     try:
         run = _run(parts, task, live)
         judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[case].steps)
+    except FullDiskError:
+        raise
     except Exception as error:  # the other runs go on; the exit code says that one failed
         return RunRow(problem, case, name, failure=_described(error, log), fault=fault)
     try:
         found += _recorded(run, log)
         if load_run(log) != run:
             found.append(f"{log.name} does not read back equal to the run")
+    except FullDiskError:
+        raise
     except Exception as error:  # the figures of the run are kept without its log
         found.append(_described(error, log))
-    if log.exists() and not log.stat().st_size:
-        log.unlink()
     kept = log if log.exists() else None
     training = parts.training_time if name in LEARNED else 0.0
     return RunRow(problem, case, name, *judged, training, kept, "; ".join(found) or None, fault)
@@ -149,7 +155,8 @@ def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> RunRow:
 def _described(error: Exception, log: Path) -> str:
     """Return the error in one line, and write its traceback beside the log."""
     trace = log.with_suffix(".txt")
-    trace.write_text("".join(traceback.format_exception(error)))
+    with disk.writing(trace) as stream:
+        stream.write("".join(traceback.format_exception(error)).encode())
     return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
 
 
@@ -157,6 +164,8 @@ def _recorded(run: Run, log: Path) -> list[str]:
     """Write the log; where its scene cannot be drawn, write it without the scene and return why."""
     try:
         record(run, log)
+    except FullDiskError:
+        raise
     except Exception as error:
         if run.scene is None:
             raise

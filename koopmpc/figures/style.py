@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, ParamSpec, TypeVar, ca
 
 import numpy as np
 
-from koopmpc import checks
+from koopmpc import checks, disk
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Chosen, indices
 
@@ -196,7 +196,7 @@ def save(made: "Figure", path: str | PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in _SUFFIXES:
         raise DataError(f"{path} is no picture by its name; end it with one of {', '.join(_SUFFIXES)}")
-    with checks.writing(path) as stream:
+    with disk.writing(path) as stream:
         if suffix == ".png":
             _save_png(made, stream)
         else:

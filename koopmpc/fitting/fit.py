@@ -14,6 +14,7 @@ from koopmpc.bench.page import Page
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.storage import Files
+from koopmpc.errors import FullDiskError
 from koopmpc.figures.comparisons import error
 from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import rollout
@@ -153,6 +154,8 @@ def fit_data(
     recording = place / "model.rrd"
     try:
         record_model(selection.predictor, split.held_out, recording, report=report)
+    except FullDiskError:
+        raise
     except Exception as failure:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(failure).__name__}: {failure}")
     usage = _usage(selection, model)
@@ -166,6 +169,8 @@ def fit_data(
     for name, caption, draw_picture in pictures:
         try:
             page.picture(name, caption, draw_picture())
+        except FullDiskError:
+            raise
         except Exception as failure:  # a picture that cannot be drawn must not cost the model
             failures.append(f"{name}.png: {type(failure).__name__}: {failure}")
     page.text("## Choice")

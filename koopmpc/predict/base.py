@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc import checks, disk
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, LogError, ShapeError
@@ -32,7 +32,7 @@ def save_value(value: Value, path: str | Path) -> None:
     arrays: Arrays = {}
     tree = {"format": _FORMAT, "value": to_data(value, arrays)}
     text = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
-    with checks.writing(path) as file:
+    with disk.writing(path) as file:
         np.savez_compressed(file, allow_pickle=False, tree=text, **arrays)
 
 
@@ -46,26 +46,34 @@ def load_value(path: str | Path, *kinds: type[V]) -> V:
     """
     wanted = " or ".join(kind.__name__ for kind in kinds)
     advice = f"pass the .npz of a saved {wanted}"
-    source = checks.existing(path, advice)
+    source = disk.existing(path, advice)
     try:
-        arrays = checks.read_arrays(source, ("tree",))
-        tree = cast("object", json.loads(arrays.pop("tree").tobytes().decode()))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        with disk.Members(source) as arrays:
+            arrays.require("tree")
+            value = _built(arrays)
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise LogError(f"{path} is damaged: the text in it cannot be read; {advice}") from error
     except (OSError, ValueError) as error:
         raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}; {advice}") from error
-    node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
-    if node.get("format") != _FORMAT:
-        raise LogError(f"{path} is no {_FORMAT} file; save it again with this version")
-    try:
-        value = from_data(node.get("value"), arrays)
-    except LogError as error:
-        raise LogError(f"{path}: {error}") from error
-    except Exception as error:  # a damaged file gave a class something that it was never meant to hold
-        raise LogError(f"{path} is damaged, or was made by hand: {error}") from error
     if not isinstance(value, kinds):
         raise LogError(f"{path} holds a {type(value).__name__}, not a {wanted}")
     return value
+
+
+def _built(arrays: disk.Members) -> object:
+    """Build what the text of the file describes, and read the arrays that it names."""
+    tree = cast("object", json.loads(arrays["tree"].tobytes().decode()))
+    node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
+    if node.get("format") != _FORMAT:
+        raise LogError(f"it is no {_FORMAT} file; save it again with this version")
+    try:
+        return from_data(node.get("value"), arrays)
+    except LogError:
+        raise
+    except Exception as error:  # a damaged file gave a class something that it was never meant to hold
+        raise LogError(f"it is damaged, or was made by hand: {error}") from error
 
 
 _DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent

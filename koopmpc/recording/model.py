@@ -15,7 +15,7 @@ from koopmpc.errors import DataError
 from koopmpc.figures.plane import Axes, Plane, plane_through
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
-from koopmpc.recording.format.writer import PATIENCE, file_recording, times
+from koopmpc.recording.format.writer import file_recording, times
 from koopmpc.recording.views.blueprint import color, framed
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
 from koopmpc.scene import Color
@@ -91,23 +91,21 @@ def record_model(
     residuals = None if report is None else report.residuals
     pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
     layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)
-    rec = file_recording(path, "koopmpc-model", layout)
-    rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
-    text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
-    rec.log("report", text, static=True)
-    drawn = draw_eigenvalues(predictor, residuals)
-    for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
-        rec.log(entity, archetype, static=True)
-    for r, one in enumerate(ahead):
+    with file_recording(path, "koopmpc-model", layout) as rec:
+        rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
+        text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
+        rec.log("report", text, static=True)
+        drawn = draw_eigenvalues(predictor, residuals)
+        for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
+            rec.log(entity, archetype, static=True)
+        for r, one in enumerate(ahead):
+            for i in range(predictor.nx):
+                _send(rec, f"rollout/{r}/state/{i}", _forecast_curves(one, i), predictor.dt)
+            if predictor.nu:
+                inputs = [(name, color(1 + j), 2.0, one.U[:, j]) for j, name in enumerate(one.inputs)]
+                _send(rec, f"rollout/{r}/inputs", inputs, predictor.dt, interpolation_mode="StepAfter")
         for i in range(predictor.nx):
-            _send(rec, f"rollout/{r}/state/{i}", _forecast_curves(one, i), predictor.dt)
-        if predictor.nu:
-            inputs = [(name, color(1 + j), 2.0, one.U[:, j]) for j, name in enumerate(one.inputs)]
-            _send(rec, f"rollout/{r}/inputs", inputs, predictor.dt, interpolation_mode="StepAfter")
-    for i in range(predictor.nx):
-        _send(rec, f"error/{i}", _error_curves(errors, i), predictor.dt, first=1)
-    rec.flush(timeout_sec=PATIENCE)
-    rec.disconnect()
+            _send(rec, f"error/{i}", _error_curves(errors, i), predictor.dt, first=1)
 
 
 def _forecast_curves(ahead: Forecast, i: int) -> list[Curve]:

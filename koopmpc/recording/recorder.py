@@ -68,6 +68,8 @@ class BackgroundWriter:
                     writer.end(Run(**columns, **self._about.about()) if whole else None)
             except Exception as error:  # whatever a scene, a disk or a viewer raises must not reach the loop
                 self._failure = error
+        if self._failure is not None:
+            writer.discard()
 
     def _drained(self) -> list[Step]:
         """Return the steps that are in the queue now."""
@@ -103,8 +105,12 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     """
     scene, model = scene or run.scene, run.model if model is None else model
     writer = Writer(About(**run.about()), path=Path(path), scene=scene, model=model, steps=run.steps)
-    writer.write(block_of_run(run))
-    writer.end(run)
+    try:
+        writer.write(block_of_run(run))
+        writer.end(run)
+    except BaseException:
+        writer.discard()
+        raise
 
 
 class Recorder:
@@ -207,7 +213,7 @@ class Recorder:
         self._writers = {}
 
     def _opened(self, path: Path | None, viewer: str | None) -> BackgroundWriter:
-        writer = Writer(self._about, path=path, viewer=viewer, scene=self._scene, model=self._model)
+        writer = Writer(self._about, path=path, viewer=viewer, scene=self._scene, model=self._model, growing=True)
         return BackgroundWriter(self._about, writer)
 
 

@@ -139,7 +139,8 @@ def test_a_changed_file_of_our_own_is_refused(tmp_path: Path) -> None:
     lines = (tmp_path / "own.csv").read_text().splitlines()
     text(tmp_path / "own.csv", "\n".join([*lines[:3], *lines[4:]]))
     with pytest.raises(
-        km.errors.LogError, match="holds no episodes that can be read: its rows are not those that were written"
+        km.errors.LogError,
+        match="holds no episodes that can be read: it has 2 rows of 3, and they are not those that were written",
     ):
         km.load_episodes(tmp_path / "own.csv")
 

@@ -107,7 +107,8 @@ def test_foreign_contents_are_refused(tmp_path: Path) -> None:
 
 
 def test_no_pickle_is_opened(tmp_path: Path) -> None:
-    np.savez(tmp_path / "evil.npz", X=np.array([{"a": 1}], dtype=object))
+    pickled = np.array([{"a": 1}], dtype=object)
+    np.savez(tmp_path / "evil.npz", X=pickled, U=pickled, steps=pickled, about=pickled)
     with pytest.raises(
         km.errors.LogError, match="it is damaged, or holds something other than arrays of numbers; pass a file"
     ):

@@ -2,6 +2,7 @@
 """The door to CSV: columns of a text table by name, and episodes as one such table, to the bit."""
 
 import json
+import re
 import zlib
 from decimal import Decimal
 from io import BytesIO
@@ -15,11 +16,17 @@ from koopmpc.data.files.parquet import positions
 from koopmpc.errors import DataError, LogError
 
 _MARK = "# koopmpc.episodes "
+_OWN = ('"dt": ', '"states": ')  # in the first line too: a damaged mark is found
+_LINE = re.compile(r"rows=(\d+) crc32=([0-9a-f]{8}) (.*)")
+_EARLIER = re.compile(r"(\b)([0-9a-f]{8}) (.*)")  # which has no count, and whose checksum is of the rows alone
 _TEXT = ("utf-8-sig", "latin-1")
 
 
 def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str) -> None:
-    """Write the stacked rows below a line of metadata; the inputs of an episode's last row stay empty."""
+    """Write the stacked rows below a line with their number, a checksum and metadata.
+
+    The inputs of an episode's last row stay empty. The checksum is of the metadata and the rows.
+    """
     episode, step = positions(steps)
     last = step == steps[episode]
     lines = [",".join(_quoted(name) for name in ("episode", "step", *names))]
@@ -28,7 +35,7 @@ def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names
         u = [""] * U.shape[1] if end else [repr(float(v)) for v in next(inputs)]
         lines.append(",".join([str(e), str(k), *(repr(float(v)) for v in x), *u]))
     body = ("\n".join(lines) + "\n").encode()
-    file.write(f"{_MARK}{zlib.crc32(body):08x} {about}\n".encode())
+    file.write(f"{_MARK}rows={len(X)} crc32={zlib.crc32(body, zlib.crc32(about.encode())):08x} {about}\n".encode())
     file.write(body)
 
 
@@ -37,7 +44,9 @@ def described(path: Path) -> str | None:
     with path.open("rb") as file:
         line = file.readline(1_000_000)
     text = line.decode(_TEXT[0], errors="replace")
-    return text[len(_MARK) :].strip() if text.startswith(_MARK) else None
+    if text.startswith(_MARK):
+        return text[len(_MARK) :].strip()
+    return text if text.startswith("#") and any(sign in text for sign in _OWN) else None
 
 
 def columns(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
@@ -98,11 +107,16 @@ def read(path: Path, about: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, st
     LogError, ValueError
         It is damaged, or its rows were changed.
     """
-    check, _, about = about.partition(" ")
+    line = _LINE.fullmatch(about) or _EARLIER.fullmatch(about)
+    if line is None:
+        raise ValueError("its first line is damaged; take another copy, or remove the line to read a plain table")
+    count, check, about = line.groups()
+    body = path.read_bytes().partition(b"\n")[2].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
+    if f"{zlib.crc32(body, zlib.crc32(about.encode()) if count else 0):08x}" != check:
+        held = body.count(b"\n") - 1
+        what = f"it has {held} rows of {count}, and they" if count and held != int(count) else "its rows"
+        raise ValueError(f"{what} are not those that were written; without its first line it is a plain table")
     named = json.loads(about)
-    body = path.read_bytes().partition(b"\n")[2].replace(b"\r\n", b"\n")
-    if f"{zlib.crc32(body):08x}" != check:
-        raise ValueError("its rows are not those that were written; without its first line it is a plain table")
     found = columns(path)[1]
     episode, step = (np.asarray(found[name], dtype=np.intp) for name in ("episode", "step"))
     steps = np.bincount(episode) - 1

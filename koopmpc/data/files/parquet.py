@@ -5,6 +5,7 @@ A group of rows is read without the rest of the file, so that a fit never holds 
 """
 
 import json
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,9 +14,10 @@ import numpy as np
 
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature
 from koopmpc.data.source import Part
+from koopmpc.disk import affordable
 from koopmpc.errors import DataError, LogError
 
-_KEY = b"koopmpc.episodes"
+_KEY, _CHECK = b"koopmpc.episodes", b"koopmpc.check"
 _GROUP = 8_000_000  # bytes of a group of rows, about
 ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
@@ -46,7 +48,42 @@ def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names
     columns += [pa.array(column, mask=last) for column in full.T]
     table = pa.table(columns, names=["episode", "step", *names])
     rows = max(_GROUP // (8 * len(columns)), 1)
-    pq.write_table(table.replace_schema_metadata({_KEY: about.encode()}), file, row_group_size=rows)
+    check = json.dumps({"rows": rows, "crc32": _checksums(about, rows, 0, np.column_stack([episode, step]), X, full)})
+    table = table.replace_schema_metadata({_KEY: about.encode(), _CHECK: check.encode()})
+    pq.write_table(table, file, row_group_size=rows, write_page_checksum=True)
+
+
+def _checksums(about: str, size: int, first: int, *columns: np.ndarray) -> list[int]:
+    """Return a checksum of each whole block of `size` rows and of the metadata; `first` is the number of the first row.
+
+    Pages have checksums of their own, but names, sizes and the places of pages have none.
+    """
+    seed, count = zlib.crc32(about.encode()), len(columns[0])
+    sums: list[int] = []
+    for start in range(-first % size, count, size):
+        total = seed
+        for some in columns:
+            total = zlib.crc32(np.ascontiguousarray(some[start : start + size]).data, total)
+        sums.append(total)
+    return sums
+
+
+def _verify(table: Any, named: dict[str, Any], first: int = 0, rows: int | None = None) -> None:
+    """Raise where rows of a file, the first of them number `first` of `rows`, are not those that were written."""
+    metadata = table.schema.metadata
+    if _CHECK not in metadata:  # written by an earlier version
+        return
+    check = json.loads(metadata[_CHECK])
+    size, rows = int(check["rows"]), len(table) if rows is None else rows
+    places = np.stack([table[name].to_numpy() for name in ("episode", "step")], axis=1)
+    U = _stacked(table, named["inputs"] + named.get("disturbances", []))
+    found = _checksums(metadata[_KEY].decode(), size, first, places, _stacked(table, named["states"]), np.nan_to_num(U))
+    if (first + len(table)) % size and first + len(table) < rows:  # the last block is not whole
+        found.pop()
+    begin = -(-first // size)
+    written = check["crc32"][begin : begin + len(found)] if first + len(table) < rows else check["crc32"][begin:]
+    if found != written:
+        raise ValueError("its numbers are not those that were written; take another copy")
 
 
 def described(path: Path) -> bool:
@@ -57,7 +94,7 @@ def described(path: Path) -> bool:
     LogError
         It is no .parquet file.
     """
-    return _KEY in (_schema(path).metadata or {})
+    return any(key in (_schema(path).metadata or {}) for key in (_KEY, _CHECK))
 
 
 def names(path: Path) -> list[str]:
@@ -93,6 +130,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     expected = positions(steps)
     if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
         raise ValueError("rows are missing or out of order")
+    _verify(table, named)
     last = step == steps[episode]
     X = _stacked(table, named["states"])
     return X, _stacked(table, named["inputs"] + named.get("disturbances", []))[~last], steps, about
@@ -126,7 +164,7 @@ class RowGroup(Part):
 
         first, last = self.stretches[0][0], sum(self.stretches[-1])
         try:
-            with pq.ParquetFile(self.file) as held:
+            with pq.ParquetFile(self.file, page_checksum_verification=True) as held:
                 ends = np.cumsum([held.metadata.row_group(i).num_rows for i in range(held.num_row_groups)])
                 groups = np.arange(np.searchsorted(ends, first, "right"), np.searchsorted(ends, last, "right") + 1)
                 table = held.read_row_groups(groups.tolist())
@@ -134,13 +172,14 @@ class RowGroup(Part):
             disturbances = named.get("disturbances", [])
             X, U, W = (_stacked(table, some) for some in (named["states"], named["inputs"], disturbances))
             episode, step = (table[name].to_numpy() for name in ("episode", "step"))
-            before = ends[groups[0] - 1] if groups[0] else 0
+            before = int(ends[groups[0] - 1]) if groups[0] else 0
             found: list[Episode] = []
             for row, steps in self.stretches:
                 a, b = row - before, row - before + steps
                 if np.ptp(episode[a : b + 1]) or (np.diff(step[a : b + 1]) != 1).any():
                     raise ValueError("rows are missing or out of order")
                 found.append(Episode(X=X[a : b + 1], U=U[a:b], W=W[a:b]))
+            _verify(table, named, before, int(ends[-1]))
             episodes = Episodes(found, named["dt"], named["states"], named["inputs"], disturbances)
         except (KeyError, IndexError, TypeError, ValueError, OSError, pa.ArrowException) as error:
             raise LogError(f"{self} holds no episodes that can be read: {error}") from error
@@ -160,7 +199,7 @@ def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[R
 
     counts, lengths = np.zeros(0, dtype=np.intp), list[int]()
     try:
-        with pq.ParquetFile(file) as held:
+        with pq.ParquetFile(file, page_checksum_verification=True) as held:
             if _KEY not in (held.schema_arrow.metadata or {}):
                 return None
             for i in range(held.num_row_groups):
@@ -216,6 +255,9 @@ def _table(path: Path, wanted: list[str] | None = None) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        return pq.read_table(path, columns=wanted)
+        with pq.ParquetFile(path, page_checksum_verification=True) as held:
+            size = held.metadata.num_rows * (held.metadata.num_columns if wanted is None else len(wanted))
+            affordable(8 * size, f"{path}: {size} cells")
+            return held.read(columns=wanted)
     except (pa.ArrowException, OSError) as error:
         raise LogError(f"{path} holds no episodes that can be read: its columns are damaged; {ADVICE}") from error

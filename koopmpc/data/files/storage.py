@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from koopmpc import checks
+from koopmpc import disk
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature, joined
 from koopmpc.data.files import csv, parquet
 from koopmpc.data.files.parquet import RowGroup, row_groups
@@ -37,7 +37,7 @@ def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     about = json.dumps({"dt": episodes.dt, **names})
     if suffix in _WRITERS:
         parquet.check_names(driven.states + driven.inputs, suffix)
-    with checks.writing(file) as stream:
+    with disk.writing(file) as stream:
         if suffix in _WRITERS:
             _WRITERS[suffix](stream, X, U, steps, driven.states + driven.inputs, about)
         else:
@@ -98,7 +98,7 @@ def load_episodes(
 
 def _read(file: Path, told: Told) -> Episodes:
     suffix = _suffix(file, (".npz", *_WRITERS, *_READERS))
-    checks.existing(file, ADVICE)
+    disk.existing(file, ADVICE)
     about = csv.described(file) if suffix == ".csv" else None
     if suffix == ".csv" and about is None:
         names, held = csv.columns(file)
@@ -132,8 +132,9 @@ def _own(file: Path, suffix: str, about: str | None) -> tuple[np.ndarray, np.nda
         return csv.read(file, about)
     if suffix == ".parquet":
         return parquet.read(file)
-    held = checks.read_arrays(file, ("X", "U", "steps", "about"))
-    return held["X"], held["U"], held["steps"], str(held["about"])
+    with disk.Members(file) as held:
+        held.require("X", "U", "steps", "about")
+        return held["X"], held["U"], held["steps"], str(held["about"])
 
 
 def _suffix(file: Path, known: Sequence[str]) -> str:

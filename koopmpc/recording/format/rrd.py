@@ -4,8 +4,7 @@
 import json
 import struct
 import tempfile
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,11 @@ from zlib import crc32
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc import disk
 from koopmpc.errors import LogError
 from koopmpc.loop.run import Plans, Run, Step, StepRows
+from koopmpc.recording.format.apart import Column, read, read_apart
+from koopmpc.recording.format.logfile import intact
 
 _MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
 _FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
@@ -29,19 +30,12 @@ class LogColumns:
     `torn` says that the file ends within a message.
     """
 
-    def __init__(self, chunks: Any, entities: tuple[str, ...], torn: bool) -> None:
+    def __init__(self, columns: Iterable[Column], entities: tuple[str, ...], torn: bool) -> None:
         self._entities, self.torn = entities, torn
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
-        for chunk in chunks:
-            if not chunk.is_static and "step" not in chunk.timeline_names:
-                continue  # not written by koopmpc
-            batch = chunk.to_record_batch()
-            k = None if chunk.is_static else batch.column("step").to_numpy(zero_copy_only=False).astype(np.int64)
-            for name in batch.schema.names:
-                metadata = batch.schema.field(name).metadata or {}
-                if metadata.get(b"rerun:kind") == b"data":
-                    key = (chunk.entity_path, name.split(":")[-1])
-                    self._parts.setdefault(key, []).append((k, batch.column(name)))
+        for entity, component, k, values in columns:
+            steps = None if k is None else k.to_numpy(zero_copy_only=False).astype(np.int64)
+            self._parts.setdefault((entity, component), []).append((steps, values))
 
     def static(self, entity: str, component: str) -> Any:
         """Return the one value that does not change, or None."""
@@ -86,7 +80,16 @@ class LogColumns:
     def changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
         sums: dict[str, int] = json.loads(self.static("/metrics", "sums"))
-        return [key for key, total in sums.items() if (data := self._data(key)) is not None and crc32(data) != total]
+        places: dict[str, int] = json.loads(self.static("/metrics", "places") or "{}")  # logs of before have none
+        bad = [key for key, total in sums.items() if (data := self._data(key)) is not None and crc32(data) != total]
+        return bad + [key for key, total in places.items() if key not in bad and self._steps(key) not in (None, total)]
+
+    def _steps(self, key: str) -> int | None:
+        """Return the checksum of the steps of a column; None for an entity that is not read."""
+        entity, component = key.split(":")
+        if entity not in self._entities:
+            return None
+        return crc32(np.ascontiguousarray(self.rows(entity, component)[0], dtype=np.int64).data)
 
     def _data(self, key: str) -> Any:
         """Return the bytes of a column for its checksum; None for an entity that is not read."""
@@ -115,14 +118,12 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
     LogError
         The file is missing, no .rrd, or damaged beyond a torn end.
     """
-    from rerun.chunk import RrdReader
-
     check_log(path)
     try:
-        with _whole_messages(path) as (whole, torn), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # load_run itself warns of a missing end
-            chunks = RrdReader(whole).stream().filter(content=list(entities)).to_chunks()
-            return LogColumns(chunks, entities, torn)
+        if intact(path):
+            return LogColumns(read(path, entities), entities, torn=False)
+        with _whole_messages(path) as (whole, torn):
+            return LogColumns(read_apart(whole, entities, path), entities, torn)
     except LogError:
         raise
     except Exception as error:  # Rerun's reader raises exceptions of many kinds
@@ -138,7 +139,7 @@ def check_log(path: Path) -> None:
         The file is missing, a folder, cannot be opened, or is no .rrd.
     """
     try:
-        with checks.existing(path, "pass the .rrd of a run").open("rb") as file:
+        with disk.existing(path, "pass the .rrd of a run").open("rb") as file:
             start = file.read(len(_MAGIC))
     except LogError:
         raise

@@ -4,13 +4,13 @@
 import json
 import uuid
 import zlib
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from koopmpc import checks
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
@@ -24,6 +24,7 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
+from koopmpc.recording.format.logfile import CHECK, LogFile
 from koopmpc.recording.format.rrd import LogBlock, blocks
 from koopmpc.recording.views.blueprint import blueprint, input_limits, styles
 from koopmpc.recording.views.eigenvalues import draw_eigenvalues
@@ -34,8 +35,9 @@ _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
 PATIENCE = 10.0  # longest wait for a file that is written at once [s]
 
 
-def file_recording(path: str | Path, application: str, layout: Any) -> Any:
-    """Return a recording that writes to `path`, whose folders are made.
+@contextmanager
+def file_recording(path: str | Path, application: str, layout: Any) -> Generator[Any]:
+    """Yield a recording that is written beside `path`, and takes its place at the end of the block.
 
     Raises
     ------
@@ -44,10 +46,18 @@ def file_recording(path: str | Path, application: str, layout: Any) -> Any:
     """
     import rerun as rr
 
-    _require_writable(path)
+    file = LogFile(path)
     rec = rr.RecordingStream(application, recording_id=uuid.uuid4())
-    rec.set_sinks(rr.FileSink(str(path)), default_blueprint=layout)
-    return rec
+    try:
+        file.attach(rec, default_blueprint=layout)
+        yield rec
+        rec.flush(timeout_sec=PATIENCE)
+        rec.disconnect()
+        file.close()
+    except BaseException:
+        rec.disconnect()
+        file.discard()
+        raise
 
 
 def times(k: np.ndarray, dt: float) -> list[Any]:
@@ -56,12 +66,6 @@ def times(k: np.ndarray, dt: float) -> list[Any]:
 
     nanoseconds = np.rint(k * dt * 1e9).astype("timedelta64[ns]")
     return [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)]
-
-
-def _require_writable(path: str | Path) -> None:
-    """Make the folders of `path` and open it once, because Rerun reports no path that it cannot write."""
-    with checks.writing(path, "ab"):
-        pass
 
 
 class Writer:
@@ -80,23 +84,27 @@ class Writer:
         scene: Scene | None = None,
         model: Predictor | None = None,
         steps: int | None = None,
+        growing: bool = False,
     ) -> None:
-        """Check that `about` can be saved and `path` be written; `viewer` is the address of a viewer that is up."""
+        """Check that `about` can be saved and open `path`; `viewer` is the address of a viewer that is up.
+
+        A `growing` log is there while it is written, any other takes its place at the end.
+        """
         import rerun as rr
 
         self._about, self._scene, self._model = about, scene, model
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
-        self._path, self._viewer = path, viewer
+        self._viewer = viewer
         self._rec = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
         self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
         self._extent, self._shown = Extent(), Extent().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
+        self._places: dict[str, int] = {}  # a checksum of the steps of its rows
         self._u: np.ndarray | None = None
         self._names = Names()
-        if path is not None:
-            _require_writable(path)
+        self._file = None if path is None else LogFile(path, growing=growing)
 
     def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""
@@ -138,7 +146,7 @@ class Writer:
                 "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
             )
             scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
-            self._sum("/solver/time_ms:seconds", np.ascontiguousarray(rows.solve_time).data)
+            self._sum("/solver/time_ms:seconds", np.ascontiguousarray(rows.solve_time).data, k[:m])
             self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
             self._rec.send_columns("solver/time_ms", times(k[:m], self._about.dt), [*scalars, *exact])
             self._statuses(rows)
@@ -146,8 +154,10 @@ class Writer:
         self._vectors("state", k, rows.X)
 
     def flush(self) -> None:
-        """Wait until the sinks have what was written."""
+        """Wait until the sinks have what was written; raise where the disk has refused it."""
         self._rec.flush(timeout_sec=_FLUSH)
+        if self._file is not None:
+            self._file.check()
 
     def end(self, run: Run | None) -> None:
         """Write the metrics of the whole `run` and close; the log says from now on that it is complete."""
@@ -167,20 +177,31 @@ class Writer:
         if not self._opened:
             self._open()
         document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log("metrics", document, rr.AnyValues(sums=json.dumps(self._sums), **numbers), static=True)
+        numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
+        self._rec.log("metrics", document, rr.AnyValues(**numbers), static=True)
         if self._extent.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
         self.flush()
         self._rec.disconnect()
+        if self._file is not None:
+            self._file.close()
+
+    def discard(self) -> None:
+        """Close without an end: of a growing log what was written stays, any other file is removed."""
+        self._rec.disconnect()
+        if self._file is not None:
+            self._file.discard()
 
     def _open(self) -> None:
         """Open the sinks, once the first drawings say how large the animation is, and write what is static."""
         import rerun as rr
 
         self._opened = True
-        sinks: list[Any] = [] if self._path is None else [rr.FileSink(self._path)]
-        sinks += [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
-        self._rec.set_sinks(*sinks)
+        sinks = [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
+        if self._file is None:
+            self._rec.set_sinks(*sinks)
+        else:
+            self._file.attach(self._rec, *sinks)
         self._rec.send_recording_name(drawable(title_of(self._about)))
         self._sum("/description:json", self._json.encode())
         text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
@@ -204,13 +225,19 @@ class Writer:
             return
         width = values[0].size
         columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(len(k), width))
-        self._sum(f"/{entity}:scalars", np.ascontiguousarray(values).data)
+        self._sum(f"/{entity}:scalars", np.ascontiguousarray(values).data, k)
         if values.ndim > 2:
+            if entity not in self._styled:
+                self._sum(f"/{entity}:last_width", np.array([values.shape[-1]], dtype=np.int64).data)
             self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
         self._rec.send_columns(entity, times(k, self._about.dt), columns)
 
-    def _sum(self, column: str, data: Any) -> None:
+    def _sum(self, column: str, data: Any, k: np.ndarray | None = None) -> None:
+        """Take data of a column, and the steps k of its rows, into their checksums."""
         self._sums[column] = zlib.crc32(data, self._sums.get(column, 0))
+        if k is not None:
+            steps = np.ascontiguousarray(k, dtype=np.int64)
+            self._places[column] = zlib.crc32(steps.data, self._places.get(column, 0))
 
     def _style(self, entity: str, style: Any) -> None:
         """Log a static archetype of the entity, once."""
@@ -227,7 +254,7 @@ class Writer:
         self._status = pairs[-1]
         if changed:
             words = [_word(*pairs[i]) for i in changed]
-            self._sum("/solver/status:state", "".join(words).encode())
+            self._sum("/solver/status:state", "".join(words).encode(), rows.k + np.array(changed))
             at = times(rows.k + np.array(changed), self._about.dt)
             self._rec.send_columns("solver/status", at, rr.StateChange.columns(state=words))
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]

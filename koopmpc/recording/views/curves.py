@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError
 from koopmpc.recording.description import drawable
-from koopmpc.recording.format.writer import PATIENCE, file_recording, times
+from koopmpc.recording.format.writer import file_recording, times
 from koopmpc.recording.views.blueprint import color, framed
 
 
@@ -71,19 +71,17 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
     if twice is not None:
         raise DataError(f"two tabs are called {twice!r}; name each by a title of its own")
     tables = [_tables(tab) for tab in tabs]
-    rec = file_recording(path, application, _blueprint(tabs, slugs))
-    rec.log("page", rr.TextDocument(drawable(page), media_type="text/markdown"), static=True)
-    for tab, slug, curves in zip(tabs, slugs, tables, strict=True):
-        for j, column in enumerate(tab.columns):
-            for i, (name, X) in enumerate(curves.items()):
-                k = np.flatnonzero(np.isfinite(X[:, j]))
-                if not len(k):
-                    continue  # the viewer crashes on a timeline without rows
-                entity = f"{slug}/{_slug(column)}/{i}_{_slug(name)}"  # drawn in this order: the truth below
-                rec.log(entity, rr.SeriesLines(names=drawable(name), colors=color(i), widths=2.0), static=True)
-                rec.send_columns(entity, times(k, tab.dt), rr.Scalars.columns(scalars=X[k, j]))
-    rec.flush(timeout_sec=PATIENCE)
-    rec.disconnect()
+    with file_recording(path, application, _blueprint(tabs, slugs)) as rec:
+        rec.log("page", rr.TextDocument(drawable(page), media_type="text/markdown"), static=True)
+        for tab, slug, curves in zip(tabs, slugs, tables, strict=True):
+            for j, column in enumerate(tab.columns):
+                for i, (name, X) in enumerate(curves.items()):
+                    k = np.flatnonzero(np.isfinite(X[:, j]))
+                    if not len(k):
+                        continue  # the viewer crashes on a timeline without rows
+                    entity = f"{slug}/{_slug(column)}/{i}_{_slug(name)}"  # drawn in this order: the truth below
+                    rec.log(entity, rr.SeriesLines(names=drawable(name), colors=color(i), widths=2.0), static=True)
+                    rec.send_columns(entity, times(k, tab.dt), rr.Scalars.columns(scalars=X[k, j]))
 
 
 def _tables(tab: Curves) -> dict[str, np.ndarray]:

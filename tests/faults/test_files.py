@@ -1,0 +1,203 @@
+"""Saves are whole or not there: full disks, interrupts and flipped bits lose no file and change none in silence."""
+
+import random
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc import disk
+from tests.faults.damage import READERS, WRITERS, episodes, model, recorded, room_for
+from tests.recording.runs import make_run
+
+UNCHANGED = b"what was there before"
+
+
+def left(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("count", [2, pytest.param(30, marks=pytest.mark.slow)])
+def test_a_full_disk_leaves_the_old_file_and_one_sentence(tmp_path: Path, name: str, count: int) -> None:
+    WRITERS[name](tmp_path / name)
+    size, rng = (tmp_path / name).stat().st_size, random.Random(name)
+    (tmp_path / name).write_bytes(UNCHANGED)
+    for _ in range(count):
+        with room_for(rng.randrange(size)), pytest.raises(km.errors.FullDiskError) as caught:
+            WRITERS[name](tmp_path / name)
+        said = str(caught.value)
+        assert said.startswith(f"{tmp_path / name} cannot be written: File too large; the file that was there is as it")
+        assert "\n" not in said
+        assert (tmp_path / name).read_bytes() == UNCHANGED
+        assert left(tmp_path) == [name]
+    (tmp_path / name).unlink()
+    with room_for(size // 2), pytest.raises(km.errors.FullDiskError, match="too large; make room, or pass another"):
+        WRITERS[name](tmp_path / name)
+    assert left(tmp_path) == []
+
+
+def test_a_log_that_grows_is_kept_as_far_as_the_disk_took_it(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    recorded(path)
+    whole = path.read_bytes()
+    with room_for(len(whole) * 3 // 4), pytest.warns(UserWarning, match="run.rrd is not complete: .* File too large"):
+        recorded(path)
+    assert path.read_bytes() == whole  # a run that was recorded before is as it was
+    assert left(tmp_path) == ["run.rrd", "run.rrd.part"]
+    assert 0 < (tmp_path / "run.rrd.part").stat().st_size <= len(whole) * 3 // 4
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_interrupt_in_a_save_leaves_the_old_file(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / name).write_bytes(UNCHANGED)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(disk, "settle", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        WRITERS[name](tmp_path / name)
+    assert (tmp_path / name).read_bytes() == UNCHANGED
+    assert left(tmp_path) == [name]
+
+
+def test_a_save_keeps_links_permissions_and_read_only_files(tmp_path: Path) -> None:
+    file, link = tmp_path / "data.csv", tmp_path / "link.csv"
+    file.write_bytes(UNCHANGED)
+    file.chmod(0o640)
+    link.symlink_to(file)
+    episodes().save(link)
+    assert link.is_symlink()
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert km.load_episodes(file) == episodes()
+    with disk.writing("/dev/null") as stream:
+        stream.write(b"x")
+    assert Path("/dev/null").is_char_device()
+
+
+def flipped(data: bytes, rng: random.Random) -> bytes:
+    """Return the bytes with one bit changed."""
+    bad, bit = bytearray(data), rng.randrange(8 * len(data))
+    bad[bit // 8] ^= 1 << bit % 8
+    return bytes(bad)
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_no_flipped_bit_is_read_as_other_data(tmp_path: Path, name: str, count: int) -> None:
+    written, read = READERS[name][0](), READERS[name][1]
+    path, bad = tmp_path / name, tmp_path / f"bad {name}"
+    WRITERS[name](path)
+    data, rng, refused = path.read_bytes(), random.Random(count), 0
+    for _ in range(count if name != "run.rrd" else count // 20):  # a second each: they are read in a child process
+        bad.write_bytes(flipped(data, rng))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                found = read(bad)
+            except km.errors.LogError as error:
+                assert str(bad) in str(error)
+                refused += 1
+                continue
+        assert found == written or caught
+    assert refused > 0
+
+
+def test_the_metadata_of_a_table_are_covered_too(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    episodes().save(path)
+    text = path.read_text()
+    assert text.startswith("# koopmpc.episodes rows=126 crc32=")
+    for old, new in (
+        ('"dt": 0.1', '"dt": 0.3'),
+        ("v [m/s]", "w [m/s]"),
+        ("# koopmpc", "# koopmpb"),
+        ("rows=", "rowr="),
+    ):
+        assert old in text
+        path.write_text(text.replace(old, new))
+        with pytest.raises(km.errors.LogError):
+            km.load_episodes(path)
+
+
+def test_every_page_of_a_parquet_file_has_a_checksum(tmp_path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    episodes(steps=2000).save(tmp_path / "data.parquet")
+    data = bytearray((tmp_path / "data.parquet").read_bytes())
+    held = pq.ParquetFile(tmp_path / "data.parquet").metadata.row_group(0).column(3)
+    data[held.data_page_offset + held.total_compressed_size - 5] ^= 4
+    (tmp_path / "data.parquet").write_bytes(data)
+    with pytest.raises(OSError, match="CRC"):
+        pq.read_table(tmp_path / "data.parquet", page_checksum_verification=True)
+    with pytest.raises(km.errors.LogError, match="columns are damaged"):
+        km.load_episodes(tmp_path / "data.parquet")
+
+
+def rezipped(path: Path, **members: bytes) -> None:
+    """Write the members into the .npz file, instead of its own or beside them."""
+    with zipfile.ZipFile(path) as held:
+        kept = {info.filename: held.read(info) for info in held.infolist()}
+    kept |= {f"{name}.npy": data for name, data in members.items()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as made:
+        for name, data in kept.items():
+            made.writestr(name, data)
+
+
+def header(shape: tuple[int, ...]) -> bytes:
+    """Return the head of a .npy file of this shape."""
+    from io import BytesIO
+
+    stream = BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def test_a_claimed_size_is_checked_before_it_is_allocated(tmp_path: Path) -> None:
+    path = tmp_path / "data.npz"
+    episodes().save(path)
+    rezipped(path, X=header((10**12, 3)) + bytes(24))
+    with pytest.raises(km.errors.LogError, match="it is damaged, or holds something other than arrays of numbers"):
+        km.load_episodes(path)
+
+
+def test_what_does_not_fit_into_memory_is_refused_with_the_number(tmp_path: Path, monkeypatch) -> None:
+    episodes().save(tmp_path / "data.npz")
+    episodes().save(tmp_path / "data.parquet")
+    monkeypatch.setattr(disk, "memory", lambda: 1000)
+    for name in ("data.npz", "data.parquet"):
+        with pytest.raises(km.errors.LogError, match=r"would take .* GB, and 1e-06 GB are free"):
+            km.load_episodes(tmp_path / name)
+
+
+def test_members_that_nobody_needs_are_not_read(tmp_path: Path) -> None:
+    import tracemalloc
+
+    path = tmp_path / "model.npz"
+    model().save(path)
+    rezipped(path, array99=header((25_000_000,)) + bytes(200_000_000))
+    assert path.stat().st_size < 1_000_000
+    tracemalloc.start()
+    assert km.load_model(path) == model()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6
+
+
+def test_a_reader_that_ends_its_process_ends_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A log that is not as it was written is read apart; here the child is killed as an abort would kill it."""
+    from koopmpc.recording.format import apart
+
+    path = tmp_path / "run.rrd"
+    km.record(make_run(T=20), path)
+    path.write_bytes(path.read_bytes()[:-100])
+    crash = tmp_path / "crash.py"
+    crash.write_text("import os\nos.abort()\n")
+    run = apart.subprocess.run
+    monkeypatch.setattr(apart.subprocess, "run", lambda command, **more: run([command[0], str(crash)], **more))
+    with pytest.raises(km.errors.LogError, match=r"run\.rrd is damaged, beyond what can be read"):
+        km.load_run(path)
