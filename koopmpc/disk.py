@@ -174,7 +174,7 @@ class Members(Mapping[str, np.ndarray]):
         """Return the array; ValueError where it is damaged or too large."""
         info = self._infos[name]
         with _told(), self._zip.open(info) as stream:
-            return _array(info, cast("BinaryIO", stream))
+            return _array(info, stream)
 
     def require(self, *names: str) -> None:
         """Raise ValueError where one of these arrays is missing."""
@@ -199,7 +199,7 @@ class _TooLargeError(ValueError):
     """An array does not fit into memory."""
 
 
-def _array(info: ZipInfo, stream: BinaryIO) -> np.ndarray:
+def _array(info: ZipInfo, stream: Any) -> np.ndarray:
     """Read one member: its header, whose size must be that of the member, then the numbers, to the checksum."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
