@@ -8,7 +8,7 @@ import io
 import os
 import secrets
 import stat
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
@@ -137,7 +137,7 @@ class _Stream(io.FileIO):
             raise
 
 
-class Members(Mapping[str, np.ndarray]):
+class Members:
     """The arrays of a .npz file, each read when it is asked for: what nobody needs takes no memory.
 
     A pickle is never opened. Before an array is allocated, its size must be what its member holds, and fit into
@@ -163,12 +163,6 @@ class Members(Mapping[str, np.ndarray]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._zip.close()
-
-    def __len__(self) -> int:
-        return len(self._infos)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._infos)
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the array; ValueError where it is damaged or too large."""

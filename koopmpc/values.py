@@ -13,7 +13,19 @@ from functools import cache
 from importlib import import_module
 from math import copysign
 from types import UnionType
-from typing import Any, ClassVar, Literal, Union, cast, get_args, get_origin, get_type_hints, no_type_check
+from typing import (
+    Any,
+    ClassVar,
+    Literal,
+    Protocol,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    no_type_check,
+    runtime_checkable,
+)
 
 import numpy as np
 from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
@@ -23,6 +35,15 @@ from koopmpc.errors import DataError, LogError
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
+
+
+@runtime_checkable
+class Keyed(Protocol):
+    """Arrays by their key: a dict, or the members of a file, which are read when they are asked for."""
+
+    def __getitem__(self, key: str, /) -> Array: ...
+
+
 _SHOWN, _LONG = 4, 80  # items and characters that a repr shows of a field
 
 ALIASES: dict[str, str] = {"Row": "LeaderboardRow", "Storage": "Dissipation"}
@@ -129,7 +150,7 @@ def to_data(value: Any, arrays: Arrays | None = None) -> Any:
             raise DataError(f"a {type(value).__name__} cannot be saved as data; use numbers, names and arrays")
 
 
-def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Sequence[type[Enum]] = ()) -> Any:
+def from_data(tree: Any, arrays: Keyed | None = None, enums: Sequence[type[Enum]] = ()) -> Any:
     """Build the value that `to_data` wrote; lists come back as tuples.
 
     Raises
@@ -145,7 +166,7 @@ def from_data(tree: Any, arrays: Mapping[str, Array] | None = None, enums: Seque
     kind = node.get("kind")
     try:
         if kind == "array":
-            return _array(node, arrays or {})
+            return _array(node, {} if arrays is None else arrays)
         if kind == "dict":
             return {key: from_data(item, arrays, enums) for key, item in node["items"]}
         for enum in enums:
@@ -256,7 +277,7 @@ def _array_to_data(array: Array, arrays: Arrays | None) -> dict[str, Any]:
     return {"kind": "array", "key": key}
 
 
-def _array(node: dict[str, Any], arrays: Mapping[str, Array]) -> Array:
+def _array(node: dict[str, Any], arrays: Keyed) -> Array:
     held = np.asarray(arrays[node["key"]]) if "key" in node else None
     dtype = np.dtype(node["dtype"]) if held is None else held.dtype
     if dtype.kind not in "fiubc":

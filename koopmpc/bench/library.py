@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from koopmpc import checks
+from koopmpc import disk
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
@@ -81,7 +81,7 @@ def new_problem(name: str | Path) -> Path:
         raise ProblemError(f"{path.stem!r} is no name for a problem; use letters, digits and _, a letter first")
     if path.exists():
         raise ProblemError(f"{path} exists already and is kept as it is; choose another name")
-    with checks.writing(path, "xb") as file:
+    with disk.writing(path) as file:
         file.write((Path(__file__).parent / "template.txt").read_bytes())
     return path
 

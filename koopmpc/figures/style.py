@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, ParamSpec, TypeVar, ca
 
 import numpy as np
 
-from koopmpc import checks, disk
+from koopmpc import disk
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Chosen, indices
 
