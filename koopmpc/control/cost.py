@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.limits import Interval, Limits, Softness
+from koopmpc.control.riccati import root
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.state import State
@@ -276,9 +277,3 @@ def checked(cost: object, limits: object) -> tuple[Cost, Limits]:
     if not isinstance(limits, Limits):
         raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
     return cost, limits
-
-
-def root(Q: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return a matrix S with SᵀS = Q."""
-    values, vectors = np.linalg.eigh(Q)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, StateTracking, root
+from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.problem import LearnedMap
+from koopmpc.control.riccati import root
 from koopmpc.control.terminal_cost import one_step, stationary, tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State

@@ -77,6 +77,7 @@ class RealTimeIteration:
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
+        self._targets: StageTargets | None = None  # those that the routines have
         self._terminal = zeros((nr, nx + nr)), zeros((nx, nx + nr)), zeros(nx + nr)  # columns as rows
         A, B, F = zeros((N, nx, nx)), zeros((N, nu, nx)), zeros((N, nx))
         Q, q, r = zeros((N, nx, nx)), zeros((N, nx)), zeros((N, nu))
@@ -108,14 +109,13 @@ class RealTimeIteration:
         """Whether the iterations run as machine code."""
         return self._linearise.compiled and self._free.compiled
 
-    def track(self, targets: StageTargets) -> None:
-        """Set what is tracked from now on."""
-        self._R[:], self._U_r[:] = targets.R, targets.U
-        for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
-            place[:] = value
-
-    def step(self, x: Float[np.ndarray, " nx"], deadline: float) -> StageStep:
-        """Return the solution of the quadratic program for the measured state x along the plan."""
+    def step(self, x: Float[np.ndarray, " nx"], targets: StageTargets, deadline: float) -> StageStep:
+        """Return the solution of the quadratic program for the measured state x and these targets along the plan."""
+        if targets is not self._targets:
+            self._targets = targets
+            self._R[:], self._U_r[:] = targets.R, targets.U
+            for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
+                place[:] = value
         self._linearise.call()
         np.subtract(self._F, self.X[1:], out=self._c)
         self._c += self.e

@@ -40,6 +40,8 @@ class LearnedMap:
         Entries of x, of the plant's state, of u and of w.
     embedding
         What makes x of the plant's state and its past; None where x is that state.
+    center
+        (ny,) mean of the plant's states over the data that the model was fitted to, None where it is not known.
     """
 
     model: ModelOrMap
@@ -53,17 +55,14 @@ class LearnedMap:
     embedding: Delay | None
     lifting: None = None  # a plan is made of states, and none of them is lifted
     nz: int = field(init=False)  # a plan is made of x
+    center: Float[np.ndarray, " ny"] | None = field(init=False)
 
     def __post_init__(self) -> None:
+        model, center = self.model, None
+        if not isinstance(model, StepMap) and model.scale is not None and model.lifting.constant_index is not None:
+            center = model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
         object.__setattr__(self, "nz", self.nx)
-
-    @property
-    def center(self) -> Float[np.ndarray, " ny"] | None:
-        """The mean of the plant's states over the data that the model was fitted to, None where it is not known."""
-        model = self.model
-        if isinstance(model, StepMap) or model.scale is None or model.lifting.constant_index is None:
-            return None
-        return model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
+        object.__setattr__(self, "center", center)
 
     def updated(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.

@@ -52,6 +52,7 @@ class StagedMPC(MPCBase):
     """An MPC on x⁺ = F(x, u) + E w + d, whose solver works stage by stage; parameters as in `BilinearMPC`."""
 
     _e: Float[np.ndarray, "N nx"]  # e_k = E w_k + d of the step
+    _targets: StageTargets  # of the step
     _warm: bool  # whether the next step starts from the plan of the last one
 
     def __init__(
@@ -176,10 +177,6 @@ class StagedMPC(MPCBase):
     ) -> StagePlan:
         """Return the plan from s on, with v_0 inside `first`."""
 
-    @abstractmethod
-    def _track(self, targets: StageTargets) -> None:
-        """Hand new targets to the solver."""
-
     def _disturb(self) -> bool:
         """Write down e_k = E w_k + d; return whether it is finite."""
         initial = self._initial
@@ -193,7 +190,7 @@ class StagedMPC(MPCBase):
         return True
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
-        """Hand the targets of a reference to the solver where they have changed; return whether it is finite."""
+        """Find the targets of a reference where it has changed; return whether it is finite."""
         key = reference.tobytes()
         if key == self._reference and not self._moved:
             return True
@@ -230,7 +227,7 @@ class StagedMPC(MPCBase):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
-        self._track(self._staged(R[1:], U, end))
+        self._targets = self._staged(R[1:], U, end)
         return True
 
     def _staged(
