@@ -22,7 +22,9 @@ from koopmpc.plants.step_map import StepMap
 
 EACH, FIRST = 12, 10  # iterations from each start of a first step, and of its best plan, at most
 FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
-SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of 1 + its size
+SETTLED = (
+    1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
+)
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -245,7 +247,8 @@ class BilinearMPC(StagedMPC):
                 return (found.status if iteration.gap < NEAR else Status.FAILED), total
             self._enter(*self._trajectory(iteration.X, iteration.U), u_prev)
             status = Status.SOFTENED if iteration.slack else found.status
-            moved = (found.U, iteration.U), (found.X, iteration.X)
+            p = self._problem
+            moved = (found.U / p.input_sizes, iteration.U / p.input_sizes), (found.X / p.sizes, iteration.X / p.sizes)
             if all(np.abs(d).max() <= settled * (1 + np.abs(v).max()) for d, v in moved):
                 break
         return status, total

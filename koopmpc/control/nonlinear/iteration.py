@@ -62,6 +62,7 @@ class RealTimeIteration:
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides, cost, R = sides(problem), plan_cost(problem), weights(problem)
+        self._sizes = problem.sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
         free = unconstrained(sweeps, R)
         interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
@@ -142,7 +143,7 @@ class RealTimeIteration:
         left = self._c.copy()
         left[0] += self._x0 @ self._A[0]  # δx_0 is taken whole
         change = np.maximum(np.abs(found.X).max(axis=0), np.abs(left).max(axis=0))
-        reach = NEAR * change + 1e-9 * (1 + np.abs(X).max(axis=0))
+        reach = NEAR * change + 1e-9 * (self._sizes + np.abs(X).max(axis=0))
         length = 1.0
         while True:
             X_new, U_new = X + length * found.X, U + length * found.U
@@ -163,7 +164,7 @@ class RealTimeIteration:
     @property
     def gap(self) -> float:
         """The largest defect that the last step has left, as a share of the range of its state in the plan."""
-        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (1 + np.abs(self.X[0])))).max())
+        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (self._sizes + np.abs(self.X[0])))).max())
 
     def cost(self) -> float:
         """Return what the plan costs, its breaches of soft limits included."""

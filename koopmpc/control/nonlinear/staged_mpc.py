@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, state_tracking
+from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
@@ -67,9 +67,10 @@ class StagedMPC(MPCBase):
         time_limit: float | None,
     ) -> None:
         self._map = given = learned_map(model)
-        self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx)
+        ranges = {} if isinstance(model, StepMap) else data_ranges(model)
+        self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx, ranges)
         blocks = blocked(moves, horizon)
-        self._problem = staged_problem(given.F, o, blocks)
+        self._problem = staged_problem(given, o, blocks)
         N = sum(blocks)
         super().__init__(
             model.dt,
@@ -253,7 +254,8 @@ class StagedMPC(MPCBase):
             return x, self._problem.inputs, False
         inputs = self._outputs.inputs
         widened = Interval(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
-        conflict = bool((widened.low < low - 1e-9).any() or (widened.high > high + 1e-9).any())
+        reach = 1e-9 * (np.abs(u_prev) + self._problem.input_sizes)
+        conflict = bool((widened.low < low - reach).any() or (widened.high > high + reach).any())
         return np.concatenate([x, u_prev, np.zeros(len(self._problem.soft_rates))]), widened, conflict
 
     def _stages(
