@@ -119,7 +119,7 @@ show(lambda: km.metrics([1, 2]))
         """DataError u_target is 'rest'; pass "equilibrium", "zero", an input or rows of inputs""",
         "DataError solver is 'simplex'; there are 'osqp', 'daqp'",
         "DataError horizon is 2.5; pass a whole number",
-        "ShapeError slack is 5; pass (linear, quadratic), \"auto\", or None for hard limits",
+        'ShapeError slack is 5; pass (linear, quadratic), "auto", or None for hard limits',
         'DataError of is a str, expected a Lifting; for example km.Fourier(1, states="theta")',
         'DataError of is a str, expected a Lifting; for example km.State("theta"), or km.Fourier(1, states="theta")',
         "DataError moves is array([ 1, 19]); pass how many moves there are, or a tuple of the blocks' lengths",
