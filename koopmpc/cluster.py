@@ -25,7 +25,7 @@ _ANY_PORT = "127.0.0.1:0"
 
 
 @dataclass(frozen=True, eq=False)
-class Job(Generic[Task]):
+class QueuedTask(Generic[Task]):
     """A task and its place in the order."""
 
     index: int
@@ -75,8 +75,8 @@ def on_dask(
 ) -> Generator[Result]:
     """Yield the results of a Dask cluster in order; Dask does the tasks of a lost worker again."""
     with _client(scheduler, workers) as client:
-        run, futures = f"koopmpc-{uuid4()}", deque[tuple[Job[Task], Any]]()
-        jobs = (Job(i, task) for i, task in enumerate(tasks))
+        run, futures = f"koopmpc-{uuid4()}", deque[tuple[QueuedTask[Task], Any]]()
+        jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
         try:
             while True:
                 room = AHEAD * max(sum(client.nthreads().values()), 1) - len(futures)
@@ -94,7 +94,7 @@ def on_dask(
                 future.cancel()
 
 
-def _awaited(job: Job[Any], future: Any, client: Any) -> Any:
+def _awaited(job: QueuedTask[Any], future: Any, client: Any) -> Any:
     """Return the result of the future, or raise what it raised; a cluster without any worker is not waited for."""
     from distributed.scheduler import KilledWorker
 

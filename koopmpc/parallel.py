@@ -16,7 +16,7 @@ from multiprocessing.connection import wait
 from typing import Any, cast
 
 from koopmpc import checks
-from koopmpc.cluster import AHEAD, ONE_THREAD, Job, Result, Task, address_of, died, on_dask
+from koopmpc.cluster import AHEAD, ONE_THREAD, QueuedTask, Result, Task, address_of, died, on_dask
 from koopmpc.errors import DataError, KoopmpcError
 
 Progress = Callable[[int, int | None], None]
@@ -95,7 +95,7 @@ class _Pool:
         self.workers = workers
         self._executor = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (function,))
 
-    def submit(self, job: Job[Any]) -> "Future[bytes]":
+    def submit(self, job: QueuedTask[Any]) -> "Future[bytes]":
         """Send the job to the next worker that is free.
 
         Raises
@@ -132,9 +132,9 @@ def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], worker
     A worker that dies breaks the pool, and nobody knows which task it was. The first task that is due is therefore
     done alone, where a death is its own, and the others go to a new pool.
     """
-    jobs = (Job(i, task) for i, task in enumerate(tasks))
+    jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
     pool = _Pool(function, workers)
-    queue: deque[tuple[Job[Task], Future[bytes] | None]] = deque()
+    queue: deque[tuple[QueuedTask[Task], Future[bytes] | None]] = deque()
     try:
         while True:
             queue.extend((job, None) for job in islice(jobs, AHEAD * workers - len(queue)))
@@ -163,7 +163,7 @@ def _is_done(future: "Future[bytes] | None") -> bool:
     return future is not None and future.done() and not future.cancelled() and future.exception() is None
 
 
-def _alone(function: Callable[[Any], Any], job: Job[Any]) -> bytes:
+def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
     """Return the answer of a worker that has nothing else to do.
 
     Raises

@@ -55,8 +55,8 @@ PAPERS = ("snyder",)
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The result of a reproduction: each claim with its verdict, and the paths of the report and of the recording."""
+class Reproduction:
+    """A paper done again: each claim with its verdict, and the paths of the report and of the recording."""
 
     claims: tuple[Claim, ...]
     report: Path
@@ -73,7 +73,7 @@ class Paper:
 
     name: str
     title: str
-    reproduce: Callable[[Path, bool, Callable[[str], None]], Outcome]
+    reproduce: Callable[[Path, bool, Callable[[str], None]], Reproduction]
 
 
 def find_paper(name: str) -> Paper:

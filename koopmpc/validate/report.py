@@ -20,17 +20,17 @@ from koopmpc.validate.regions import Coverage, coverage
 from koopmpc.validate.residuals import eigen_residuals, moments_of, proximity_of
 from koopmpc.validate.scoring import AnyPredictor, score
 from koopmpc.validate.text import labelled, observable, percent, quantity, table, written
-from koopmpc.validate.verdict import Evidence, Finding, findings
+from koopmpc.validate.verdict import CheckResults, Finding, findings
 
 _ORDER = 20  # persistency of excitation is looked at up to this order
 _REGIONS = 3  # empty regions that are named
 
 
 @dataclass(frozen=True, eq=False)
-class TrustReport(Evidence):
+class TrustReport(CheckResults):
     """All checks of a predictor on episodes that it was not fitted to; `print` shows them, the verdict first.
 
-    Its attributes are those of `Evidence`.
+    Its attributes are those of `CheckResults`.
     """
 
     @cached_property

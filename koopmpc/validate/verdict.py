@@ -19,7 +19,7 @@ SMALL = 0.05  # share up to which it need not beat x̂ = x_k
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence(Value):
+class CheckResults(Value):
     """The results of all checks of a predictor on episodes that it was not fitted to.
 
     Attributes
@@ -116,14 +116,14 @@ class Finding(Value):
     do: str
 
 
-def findings(evidence: Evidence) -> tuple[Finding, ...]:
+def findings(evidence: CheckResults) -> tuple[Finding, ...]:
     """Return the findings against the predictor, the gravest first."""
     checks = (_errors, _spectrum, _dictionary, _fit, _inputs, _band, _closed_loop)
     found = [finding for check in checks for finding in check(evidence)]
     return tuple(sorted(found, key=lambda finding: not finding.grave))
 
 
-def _errors(evidence: Evidence) -> list[Finding]:
+def _errors(evidence: CheckResults) -> list[Finding]:
     horizon, steps = evidence.score.horizon, evidence.steps
     if steps == horizon:
         return []
@@ -143,7 +143,7 @@ def _errors(evidence: Evidence) -> list[Finding]:
     return [Finding(True, says, do + shorten)]
 
 
-def _spectrum(evidence: Evidence) -> list[Finding]:
+def _spectrum(evidence: CheckResults) -> list[Finding]:
     of = evidence.residuals
     bad = of.spurious
     if not bad.any():
@@ -162,7 +162,7 @@ def _spectrum(evidence: Evidence) -> list[Finding]:
     return [Finding(False, f"{says}; the worst is {told}", do)]
 
 
-def _dictionary(evidence: Evidence) -> list[Finding]:
+def _dictionary(evidence: CheckResults) -> list[Finding]:
     errors = evidence.invariance.errors
     bad = np.flatnonzero(errors > _INVARIANT)
     if not bad.size:
@@ -184,7 +184,7 @@ def _dictionary(evidence: Evidence) -> list[Finding]:
     ]
 
 
-def _fit(evidence: Evidence) -> list[Finding]:
+def _fit(evidence: CheckResults) -> list[Finding]:
     found: list[Finding] = []
     if evidence.train_score is not None and _overfit(evidence):
         ratio = evidence.score.total / max(evidence.train_score.total, np.finfo(float).tiny)
@@ -203,7 +203,7 @@ def _fit(evidence: Evidence) -> list[Finding]:
     return found
 
 
-def _inputs(evidence: Evidence) -> list[Finding]:
+def _inputs(evidence: CheckResults) -> list[Finding]:
     found: list[Finding] = []
     if evidence.persistency is not None and evidence.persistency.order < min(2, evidence.persistency.asked):
         found.append(
@@ -229,7 +229,7 @@ def _inputs(evidence: Evidence) -> list[Finding]:
     return found
 
 
-def _band(evidence: Evidence) -> list[Finding]:
+def _band(evidence: CheckResults) -> list[Finding]:
     band = evidence.band
     if np.isfinite(band.quantile):
         return []
@@ -245,7 +245,7 @@ def _band(evidence: Evidence) -> list[Finding]:
     ]
 
 
-def _closed_loop(evidence: Evidence) -> list[Finding]:
+def _closed_loop(evidence: CheckResults) -> list[Finding]:
     loop, band = evidence.closed_loop, evidence.band
     if loop is None:
         return []
@@ -261,7 +261,7 @@ def _closed_loop(evidence: Evidence) -> list[Finding]:
     ]
 
 
-def _overfit(evidence: Evidence) -> bool:
+def _overfit(evidence: CheckResults) -> bool:
     train = evidence.train_score
     return train is not None and evidence.score.total > max(_OVERFIT * train.total, 1e-6)
 

@@ -12,7 +12,7 @@ from koopmpc.cli.app import app
 from koopmpc.papers import registry
 from koopmpc.papers.contest import ORACLE, costs
 from koopmpc.papers.reconstruction import percent
-from koopmpc.papers.registry import Claim, Outcome, Paper, Verdict, find_paper, judged
+from koopmpc.papers.registry import Claim, Paper, Reproduction, Verdict, find_paper, judged
 from koopmpc.papers.snyder.control import contest, predictions
 from koopmpc.papers.snyder.settings import SHAKINGS, all_settings
 
@@ -78,7 +78,7 @@ def test_the_command_prints_verdicts_and_paths(tmp_path, monkeypatch):
         assert not quick
         progress("working")
         claims = (Claim("abstract", "it works", Verdict.IN_PART, "half of it"),)
-        return Outcome(claims, folder / "report.md", folder / "x.rrd")
+        return Reproduction(claims, folder / "report.md", folder / "x.rrd")
 
     monkeypatch.setattr(registry, "PAPERS", ("mine",))
     monkeypatch.setattr(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from koopmpc.bench.page import Page
 from koopmpc.papers.reconstruction import Reconstruction, Setting
-from koopmpc.papers.registry import Outcome, Paper
+from koopmpc.papers.registry import Paper, Reproduction
 from koopmpc.papers.snyder import control, report, theory
 from koopmpc.papers.snyder.claims import Fits, of_figures, of_text
 from koopmpc.papers.snyder.settings import OBSERVABLES, SHAKINGS, TASKS, all_settings
@@ -15,7 +15,7 @@ from koopmpc.recording.views.curves import record_curves
 RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine
 
 
-def reproduce(folder: Path, quick: bool, progress: Callable[[str], None]) -> Outcome:
+def reproduce(folder: Path, quick: bool, progress: Callable[[str], None]) -> Reproduction:
     """Write the report, the figures and the recording into `folder`; `quick` shortens what takes long."""
     page = Page(folder, beside="snyder")
     progress("trajectories and their reconstructions")
@@ -51,7 +51,7 @@ def reproduce(folder: Path, quick: bool, progress: Callable[[str], None]) -> Out
     progress("report and recording")
     written, recording = page.write(), folder / "snyder.rrd"
     record_curves(page.curves, recording, application="koopmpc-reproduce-snyder", page=page.words)
-    return Outcome((*said, *shown), written, recording)
+    return Reproduction((*said, *shown), written, recording)
 
 
 def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
