@@ -133,6 +133,7 @@ def fit_data(
             horizon=split.horizon,
             delays=range(PAST + 1),
             bilinear=bilinear,
+            relift=False,  # the report is one of forecasts in z
             workers=workers,
             scheduler=scheduler,
             progress=progress,

@@ -34,6 +34,7 @@ def select(
     ridges: ArrayLike | None = None,
     delays: Sequence[int] = (0, 1, 2),
     bilinear: bool = True,
+    relift: bool = True,
     sample: int = 30_000,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -42,11 +43,11 @@ def select(
 ) -> Selection:
     """Choose the model with min over models of max over folds of the h-step error, h = 1 … horizon, and fit it to all.
 
-    Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon: one-step errors
-    do not choose a model that a controller can look ahead with. An error is relative to the state's standard deviation,
-    so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such model is taken
-    while there is another. The models are ranked by their worst fold, and of all within one standard error of the best
-    the smallest is taken (Breiman et al. 1984).
+    Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon: one-step
+    errors do not choose a model that a controller can look ahead with. An error is relative to the state's standard
+    deviation, so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such
+    model is taken while there is another. The models are ranked by their worst fold, and of all within one standard
+    error of the best the smallest is taken (Breiman et al. 1984).
 
     A source larger than memory is chosen on a sample of it, whole episodes from evenly spread parts; the winner is
     then fitted to all of it, part by part.
@@ -74,6 +75,9 @@ def select(
         Past steps to try in an embedding.
     bilinear
         Try z⁺ = A z + B u + Σ uᵢ Nᵢ z too, where there are inputs and no measured disturbances.
+    relift
+        Judge a bilinear model by forecasts that lift afresh at each step, as BilinearMPC plans, `step_map()` simulates
+        and `score(relift=True)` measures. False: by forecasts in z, as `rollout` predicts and a linear model is judged.
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
@@ -125,7 +129,7 @@ def select(
     first = max(one.delays for one in given)
     ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
     data = folded(held, ahead + first, folds, draw)
-    trials = [Trial(one, data.episodes, data.fold, ahead, first, weights) for one in given]
+    trials = [Trial(one, data.episodes, data.fold, ahead, first, weights, relift=relift) for one in given]
     told = None if progress is None else partial(progress, "candidates")
     results = list(map_tasks(tried, trials, workers=workers, scheduler=scheduler, progress=told))
     # on a grid of decades the one nearest to ε² is the first

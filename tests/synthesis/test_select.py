@@ -75,6 +75,20 @@ def test_inputs_that_multiply_the_state_get_a_bilinear_model_and_the_best_linear
     assert {row.kind for row in only.leaderboard} == {"linear"}
 
 
+def test_a_bilinear_model_is_judged_by_forecasts_that_lift_afresh_as_its_controller_plans():
+    """x⁺ is in the span of the observables and the cubes of x⁺ are not: forecasts in z drift, re-lifted ones are exact."""
+
+    def cubic(x, u):
+        return np.array([0.9 * x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * x[0] ** 3 + 0.4 * u[0] * x[0]])
+
+    data = episodes_of(cubic)
+    found = km.select(data, candidates=[PLAIN + km.Monomials(3)], horizon=15, delays=[0])
+    assert found.best.bilinear
+    assert found.best.worst < 1e-6
+    assert km.score(found.predictor, data, 15, relift=True).total < 1e-6
+    assert km.score(found.predictor, data, 15).total > 1e-3
+
+
 def test_what_is_not_measured_is_found_in_the_past():
     """Of two linear states one is measured: one delay closes the model."""
     found = km.select(episodes_of(linear, keep=1), candidates=[km.State()], horizon=8)
