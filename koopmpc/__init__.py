@@ -34,12 +34,12 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
     from koopmpc.control.linear.linear_mpc import LinearMPC as LinearMPC
     from koopmpc.control.lqr import LQR as LQR
+    from koopmpc.control.lqr import dlqr as dlqr
+    from koopmpc.control.lqr import lqr as lqr
     from koopmpc.control.move import Move as Move
     from koopmpc.control.move import Status as Status
     from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC as BilinearMPC
     from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC as NonlinearMPC
-    from koopmpc.control.riccati import dlqr as dlqr
-    from koopmpc.control.riccati import lqr as lqr
     from koopmpc.data.collect import Uniform as Uniform
     from koopmpc.data.collect import collect as collect
     from koopmpc.data.delay import Delay as Delay

@@ -1,8 +1,8 @@
 """The quadratic Cost that every controller and every metric shares, and what of a model it and the Limits read."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, Literal, TypeAlias, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -10,13 +10,15 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.limits import Interval, Limits, Softness
+from koopmpc.control.limits import Interval, Limits, Softness, half_width, magnitude
+from koopmpc.control.riccati import root
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.state import State
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
+_CONSTANT = 1e-12  # share of the mean square below which a variance is rounding
 Read = TypeVar("Read", np.ndarray, ca.Function)
 
 
@@ -123,6 +125,71 @@ class Cost(Value):
         return R_delta if R_delta.any() else None
 
 
+class Sizes(NamedTuple):
+    """How far each state, input and limited row [x; of(x)] goes, and the scale of the cost: what units mean nothing to.
+
+    A limit is as large as half the width of its two finite ends; else as half the range of the data behind the model;
+    else as the value of its row that costs, by Q, what the sizes of the other rows cost on the mean; else as |limit|;
+    else 1. The same goes for states without a limit, and for inputs by R. The scale of the cost is the most that a
+    tracked output or an input of known size costs in a step.
+    """
+
+    states: Float[np.ndarray, " nx"]
+    inputs: Float[np.ndarray, " nu"]
+    rows: Float[np.ndarray, " n"]
+    scale: float
+
+    @staticmethod
+    def of(
+        cost: Cost, limits: Limits, states: Sequence[str], nu: int, ranges: Mapping[str, float] | None = None
+    ) -> "Sizes":
+        """Return the sizes under a cost and limits; `ranges` are half of those of the data, by name."""
+        if nu == 0:
+            raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
+        tracked = cost.of.bind(states)
+        names = [*states, *(() if limits.of is None else limits.of.bind(states).names)]
+        ends, inputs = limits.ends(len(states), len(names) - len(states)), limits.inputs(nu)
+        (Q, R), known = cost.matrices(tracked.nz, nu), dict(ranges or {})
+        known |= {name: float(half) for name, half in zip(names, half_width(ends), strict=True) if half > 0}
+        weights = dict(zip(tracked.names, Q.diagonal(), strict=True))
+        widths = half_width(inputs)
+        prices = [weights[name] * known[name] ** 2 for name in tracked.names if known.get(name, 0.0) > 0]
+        priced = [price for price in (*prices, *(R.diagonal() * widths**2)) if price > 0]
+        far = {name: float(end) for name, end in zip(names, magnitude(ends), strict=True) if end > 0}
+        if not priced:
+            priced = [weights[name] * end**2 for name, end in far.items() if weights.get(name, 0.0) > 0]
+        scale = max(priced or [*weights.values(), *R.diagonal()]) or 1.0
+        mean = float(np.mean([price for price in prices if price > 0] or [scale]))
+
+        def size(name: str) -> float:
+            if known.get(name, 0.0) > 0:
+                return known[name]
+            return np.sqrt(mean / weights[name]) if weights.get(name, 0.0) > 0 else far.get(name, 1.0)
+
+        rows = np.array([size(name) for name in names])
+        by_cost = np.sqrt(scale / np.where(R.diagonal() > 0, R.diagonal(), scale))
+        return Sizes(rows[: len(states)], np.where(widths > 0, widths, by_cost), rows, float(scale))
+
+
+def data_ranges(model: LinearPredictor | BilinearPredictor) -> dict[str, float]:
+    """Return half the range of the data behind a model by the names of states and observables, if they are known.
+
+    It is √3 standard deviations, those of uniform data, from the triangular factor of the lifted data. What is constant
+    in the data has none.
+    """
+    if model.scale is None:
+        return {}
+    rows = np.vstack([np.eye(model.nz), model.C])
+    seen, constant = model.scale @ rows.T, model.lifting.constant_index
+    squares = np.einsum("ij,ij->j", seen, seen)
+    mean = np.zeros(len(rows)) if constant is None else model.scale[:, constant] @ seen
+    spread = squares - mean**2
+    known = spread > _CONSTANT * squares
+    half = np.sqrt(3 * np.where(known, spread, 0.0))
+    names = [*model.lifting.names, *model.states]
+    return {name: float(value) for name, value in zip(names, half, strict=True) if value > 0}
+
+
 @dataclass(frozen=True)
 class Tracking(Generic[Read]):
     """The weights and limits of a cost and its limits, on what `tracked` and `limited` read from the model's state.
@@ -131,7 +198,7 @@ class Tracking(Generic[Read]):
     `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. R_delta and
     `rates` are None where the change of the inputs is free, and `with_rates` says whether it counts. `hard_rates` are
     those of `SizedLimits`. `given` are the rows of a u_target that is given as numbers, None for one by name. `Q_root`
-    and `R_root` are S with SᵀS = Q and R.
+    and `R_root` are S with SᵀS = Q and R. `sizes` are those of states, inputs, limits and cost.
     """
 
     cost: Cost
@@ -151,6 +218,7 @@ class Tracking(Generic[Read]):
     given: Float[np.ndarray, "T nu"] | None
     Q_root: Float[np.ndarray, "nr nr"]
     R_root: Float[np.ndarray, "nu nu"]
+    sizes: Sizes
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
@@ -168,19 +236,24 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
         A weight or a limit has another size than what it weighs or limits.
     """
     cost, limits = checked(cost, limits)
-    C, G, nx = observed(predictor, cost.of), predictor.C, predictor.nx
+    C, G = observed(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, observed(predictor, limits.of)])
-    sizes = nx, len(G) - nx, predictor.nu
+    sizes = Sizes.of(cost, limits, predictor.states, predictor.nu, data_ranges(predictor))
     return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), sizes)
 
 
 def state_tracking(
-    states: tuple[str, ...], nu: int, cost: Cost, limits: Limits | None, size: int | None = None
+    states: tuple[str, ...],
+    nu: int,
+    cost: Cost,
+    limits: Limits | None,
+    size: int | None = None,
+    ranges: Mapping[str, float] | None = None,
 ) -> StateTracking:
     """Return what `cost` tracks and `limits` bound, as functions of these states.
 
-    The functions take `size` values, the states first; by default the states alone.
+    The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`.
     """
     cost, limits = checked(cost, limits)
     nx = len(states)
@@ -188,7 +261,7 @@ def state_tracking(
     x, of = point[:nx], cost.of.bind(states)
     bound = None if limits.of is None else limits.of.bind(states)
     values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    sizes = nx, 0 if bound is None else bound.nz, nu
+    sizes = Sizes.of(cost, limits, states, nu, ranges)
     return _tracking(
         ca.Function("tracked", [point], [ca.densify(of.symbolic(x))]),
         lambda kept: ca.Function("limited", [point], [ca.densify(values[np.flatnonzero(kept).tolist(), 0])]),
@@ -205,9 +278,9 @@ def _tracking(
     cost: Cost,
     limits: Limits,
     nr: int,
-    sizes: tuple[int, int, int],
+    sizes: Sizes,
 ) -> Tracking[Read]:
-    """Return the weights and limits of nr tracked outputs, `sizes` those of the state, of the observables and of u.
+    """Return the weights and limits of nr tracked outputs.
 
     `limited` makes the map of those outputs that have a limit.
 
@@ -216,12 +289,10 @@ def _tracking(
     DataError
         A row of u_target is outside the limits of the inputs.
     """
-    nu = sizes[2]
-    if nu == 0:
-        raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
+    nx, nu = len(sizes.states), len(sizes.inputs)
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
     Q_root, R_root = root(Q), root(R)
-    sized = limits.sized(*sizes)
+    sized = limits.sized(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
     low, high = sized.inputs
     if rows is not None:
         reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
@@ -250,6 +321,7 @@ def _tracking(
         rows,
         Q_root,
         R_root,
+        sizes,
     )
 
 
@@ -276,9 +348,3 @@ def checked(cost: object, limits: object) -> tuple[Cost, Limits]:
     if not isinstance(limits, Limits):
         raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
     return cost, limits
-
-
-def root(Q: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return a matrix S with SᵀS = Q."""
-    values, vectors = np.linalg.eigh(Q)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

@@ -1,7 +1,7 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,7 +12,8 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Value
 
-SOFTENED = 1e-4  # a slack above this share of 1 + |limit| is reported
+SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
+LINEAR, QUADRATIC = 1e4, 1e2  # default weights of a slack as a share of the size of its limit, by the scale of the cost
 Slack = tuple[ArrayLike, ArrayLike]
 
 
@@ -26,7 +27,7 @@ class Interval(NamedTuple):
 class Softness(NamedTuple):
     """linear ε + quadratic ε² is what a row's violation ε costs; linear = inf is a hard row.
 
-    A violation above its `allowance`, 1e-4 (1 + |limit|), is reported.
+    A violation above its `allowance`, 1e-4 of the limit's size, is reported.
     """
 
     linear: Float[np.ndarray, " n"]
@@ -74,7 +75,8 @@ class Limits(Value):
         (linear, quadratic) weight of the violation ε of state and output limits: linear ε + quadratic ε². A linear
         weight above the largest dual keeps a limit exactly wherever that is possible. Each is a scalar, or has an
         entry for every state where there are x limits, and then for every observable of `of`; a linear weight of
-        inf makes its row hard, None makes all hard.
+        inf makes its row hard, None makes all hard. "auto", the default, weighs ε/size by (1e4, 1e2) times the scale
+        of the cost, so that units mean nothing; see `Sizes` for both.
     du_min, du_max
         Limits of the change of the inputs in one step; du_min is −du_max by default.
     du_slack
@@ -93,7 +95,7 @@ class Limits(Value):
     of: Lifting | None = None
     y_min: ArrayLike | None = None
     y_max: ArrayLike | None = None
-    slack: Slack | None = (1e4, 1e2)
+    slack: Slack | Literal["auto"] | None = "auto"
     du_min: ArrayLike | None = None
     du_max: ArrayLike | None = None
     du_slack: Slack | None = None
@@ -119,8 +121,9 @@ class Limits(Value):
             if value is not None and (sign * value > 0).any():
                 raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
         for name in ("slack", "du_slack"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, _weights(getattr(self, name), name))
+            value = getattr(self, name)
+            if value is not None and not (name == "slack" and isinstance(value, str) and value == "auto"):
+                object.__setattr__(self, name, _weights(cast("Slack", value), name))
 
     def inputs(self, nu: int) -> Interval:
         """Return the box of the inputs."""
@@ -138,11 +141,16 @@ class Limits(Value):
     def rate_softness(self, nu: int) -> Softness:
         """Return how soft the rate limits of each input are."""
         linear, quadratic = _prices(self.du_slack, "du_slack", nu, "one an input")
-        return Softness(linear, quadratic, allowance(self._rates(nu)))
+        box = self._rates(nu)
+        size = np.where(np.isnan(half_width(box)), magnitude(box), half_width(box))
+        return Softness(linear, quadratic, SOFTENED * np.where(size > 0, size, 1.0))
 
-    def sized(self, nx: int, ny: int, nu: int) -> SizedLimits:
-        """Return all limits of a model with `nx` states, `ny` observables `of` (0 without one) and `nu` inputs."""
-        rows, rates, rate_softness = self.rows(nx, ny), self.rates(nu), self.rate_softness(nu)
+    def sized(self, nx: int, ny: int, nu: int, sizes: Float[np.ndarray, " n"], scale: float) -> SizedLimits:
+        """Return all limits of a model with `nx` states, `ny` observables `of` (0 without one) and `nu` inputs.
+
+        `sizes` are those of [x; of(x)], `scale` that of the cost, see `Sizes`.
+        """
+        rows, rates, rate_softness = self.rows(nx, ny, sizes, scale), self.rates(nu), self.rate_softness(nu)
         hard = np.isinf(rate_softness.linear)
         hard_rates = None
         if rates is not None and hard.any():
@@ -157,25 +165,39 @@ class Limits(Value):
         """Return the box of the observables `of`."""
         return _box(self.y_min, self.y_max, "y_min", "y_max", ny)
 
-    def rows(self, nx: int, ny: int) -> LimitRows:
-        """Return the limits of [x; of(x)], those rows alone that have one; ny is 0 without `of`."""
-        (x_low, x_high), (y_low, y_high) = self.states(nx), self.outputs(ny) if ny else _NONE
-        low, high = np.concatenate([x_low, y_low]), np.concatenate([x_high, y_high])
-        mine = np.repeat([_given(self.x_min, self.x_max), _given(self.y_min, self.y_max)], [nx, ny])
-        given = _prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
+    def rows(self, nx: int, ny: int, sizes: Float[np.ndarray, " n"] | None = None, scale: float = 1.0) -> LimitRows:
+        """Return the limits of [x; of(x)], the rows that have one; ny is 0 without `of`, `sizes` are 1 if None."""
+        low, high = self.ends(nx, ny)
+        size = np.ones(nx + ny) if sizes is None else sizes
         linear, quadratic = np.full(nx + ny, np.inf), np.zeros(nx + ny)
-        linear[mine], quadratic[mine] = given
+        if isinstance(self.slack, str):
+            linear, quadratic = LINEAR * scale / size, QUADRATIC * scale / size**2
+        else:
+            mine = np.repeat([_given(self.x_min, self.x_max), _given(self.y_min, self.y_max)], [nx, ny])
+            given = _prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
+            linear[mine], quadratic[mine] = given
         kept = np.isfinite(low) | np.isfinite(high)
-        box = Interval(low[kept], high[kept])
-        return LimitRows(kept, box, Softness(linear[kept], quadratic[kept], allowance(box)))
+        softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
+        return LimitRows(kept, Interval(low[kept], high[kept]), softness)
+
+    def ends(self, nx: int, ny: int) -> Interval:
+        """Return the box of [x; of(x)]; ny is 0 without `of`."""
+        outputs = self.outputs(ny) if ny else Interval(np.zeros(0), np.zeros(0))
+        return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
 
 
-_NONE = Interval(np.zeros(0), np.zeros(0))
+def half_width(box: Interval) -> Float[np.ndarray, " n"]:
+    """Return half the width of limits with two finite ends, NaN where there are fewer, or no width."""
+    low, high = box
+    both = np.isfinite(low) & np.isfinite(high)
+    width = np.where(both, high, 0.0) - np.where(both, low, 0.0)
+    return np.where(width > 0, width / 2, np.nan)
 
 
-def allowance(box: Interval) -> Float[np.ndarray, " n"]:
-    """Return the slack of each row up to which its limit counts as kept: 1e-4 (1 + |limit|)."""
-    return SOFTENED * (1 + np.maximum(*(np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)))
+def magnitude(box: Interval) -> Float[np.ndarray, " n"]:
+    """Return the absolute value of the finite end that is farther from 0; 0 where there is none."""
+    low, high = (np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)
+    return np.maximum(low, high)
 
 
 def beyond(value: Float[np.ndarray, " n"], box: Interval) -> float:
@@ -199,7 +221,8 @@ def _given(low: ArrayLike | None, high: ArrayLike | None) -> bool:
 def _weights(slack: Slack, name: str) -> Slack:
     """Return checked (linear, quadratic), each a float or a vector."""
     if not isinstance(cast(object, slack), tuple | list | np.ndarray) or len(slack) != 2:
-        raise ShapeError(f"{name} is {slack!r}; pass (linear, quadratic), or None for hard limits")
+        known = ' "auto",' if name == "slack" else ""
+        raise ShapeError(f"{name} is {slack!r}; pass (linear, quadratic),{known} or None for hard limits")
     linear = checks.array(slack[0], f"the linear weight of {name}", infinite=True)
     quadratic = checks.array(slack[1], f"the quadratic weight of {name}")
     if linear.ndim > 1 or quadratic.ndim > 1:

@@ -1,8 +1,9 @@
-"""LQR: u = −K ψ(x) + feedforward, clipped to the limits of the inputs and of their rates."""
+"""LQR: the controller u = −K ψ(x) + feedforward inside the limits of the inputs, and the gains of `lqr` and `dlqr`."""
 
 from time import perf_counter
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -13,7 +14,7 @@ from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
@@ -152,3 +153,70 @@ class LQR:
                 u_r = u_r + found.u_disturbance @ e
         w = np.zeros(self.predictor.nw) if w is None else w
         self._feedforward = self._v @ np.concatenate([w, row[0], u_r])
+
+
+def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+    """Minimise ∫ xᵀQx + uᵀRu dt for ẋ = A x + B u: K = R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
+
+    Parameters
+    ----------
+    A, B
+        (nx, nx), (nx, nu).
+    Q, R
+        Weights, Q ⪰ 0, R ≻ 0; a scalar or a vector is a diagonal.
+
+    Raises
+    ------
+    DefinitenessError
+        R is not positive definite, or Q is indefinite.
+    DataError
+        No stabilising solution: (A, B) is not stabilisable, or an imaginary mode is not seen by Q.
+    """
+    A, B, Q, R = _pair(A, B, Q, R, definite=True)
+    try:
+        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise DataError(_UNSTABILISABLE) from error
+    K = np.linalg.solve(R, B.T @ P)
+    _require(float(np.linalg.eigvals(A - B @ K).real.max()) < 0)
+    return Gain(K, P)
+
+
+def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+    """Minimise Σ xᵀQx + uᵀRu for x⁺ = A x + B u: K = (R + BᵀPB)⁻¹BᵀPA, P = Q + AᵀP(A − BK).
+
+    Parameters and errors as in `lqr`. With a Constant observable there is no such solution; `LQR` iterates instead.
+    """
+    A, B, Q, R = _pair(A, B, Q, R, definite=True)
+    try:
+        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise DataError(_UNSTABILISABLE) from error
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    _require(float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1)
+    return Gain(K, P)
+
+
+_UNSTABILISABLE = (
+    "the Riccati equation has no stabilising solution: (A, B) is not stabilisable, or Q does not see a mode on the"
+    " stability boundary; check the pair, or use LQR and KoopmanMPC, which iterate the difference equation"
+)
+
+
+def _require(stable: bool) -> None:
+    if not stable:
+        raise DataError(_UNSTABILISABLE)
+
+
+def _pair(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, *, definite: bool
+) -> tuple[
+    Float[np.ndarray, "nx nx"],
+    Float[np.ndarray, "nx nu"],
+    Float[np.ndarray, "nx nx"],
+    Float[np.ndarray, "nu nu"],
+]:
+    A = checks.array(A, "A", (None, None))
+    A = checks.array(A, "A", (len(A), len(A)))
+    B = checks.array(B, "B", (len(A), None))
+    return A, B, checks.weight(Q, "Q", len(A)), checks.weight(R, "R", B.shape[1], definite=definite)

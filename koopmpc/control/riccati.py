@@ -1,4 +1,4 @@
-"""Riccati: the gains of `lqr` and `dlqr`, and the recursion over a finite horizon."""
+"""Riccati: the recursion over a finite horizon, and the difference equation until its gain rests."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,13 +6,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
-from numpy.typing import ArrayLike
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.lapack import dgesv, dpotrf, dpotrs
 
-from koopmpc import checks
-from koopmpc.errors import DataError, DefinitenessError
+from koopmpc.errors import DefinitenessError
 
 DIGITS, LOST = 1e-9, 1e-6  # what a step may lose of P; by how much of its size P may be indefinite
+SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
+RESTS = 50  # steps for which it must have settled, at most
+LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
+LEAPT = 100.0  # growth of the closed loop over the first steps up to which doubling keeps its digits
 
 
 class Gain(NamedTuple):
@@ -46,48 +48,6 @@ class Law(NamedTuple):
     v: Float[np.ndarray, "N nu nf"]
     P: Float[np.ndarray, "nx nx"]
     p: Float[np.ndarray, "nx nf"]
-
-
-def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
-    """Minimise ∫ xᵀQx + uᵀRu dt for ẋ = A x + B u: K = R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
-
-    Parameters
-    ----------
-    A, B
-        (nx, nx), (nx, nu).
-    Q, R
-        Weights, Q ⪰ 0, R ≻ 0; a scalar or a vector is a diagonal.
-
-    Raises
-    ------
-    DefinitenessError
-        R is not positive definite, or Q is indefinite.
-    DataError
-        No stabilising solution: (A, B) is not stabilisable, or an imaginary mode is not seen by Q.
-    """
-    A, B, Q, R = _pair(A, B, Q, R, definite=True)
-    try:
-        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
-    except np.linalg.LinAlgError as error:
-        raise DataError(_UNSTABILISABLE) from error
-    K = np.linalg.solve(R, B.T @ P)
-    _require(float(np.linalg.eigvals(A - B @ K).real.max()) < 0)
-    return Gain(K, P)
-
-
-def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
-    """Minimise Σ xᵀQx + uᵀRu for x⁺ = A x + B u: K = (R + BᵀPB)⁻¹BᵀPA, P = Q + AᵀP(A − BK).
-
-    Parameters and errors as in `lqr`. With a Constant observable there is no such solution; `LQR` iterates instead.
-    """
-    A, B, Q, R = _pair(A, B, Q, R, definite=True)
-    try:
-        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
-    except np.linalg.LinAlgError as error:
-        raise DataError(_UNSTABILISABLE) from error
-    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    _require(float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1)
-    return Gain(K, P)
 
 
 def recursion(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"]) -> Law:
@@ -160,8 +120,8 @@ def rooted(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[
     nx, nu = stages[0].B.shape
     N = len(stages)
     K, L, v = np.empty((N, nu, nx)), np.empty((N, nu, nu)), np.empty((N, nu, p_N.shape[1]))
-    F, p = _root(P_N), p_N
-    costs = {id(stage): _root(_joint(stage)) for stage in stages}
+    F, p = root(P_N), p_N
+    costs = {id(stage): root(_joint(stage)) for stage in stages}
     for k in range(N - 1, -1, -1):
         A, B, _, _, _, e, q, r = stages[k]
         rows = np.vstack([costs[id(stages[k])], np.hstack([F @ B, F @ A])])
@@ -191,7 +151,7 @@ def _joint(stage: Stage) -> Float[np.ndarray, "n n"]:
     return np.block([[stage.R, M.T], [M, stage.Q]])
 
 
-def _root(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def root(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return F with FᵀF = P ⪰ 0, by the eigenvalues of P on a diagonal of ones; those below 0 are rounding."""
     size = np.sqrt(np.maximum(P.diagonal(), 0.0))
     live = np.where(size > 0, size, 1.0)
@@ -240,26 +200,63 @@ def solved(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> F
     return np.ascontiguousarray(dpotrs(L, right, lower=1)[0])
 
 
-_UNSTABILISABLE = (
-    "the Riccati equation has no stabilising solution: (A, B) is not stabilisable, or Q does not see a mode on the"
-    " stability boundary; check the pair, or use LQR and KoopmanMPC, which iterate the difference equation"
-)
+def leap(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    M: Float[np.ndarray, "nz nu"] | None,
+    most: int,
+) -> tuple[Float[np.ndarray, "nz nz"], int]:
+    """Return P after so many steps of the difference equation, a power of two below `most`, by doubling.
+
+    P = Q + H after n steps, and after 2n with
+        H + ΦᵀH(I + GH)⁻¹Φ,   G + Φ(I + GH)⁻¹GΦᵀ,   Φ(I + GH)⁻¹Φ,
+    from H = P_1 − Q, G = BS⁻¹Bᵀ, Φ = A − BK of the first step: R itself may be singular. It ends where K rests, or
+    before Φ, the closed loop of n steps, is so large that rounding would show.
+
+    Chu, Fan, Lin & Wang, "Structure-preserving algorithms for periodic discrete-time algebraic Riccati equations",
+    Int. J. Control 77, 2004.
+    """
+    K, L, P = step(A, B, Q, R, Q, M)
+    H, G, Phi, taken = P - Q, B @ solved(L, B.T), A - B @ K, 1
+    nz, one = len(A), np.eye(len(A))
+    large = LEAPT * max(1.0, float(abs(Phi).max()))
+    while 2 * taken < most:
+        _, _, both, info = dgesv(one + G @ H, np.hstack([Phi, G]))
+        new = Phi.T @ (H @ both[:, :nz])
+        new = 0.5 * (new + new.T)
+        G_new = Phi @ both[:, nz:] @ Phi.T
+        Phi = Phi @ both[:, :nz]
+        if info or not abs(Phi).max() <= large:
+            break
+        H, G, taken = H + new, G + 0.5 * (G_new + G_new.T), 2 * taken
+        K_last, K = K, gain(A, B, R, Q + H, M)[0]
+        if abs(K - K_last).max() <= SETTLED * abs(K).max():
+            break
+    return Q + H, taken
 
 
-def _require(stable: bool) -> None:
-    if not stable:
-        raise DataError(_UNSTABILISABLE)
-
-
-def _pair(
-    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, *, definite: bool
-) -> tuple[
-    Float[np.ndarray, "nx nx"],
-    Float[np.ndarray, "nx nu"],
-    Float[np.ndarray, "nx nx"],
-    Float[np.ndarray, "nu nu"],
-]:
-    A = checks.array(A, "A", (None, None))
-    A = checks.array(A, "A", (len(A), len(A)))
-    B = checks.array(B, "B", (len(A), None))
-    return A, B, checks.weight(Q, "Q", len(A)), checks.weight(R, "R", B.shape[1], definite=definite)
+def iterate(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    M: Float[np.ndarray, "nz nu"] | None,
+    P: Float[np.ndarray, "nz nz"],
+    most: int,
+) -> tuple[Gain, bool]:
+    """Return the last gain of the iteration from P, and whether P stayed below `LARGEST`."""
+    K = np.zeros((B.shape[1], A.shape[0]))
+    scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
+    rested = 0
+    for _ in range(most):
+        K_next, _, P_next = step(A, B, Q, R, P, M)
+        if not P_next.max() <= LARGEST * scale:  # P ⪰ 0: its largest entry is on its diagonal; False for NaN
+            return Gain(K, P), False
+        moved = abs(K_next - K).max()
+        P, K = P_next, K_next
+        rested = rested + 1 if moved <= SETTLED * abs(K).max() else 0
+        if rested >= min(len(A), RESTS):
+            break
+    return Gain(K, P), True

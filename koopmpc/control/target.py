@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking
-from koopmpc.control.limits import Interval
+from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolver
 from koopmpc.control.solvers.daqp import DAQP
@@ -61,8 +61,8 @@ class Targets:
         alpha = self.nearest(R, e)
         pushed = np.zeros(len(self.rows)) if e is None else self.rows_disturbance @ e
         values = alpha @ self.rows.T
-        slack = margin(values)
         low, high = self.low - pushed, self.high - pushed
+        slack = margin(values, self.low, self.high)
         outside = ((values < low - slack) | (values > high + slack)).any(axis=1)
         for k in np.flatnonzero(outside):
             key = R[k].tobytes() + (b"" if e is None else e.tobytes())
@@ -181,6 +181,8 @@ def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: 
     return np.ascontiguousarray(R[np.minimum(np.arange(first, first + N + 1), len(R) - 1)])
 
 
-def margin(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return by how much a target may stand outside its limits before it is moved: rounding."""
-    return 1e-9 * (1 + np.abs(values))
+def margin(
+    values: Float[np.ndarray, "..."], low: Float[np.ndarray, " nl"], high: Float[np.ndarray, " nl"]
+) -> Float[np.ndarray, "..."]:
+    """Return by how much a target may stand outside its limits before it is moved: 1e-9 of what both are, rounding."""
+    return 1e-9 * (np.abs(values) + magnitude(Interval(low, high)))

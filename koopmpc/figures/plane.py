@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.figures.style import SEQUENTIAL, Width, figure, styled
+from koopmpc.figures.style import CYCLIC, SEQUENTIAL, Width, figure, styled
 from koopmpc.lifting.base import index
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
@@ -232,7 +232,7 @@ def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) ->
         plane.across,
         plane.up,
         phase,
-        cmap="twilight",
+        cmap=CYCLIC,
         vmin=-np.pi,
         vmax=np.pi,
         shading="nearest",

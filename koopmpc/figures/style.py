@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, ParamSpec, TypeVar, cast
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from koopmpc import disk
 from koopmpc.errors import DataError
@@ -32,6 +33,7 @@ TRUTH: dict[str, Any] = {"color": "#000000", "linestyle": "-", "linewidth": 1.4}
 REFERENCE: dict[str, Any] = {"color": "#000000", "linestyle": ":", "linewidth": 1.1}
 LIMIT: dict[str, Any] = {"color": "#8c1d18", "linestyle": (0, (6, 2)), "linewidth": 0.9}
 SEQUENTIAL = "viridis"  # its lightness grows evenly, so it reads in grey
+CYCLIC = "twilight"  # it ends with its first colour, light; its middle is dark
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # colour-blind readers can tell them
 _DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "x")
@@ -138,6 +140,13 @@ def band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = 
     axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0, label=label)
     for edge in (low, high):
         axes.plot(x, edge, color=look["color"], linestyle=look["linestyle"], linewidth=0.6)
+
+
+def shades(values: Float[np.ndarray, "..."], scale: str) -> UInt8[np.ndarray, "... 3"]:
+    """Return the red, green and blue of values from 0 to 1 on a scale, `SEQUENTIAL` or `CYCLIC`."""
+    import matplotlib as mpl
+
+    return np.asarray(mpl.colormaps[scale](np.clip(values, 0.0, 1.0), bytes=True))[..., :3]
 
 
 def legend(made: "Figure", axes: "Iterable[Axes]", columns: int) -> None:

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.riccati import Gain, lqr
+from koopmpc.control.lqr import lqr
+from koopmpc.control.riccati import Gain
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.plants.dynamics import Dynamics, right_side
 from koopmpc.plants.integrators import RK4

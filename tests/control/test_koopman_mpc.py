@@ -47,7 +47,7 @@ def test_loose_limits_give_the_feedback_law(seed, nx, nu, constant):
 CASES = {
     "inputs": km.Limits(-0.6, 0.6),
     "one side": km.Limits(u_max=0.3),
-    "soft": km.Limits(-1, 1, x_min=[-np.inf, -0.4], x_max=[0.5, 0.4]),
+    "soft": km.Limits(-1, 1, x_min=[-np.inf, -0.4], x_max=[0.5, 0.4], slack=(1e4, 1e2)),
     "cheap": km.Limits(-1, 1, x_min=-0.4, x_max=0.4, slack=(0.4, 0.3)),
     "quadratic": km.Limits(-1, 1, x_max=0.3, slack=(0.0, 2.0)),
     "hard": km.Limits(-1.5, 1.5, x_max=[1.0, 0.1], slack=None),
@@ -91,7 +91,7 @@ def test_limits_on_observables_equal_cvxpy():
     of = km.Fourier(1, states="theta")
     H = np.eye(model.nz)[[model.lifting.names.index(name) for name in of.bind(model.states).names]]
     cost = km.Cost(Q=[5, 1], R=0.05)
-    limits = km.Limits(-15, 15, of=of, y_min=[-0.5, -np.inf], y_max=[0.5, np.inf])
+    limits = km.Limits(-15, 15, of=of, y_min=[-0.5, -np.inf], y_max=[0.5, np.inf], slack=(1e4, 1e2))
     mpc = km.KoopmanMPC(model, cost, limits, 10, settings=PRECISE)
     x, reference, seen = np.array([0.3, 0.9]), np.zeros(2), set()
     for _ in range(8):

@@ -1,7 +1,7 @@
 """Random closed loops of BilinearMPC: soft limits of states, references beyond them, models that are wrong."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -85,11 +85,13 @@ def test_a_soft_limit_or_a_reference_beyond_it_is_no_reason_to_fail(models, tria
 @pytest.mark.parametrize("case", ["hang", "aside"])
 @pytest.mark.parametrize("name", ["cart_pole_swing", "pendulum_swing"])
 def test_a_swing_up_on_given_equations_costs_what_nonlinear_mpc_costs(name: str, case: str) -> None:
+    """Under the slack weights (1e4, 1e2): as they change, ipopt ends in plans of 272, 475 or 518 from one start."""
     problem = km.load_problem(name)
+    limits = replace(problem.limits, slack=(1e4, 1e2))
     plant, asked = km.discretize(problem.dynamics, problem.dt, problem.integrator), problem.cases[case]
     cost = []
     for kind in (km.BilinearMPC, km.NonlinearMPC):
-        mpc = kind(plant, problem.cost, problem.limits, problem.horizon)
+        mpc = kind(plant, problem.cost, limits, problem.horizon)
         run = km.simulate(
             plant,
             mpc,
@@ -97,7 +99,7 @@ def test_a_swing_up_on_given_equations_costs_what_nonlinear_mpc_costs(name: str,
             reference=asked.reference,
             steps=asked.steps,
             cost=problem.cost,
-            limits=problem.limits,
+            limits=limits,
         )
         cost.append(km.metrics(run).cost)
     assert cost[0] <= 1.10 * cost[1]

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
 import koopmpc as km
 from koopmpc.figures.plane import eigenfunctions_on, plane_through
 from koopmpc.recording.format.rrd import LogColumns, read_columns
-from koopmpc.recording.views.eigenvalues import circle, sequence
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 from tests.recording.viewing import drawn
 
@@ -80,11 +80,12 @@ def test_eigenvalues_stand_upright_with_their_residuals(log: Path, report: km.va
 def test_pictures_are_the_eigenfunctions_with_the_second_state_upwards(log: Path) -> None:
     plane = plane_through(STATES, (0, 1), DATA, points=181)
     (phi,) = eigenfunctions_on(turning(0.9), 0, plane)
-    for part, shades in (("magnitude", sequence(np.abs(phi))), ("phase", circle(np.angle(phi)))):
+    scaled = {"magnitude": ("viridis", np.abs(phi)), "phase": ("twilight", np.angle(phi) / (2 * np.pi) + 0.5)}
+    for part, (scale, values) in scaled.items():
         entity = f"/eigenfunction/0/{part}/picture"
         (pixels,) = [_read(log, entity).static(entity, "buffer")]
         drawn = np.asarray(pixels, dtype=np.uint8).reshape(181, 181, 3)
-        assert np.array_equal(drawn[::-1], shades)
+        assert np.array_equal(drawn[::-1], mpl.colormaps[scale](values, bytes=True)[..., :3])
         words = _all(log, f"/eigenfunction/0/{part}/axes", "labels")
         assert set(STATES) <= set(words)
 

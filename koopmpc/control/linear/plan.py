@@ -81,8 +81,9 @@ class PlanMap:
             first = np.vstack([first + every @ from_disturbance, moved, moved])
             free = np.full(len(moved), np.inf)
             t_low, t_high = targets.low[checked], targets.high[checked]
-            low = np.concatenate([low, t_low - margin(t_low), -free])
-            high = np.concatenate([high, free, t_high + margin(t_high)])
+            reach = margin(np.zeros_like(t_low), t_low, t_high)
+            low = np.concatenate([low, t_low - reach, -free])
+            high = np.concatenate([high, free, t_high + reach])
         self.planned = nv
         self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
         self.box = Interval(self.low[: self.moves], self.high[: self.moves])

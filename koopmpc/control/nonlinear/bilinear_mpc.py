@@ -13,7 +13,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
-from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
+from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
 from koopmpc.estimate.observer import Estimator
@@ -22,7 +22,9 @@ from koopmpc.plants.step_map import StepMap
 
 EACH, FIRST = 12, 10  # iterations from each start of a first step, and of its best plan, at most
 FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
-SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of 1 + its size
+SETTLED = (
+    1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
+)
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -145,9 +147,6 @@ class BilinearMPC(StagedMPC):
         super().update(model)
         self._iteration.theta[:] = self._map.theta
 
-    def _track(self, targets: StageTargets) -> None:
-        self._iteration.track(targets)
-
     def _solve(
         self,
         s: Float[np.ndarray, " ns"],
@@ -178,8 +177,7 @@ class BilinearMPC(StagedMPC):
         iteration, total, best = self._iteration, 0, (3, 0.0)
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
         for X, U in self._starts(s[: self._map.nx], u_prev):
-            self._enter(X, U, u_prev)
-            ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY)
+            ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY, (X, U))
             total += iterations
             rank = (2, 0.0)
             if ended in GOOD:
@@ -225,17 +223,22 @@ class BilinearMPC(StagedMPC):
         most: int,
         deadline: float,
         settled: float = SETTLED,
+        begin: tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]] | None = None,
     ) -> tuple[Status, int]:
         """Return how the last of at most this many iterations ended, and the solver's iterations of all.
+
+        They begin at these states and inputs, by default at the plan.
 
         They end early at a solution, where no more than a share `settled` of the plan moves, where F is nowhere near
         its linearisation, and at the deadline: then what was found before it is used, and late.
         """
         total, status, iteration = 0, Status.FAILED, self._iteration
+        if begin is not None:
+            self._enter(*begin, u_prev)
         for k in range(most):
             if k and perf_counter() > deadline:
                 break
-            found = iteration.step(s, deadline)
+            found = iteration.step(s, self._targets, deadline)
             total += found.iterations
             if found.status not in GOOD:
                 return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
@@ -244,7 +247,8 @@ class BilinearMPC(StagedMPC):
                 return (found.status if iteration.gap < NEAR else Status.FAILED), total
             self._enter(*self._trajectory(iteration.X, iteration.U), u_prev)
             status = Status.SOFTENED if iteration.slack else found.status
-            moved = (found.U, iteration.U), (found.X, iteration.X)
+            p = self._problem
+            moved = (found.U / p.input_sizes, iteration.U / p.input_sizes), (found.X / p.sizes, iteration.X / p.sizes)
             if all(np.abs(d).max() <= settled * (1 + np.abs(v).max()) for d, v in moved):
                 break
         return status, total

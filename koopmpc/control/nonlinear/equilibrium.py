@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, StateTracking, root
-from koopmpc.control.limits import Interval
-from koopmpc.control.nonlinear.problem import LearnedMap
+from koopmpc.control.cost import Cost, StateTracking
+from koopmpc.control.limits import SOFTENED, Interval
+from koopmpc.control.nonlinear.problem import LearnedMap, point_sizes
+from koopmpc.control.riccati import root
 from koopmpc.control.terminal_cost import one_step, stationary, tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
@@ -23,7 +24,7 @@ RANK = 1e-12  # singular values below this share of the largest are rounding; ip
 CLOSE = 1e-2  # the same where the next control step goes on: the error left is of the square of this share
 _QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
 _NEWTON = 20  # Gauss–Newton steps, at most
-_AT = 1e-6  # share of 1 + |value| within which ipopt ends at a limit that is active
+_AT = 1e-6  # share of a limit's size and value within which ipopt ends at a limit that is active
 _STARTS = 12  # guesses of an equilibrium where the reference is not of the state
 _MISSED = 1e-6  # share of ‖r‖²_Q that a good equilibrium may leave
 _MOST = 10_000  # terminal targets remembered before the memory starts anew
@@ -68,7 +69,8 @@ class Linearisation(NamedTuple):
 class Equilibria:
     """Reference row and disturbance e → Equilibrium: minimises ‖of(x) − r‖²_Q inside all limits.
 
-    Where none is inside all limits, those of the inputs alone count. Of all that hold r it has the least x and u.
+    Where none is inside all limits, those of the inputs alone count. Of all that hold r it has the least x and u, by
+    their sizes.
     """
 
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking) -> None:
@@ -79,12 +81,18 @@ class Equilibria:
         found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
         local = ca.Function("local", [x, u, theta], [ca.densify(each) for each in found])
         self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local)
-        least = 1e-8 * max(float(np.trace(o.Q)), 1e-12)
-        r, e = ca.MX.sym("r", len(o.Q)), ca.MX.sym("e", model.nx)
-        f = ca.mtimes([(of - r).T, ca.DM(o.Q), of - r]) + least * (ca.sumsqr(u) + ca.sumsqr(x))
-        nlp = {"x": ca.vertcat(x, u), "p": ca.vertcat(r, theta, e), "f": f, "g": ca.vertcat(F + e - x, g)}
+        self._scale, inputs = o.sizes.scale, o.sizes.inputs
+        self.size = np.concatenate([point_sizes(model, o), inputs])
+        self._limit_size = np.concatenate([inputs, o.softness.allowance / SOFTENED])
+        r, e, s = ca.MX.sym("r", len(o.Q)), ca.MX.sym("e", model.nx), ca.MX.sym("s", model.nx + model.nu)
+        least = 1e-8 * ca.sumsqr(s)  # s, the rows and f are x and u, x and limits, and the cost by their sizes
+        f = ca.mtimes([(of - r).T, ca.DM(o.Q / self._scale), of - r])
+        rows = ca.vertcat((F + e - x) / self.size[: model.nx], g / self._limit_size[model.nu :])
+        raw = ca.Function("raw", [x, u, r, theta, e], [f, rows])
+        scaled = raw(s[: model.nx] * self.size[: model.nx], s[model.nx :] * inputs, r, theta, e)
+        nlp = {"x": s, "p": ca.vertcat(r, theta, e), "f": scaled[0] + least, "g": scaled[1]}
         self._solver = ca.nlpsol("equilibrium", "ipopt", nlp, _QUIET)
-        self._weight, self._small = o.Q_root, np.sqrt(1e-6 * least)
+        self._weight, self._small = o.Q_root / np.sqrt(self._scale), 1e-7
         self._low, self._high = (np.concatenate([o.inputs[i], o.outputs[i]]) for i in (0, 1))
 
     def __reduce__(self) -> tuple[type["Equilibria"], tuple[LearnedMap, Cost, StateTracking]]:
@@ -102,10 +110,11 @@ class Equilibria:
 
     def slope(self, at: Linearisation) -> Float[np.ndarray, "nu nx"]:
         """Return ∂u/∂e of the equilibrium where no limit is active."""
-        gain, free = _inverse(np.hstack([at.A - np.eye(len(at.A)), at.B]))
+        nx, size = len(at.A), self.size
+        gain, free = _inverse(np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None])
         W = self._residuals(at)
         beta = np.linalg.lstsq(W @ free, W @ gain, rcond=None)[0]
-        return (free @ beta - gain)[len(at.A) :]
+        return size[nx:, None] * (free @ beta - gain)[nx:] / size[:nx]
 
     def near(
         self,
@@ -119,18 +128,20 @@ class Equilibria:
         The limits that are active at `begin` are held. A limit that is broken is added, and one whose multiplier has
         the wrong sign is released. The last step is at most `enough` of the size of (x, u).
         """
-        nx, nu = self.model.nx, self.model.nu
-        s, active = np.concatenate([begin.x, begin.u]), begin.active.copy()
+        (nx, nu), size, sizes = (self.model.nx, self.model.nu), self.size, self._limit_size
+        s, active = np.concatenate([begin.x, begin.u]) / size, begin.active.copy()
         limited = np.zeros((len(active), nx + nu))
         limited[:nu, nx:] = np.eye(nu)
+        low, high = self._low / sizes, self._high / sizes
         for _ in range(_NEWTON):
-            at = self.linearise(s[:nx], s[nx:])
-            limited[nu:, :nx] = at.G
-            values = np.concatenate([s[nx:], at.g])
+            x, u = np.split(s * size, [nx])
+            at = self.linearise(x, u)
+            limited[nu:, :nx] = at.G * size[:nx] / sizes[nu:, None]
+            values = np.concatenate([u, at.g]) / sizes
             held = np.flatnonzero(active)
-            ends = np.where(active > 0, self._high, self._low)
-            E = np.vstack([np.hstack([at.A - np.eye(nx), at.B]), limited[held]])
-            missed = np.concatenate([at.F + e - s[:nx], values[held] - ends[held]])
+            ends = np.where(active > 0, high, low)
+            E = np.vstack([np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None], limited[held]])
+            missed = np.concatenate([(at.F + e - x) / size[:nx], values[held] - ends[held]])
             gain, free = _inverse(E)
             W = self._residuals(at)
             left = np.concatenate([self._weight @ (row - at.of), -self._small * s])
@@ -138,20 +149,21 @@ class Equilibria:
             step += free @ np.linalg.lstsq(W @ free, left - W @ step, rcond=None)[0]
             if not np.isfinite(step).all():
                 return None
-            size = 1 + np.abs(s).max()
+            reach = 1 + np.abs(s).max()
             s = s + step
             reached, tolerance = values + limited @ step, 1e-9 * (1 + np.abs(values))
             multipliers = active[held] * (gain.T @ (W.T @ (left - W @ step)))[nx:]  # positive where a limit holds
-            over = np.where(active == 0, np.maximum(reached - self._high, self._low - reached) - tolerance, -np.inf)
+            over = np.where(active == 0, np.maximum(reached - high, low - reached) - tolerance, -np.inf)
             if len(multipliers) and multipliers.min() < -1e-9 * np.abs(multipliers).max():
                 active[held[multipliers.argmin()]] = 0
             elif over.size and over.max() > 0:
                 worst = int(over.argmax())
-                active[worst] = 1 if reached[worst] > self._high[worst] else -1
-            elif np.abs(step).max() <= enough * size:
-                if np.abs(E @ step + missed).max() > SETTLED * size:
+                active[worst] = 1 if reached[worst] > high[worst] else -1
+            elif np.abs(step).max() <= enough * reach:
+                if np.abs(E @ step + missed).max() > SETTLED * reach:
                     return None
-                return Equilibrium(s[:nx], np.clip(s[nx:], *self._outputs.inputs), active)
+                x, u = np.split(s * size, [nx])
+                return Equilibrium(x, np.clip(u, *self._outputs.inputs), active)
         return None
 
     def find(
@@ -168,26 +180,27 @@ class Equilibria:
             weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
             x = row if center is None else np.where(weighed, row, center)
             x = x if model.embedding is None else model.embedding.held(x, u)
+        size, limit_size = self.size, self._limit_size
         guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
         if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
             scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, nx))
             guesses += [np.concatenate([x, u]) for x in scatter]
         unlimited = np.full(len(box.low), np.inf)
-        good = _MISSED * float(row @ self._outputs.Q @ row)
+        good = _MISSED * float(row @ self._outputs.Q @ row) / self._scale
         best = guesses[0]
         for limits in (box, Interval(-unlimited, unlimited)):
             found, least = None, np.inf
             for guess in guesses:
                 bounds = {
-                    "lbx": np.concatenate([np.full(nx, -np.inf), inputs.low]),
-                    "ubx": np.concatenate([np.full(nx, np.inf), inputs.high]),
-                    "lbg": np.concatenate([np.zeros(nx), limits.low]),
-                    "ubg": np.concatenate([np.zeros(nx), limits.high]),
+                    "lbx": np.concatenate([np.full(nx, -np.inf), inputs.low / size[nx:]]),
+                    "ubx": np.concatenate([np.full(nx, np.inf), inputs.high / size[nx:]]),
+                    "lbg": np.concatenate([np.zeros(nx), limits.low / limit_size[model.nu :]]),
+                    "ubg": np.concatenate([np.zeros(nx), limits.high / limit_size[model.nu :]]),
                 }
                 p = np.concatenate([row, model.theta, e])
-                solved = cast("dict[str, Any]", self._solver(p=p, x0=guess, **bounds))
+                solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
                 if self._solver.stats()["success"] and float(solved["f"]) < least:
-                    found, least = solved["x"].full().ravel(), float(solved["f"])
+                    found, least = solved["x"].full().ravel() * size, float(solved["f"])
                 if least <= good:
                     break
             if found is not None:
@@ -195,15 +208,15 @@ class Equilibria:
                 break
         x, u = best[:nx], best[nx:]
         values = np.concatenate([u, self.linearise(x, u).g])
-        reach = _AT * (1 + np.abs(values))
+        reach = _AT * (limit_size + np.abs(values))
         above = (values >= self._high - reach).astype(np.intp)
         return Equilibrium(x, u, np.where(values <= self._low + reach, -1, above))
 
     def _residuals(self, at: Linearisation) -> Float[np.ndarray, "n m"]:
-        """Return the matrix of the residuals on (x, u): those of of(x) first, then (x, u) at next to no weight."""
+        """Return the matrix of the residuals on (x, u) by sizes: of(x) first, then (x, u) at next to no weight."""
         (nr, nx), n = at.J.shape, self.model.nx + self.model.nu
         W = self._small * np.eye(nr + n, n, -nr)
-        W[:nr, :nx] = self._weight @ at.J
+        W[:nr, :nx] = self._weight @ at.J * self.size[:nx]
         return W
 
 
@@ -279,20 +292,27 @@ class TerminalTargets:
             M, L, V = (np.zeros((nx + nr, columns)) for columns in (nr, nx, len(u)))
             M[:nr] = root(checks.weight(self._cost.Q_N, "Q_N", nr))
             return TerminalTarget(found, u, M, L, V, M @ row, slope)
-        J = at.J
-        seen = J.T @ Q @ J
-        back, size = (np.linalg.pinv(each, rcond=1e-9) for each in (J, seen))
-        step = one_step(at.A, at.B, seen, o.R, o.R_delta)
+        (sx, su), scale, weights = np.split(self.equilibria.size, [nx]), o.sizes.scale, Q.diagonal()
+        sr = np.where(weights > 0, np.sqrt(scale / np.where(weights > 0, weights, 1.0)), 1.0)
+        if self.equilibria.of_state:
+            sr = sx[:nr]
+        A, B, J = at.A * sx / sx[:, None], at.B * su / sx[:, None], at.J * sx / sr[:, None]
+        Q_s, R, R_delta = Q * np.outer(sr, sr) / scale, o.R * np.outer(su, su) / scale, o.R_delta
+        if R_delta is not None:
+            R_delta = R_delta * np.outer(su, su) / scale
+        seen = J.T @ Q_s @ J
+        back, inverse = (np.linalg.pinv(each, rcond=1e-9) for each in (J, seen))
+        step = one_step(A, B, seen, R, R_delta)
         P = stationary(step.A, step.B, step.Q, step.R, self._most, step.M).P
         if self._cost.tail:
-            P = tail_of(tail_stage(at.A, at.B, np.eye(nx), J, Q, o.R, o.R_delta), self._cost.tail).P
-        n, S = len(P), root(P)
+            P = tail_of(tail_stage(A, B, np.eye(nx), J, Q_s, R, R_delta), self._cost.tail).P
+        n, S = len(P), np.sqrt(scale) * root(P)
         M, L, V = (np.zeros((n + nr, columns)) for columns in (nr, nx, len(u)))
-        M[:n] = S[:, :nx] @ back
-        L[:n] = S[:, :nx] @ (np.eye(nx) - back @ J)
-        V[:n, : n - nx] = S[:, nx:]
-        mean = float((P[:nx, :nx] * size).sum()) / max(np.linalg.matrix_rank(seen), 1)
-        M[n:] = np.sqrt(max(mean, 1.0)) * o.Q_root @ (np.eye(nr) - J @ back)
+        M[:n] = S[:, :nx] @ back / sr
+        L[:n] = S[:, :nx] @ (np.eye(nx) - back @ J) / sx
+        V[:n, : n - nx] = S[:, nx:] / su
+        mean = float((P[:nx, :nx] * inverse).sum()) / max(np.linalg.matrix_rank(seen), 1)
+        M[n:] = np.sqrt(max(mean, 1.0)) * o.Q_root @ (np.eye(nr) - sr[:, None] * (J @ back) / sr)
         return TerminalTarget(found, u, M, L, V, M @ at.of + L @ found.x + V @ u, slope)
 
 

@@ -62,6 +62,7 @@ class RealTimeIteration:
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides, cost, R = sides(problem), plan_cost(problem), weights(problem)
+        self._sizes = problem.sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
         free = unconstrained(sweeps, R)
         interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
@@ -77,6 +78,7 @@ class RealTimeIteration:
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
+        self._targets: StageTargets | None = None  # those that the routines have
         self._terminal = zeros((nr, nx + nr)), zeros((nx, nx + nr)), zeros(nx + nr)  # columns as rows
         A, B, F = zeros((N, nx, nx)), zeros((N, nu, nx)), zeros((N, nx))
         Q, q, r = zeros((N, nx, nx)), zeros((N, nx)), zeros((N, nu))
@@ -108,14 +110,13 @@ class RealTimeIteration:
         """Whether the iterations run as machine code."""
         return self._linearise.compiled and self._free.compiled
 
-    def track(self, targets: StageTargets) -> None:
-        """Set what is tracked from now on."""
-        self._R[:], self._U_r[:] = targets.R, targets.U
-        for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
-            place[:] = value
-
-    def step(self, x: Float[np.ndarray, " nx"], deadline: float) -> StageStep:
-        """Return the solution of the quadratic program for the measured state x along the plan."""
+    def step(self, x: Float[np.ndarray, " nx"], targets: StageTargets, deadline: float) -> StageStep:
+        """Return the solution of the quadratic program for the measured state x and these targets along the plan."""
+        if targets is not self._targets:
+            self._targets = targets
+            self._R[:], self._U_r[:] = targets.R, targets.U
+            for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
+                place[:] = value
         self._linearise.call()
         np.subtract(self._F, self.X[1:], out=self._c)
         self._c += self.e
@@ -142,7 +143,7 @@ class RealTimeIteration:
         left = self._c.copy()
         left[0] += self._x0 @ self._A[0]  # δx_0 is taken whole
         change = np.maximum(np.abs(found.X).max(axis=0), np.abs(left).max(axis=0))
-        reach = NEAR * change + 1e-9 * (1 + np.abs(X).max(axis=0))
+        reach = NEAR * change + 1e-9 * (self._sizes + np.abs(X).max(axis=0))
         length = 1.0
         while True:
             X_new, U_new = X + length * found.X, U + length * found.U
@@ -163,7 +164,7 @@ class RealTimeIteration:
     @property
     def gap(self) -> float:
         """The largest defect that the last step has left, as a share of the range of its state in the plan."""
-        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (1 + np.abs(self.X[0])))).max())
+        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (self._sizes + np.abs(self.X[0])))).max())
 
     def cost(self) -> float:
         """Return what the plan costs, its breaches of soft limits included."""

@@ -11,7 +11,7 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets
+from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver, Shooting, Start
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
@@ -103,9 +103,6 @@ class NonlinearMPC(StagedMPC):
         super().update(model)
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
 
-    def _track(self, targets: StageTargets) -> None:
-        self._now = targets
-
     def _solve(
         self,
         s: Float[np.ndarray, " ns"],
@@ -114,7 +111,7 @@ class NonlinearMPC(StagedMPC):
         deadline: float,
     ) -> StagePlan:
         starts = [self._next] if self._warm else self._guesses(s[: self._map.nx], u_prev)
-        solved = [self._shooting.solve(s, self._now, self._e, start, first) for start in starts]
+        solved = [self._shooting.solve(s, self._targets, self._e, start, first) for start in starts]
         iterations = sum(found.iterations for found in solved)
         good = [found for found in solved if found.status is Status.OPTIMAL]
         found = min(good, key=lambda each: each.cost) if good else solved[0]

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from koopmpc import checks
 from koopmpc.control.cost import StateTracking
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.limits import SOFTENED, Interval, Softness
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plants.compiled import Buffered
@@ -40,6 +40,8 @@ class LearnedMap:
         Entries of x, of the plant's state, of u and of w.
     embedding
         What makes x of the plant's state and its past; None where x is that state.
+    center
+        (ny,) mean of the plant's states over the data that the model was fitted to, None where it is not known.
     """
 
     model: ModelOrMap
@@ -53,17 +55,14 @@ class LearnedMap:
     embedding: Delay | None
     lifting: None = None  # a plan is made of states, and none of them is lifted
     nz: int = field(init=False)  # a plan is made of x
+    center: Float[np.ndarray, " ny"] | None = field(init=False)
 
     def __post_init__(self) -> None:
+        model, center = self.model, None
+        if not isinstance(model, StepMap) and model.scale is not None and model.lifting.constant_index is not None:
+            center = model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
         object.__setattr__(self, "nz", self.nx)
-
-    @property
-    def center(self) -> Float[np.ndarray, " ny"] | None:
-        """The mean of the plant's states over the data that the model was fitted to, None where it is not known."""
-        model = self.model
-        if isinstance(model, StepMap) or model.scale is None or model.lifting.constant_index is None:
-            return None
-        return model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
+        object.__setattr__(self, "center", center)
 
     def updated(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.
@@ -169,6 +168,8 @@ class StagedProblem(NamedTuple):
         Whether a stage has an input; else v is zero there.
     held_from
         The stage whose input each stage takes.
+    sizes, input_sizes
+        What the entries of s and v are measured by, see `Sizes`.
     """
 
     F: ca.Function
@@ -184,6 +185,8 @@ class StagedProblem(NamedTuple):
     with_rates: bool
     soft_rates: Int[np.ndarray, " nsoft"]
     nx: int
+    sizes: Float[np.ndarray, " ns"]
+    input_sizes: Float[np.ndarray, " nu"]
 
 
 class StageTargets(NamedTuple):
@@ -196,9 +199,10 @@ class StageTargets(NamedTuple):
     m: Float[np.ndarray, " nt"]
 
 
-def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ...]) -> StagedProblem:
-    """Return the problem of a horizon that is cut into blocks of held inputs, F being that of a `LearnedMap`."""
-    o, N = outputs, sum(blocks)
+def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int, ...]) -> StagedProblem:
+    """Return the problem of a horizon that is cut into blocks of held inputs."""
+    o, N, F = outputs, sum(blocks), model.F
+    x_sizes, u_sizes = point_sizes(model, o), o.sizes.inputs
     starts = np.cumsum([0, *blocks[:-1]])
     free = np.zeros(N, dtype=np.bool_)
     free[starts] = True
@@ -207,7 +211,21 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
     if not o.with_rates and len(blocks) == N:
         none = np.zeros(0, dtype=np.intp)
         return StagedProblem(
-            F, o.tracked, o.limited, o.Q, o.R, o.inputs, o.outputs, o.softness, free, held_from, False, none, nx
+            F,
+            o.tracked,
+            o.limited,
+            o.Q,
+            o.R,
+            o.inputs,
+            o.outputs,
+            o.softness,
+            free,
+            held_from,
+            False,
+            none,
+            nx,
+            x_sizes,
+            u_sizes,
         )
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates
@@ -222,7 +240,7 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
     after = ca.Function("F", [sym, v, theta], [ca.vertcat(F(sym[:nx], u, theta), u, v[soft.tolist(), 0])])
     s = ca.SX.sym("s", ns)
     x, last = s[:nx], s[nx : nx + nu]
-    hard = np.full(nu, np.inf), np.zeros(nu), np.zeros(nu)
+    hard = np.full(nu, np.inf), np.zeros(nu), SOFTENED * u_sizes
     return StagedProblem(
         after.expand("F") if F.is_a("SXFunction") else after,
         ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
@@ -237,4 +255,12 @@ def staged_problem(F: ca.Function, outputs: StateTracking, blocks: tuple[int, ..
         True,
         soft,
         ns,
+        np.concatenate([x_sizes, u_sizes, u_sizes[soft]]),
+        u_sizes,
     )
+
+
+def point_sizes(model: LearnedMap, outputs: StateTracking) -> Float[np.ndarray, " nx"]:
+    """Return the sizes of the entries of x, under an embedding those of the state and of its past."""
+    sizes = outputs.sizes
+    return sizes.states if model.embedding is None else model.embedding.held(sizes.states, sizes.inputs)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, state_tracking
+from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
@@ -52,6 +52,7 @@ class StagedMPC(MPCBase):
     """An MPC on x⁺ = F(x, u) + E w + d, whose solver works stage by stage; parameters as in `BilinearMPC`."""
 
     _e: Float[np.ndarray, "N nx"]  # e_k = E w_k + d of the step
+    _targets: StageTargets  # of the step
     _warm: bool  # whether the next step starts from the plan of the last one
 
     def __init__(
@@ -66,9 +67,10 @@ class StagedMPC(MPCBase):
         time_limit: float | None,
     ) -> None:
         self._map = given = learned_map(model)
-        self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx)
+        ranges = {} if isinstance(model, StepMap) else data_ranges(model)
+        self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx, ranges)
         blocks = blocked(moves, horizon)
-        self._problem = staged_problem(given.F, o, blocks)
+        self._problem = staged_problem(given, o, blocks)
         N = sum(blocks)
         super().__init__(
             model.dt,
@@ -176,10 +178,6 @@ class StagedMPC(MPCBase):
     ) -> StagePlan:
         """Return the plan from s on, with v_0 inside `first`."""
 
-    @abstractmethod
-    def _track(self, targets: StageTargets) -> None:
-        """Hand new targets to the solver."""
-
     def _disturb(self) -> bool:
         """Write down e_k = E w_k + d; return whether it is finite."""
         initial = self._initial
@@ -193,7 +191,7 @@ class StagedMPC(MPCBase):
         return True
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
-        """Hand the targets of a reference to the solver where they have changed; return whether it is finite."""
+        """Find the targets of a reference where it has changed; return whether it is finite."""
         key = reference.tobytes()
         if key == self._reference and not self._moved:
             return True
@@ -230,7 +228,7 @@ class StagedMPC(MPCBase):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
-        self._track(self._staged(R[1:], U, end))
+        self._targets = self._staged(R[1:], U, end)
         return True
 
     def _staged(
@@ -256,7 +254,8 @@ class StagedMPC(MPCBase):
             return x, self._problem.inputs, False
         inputs = self._outputs.inputs
         widened = Interval(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
-        conflict = bool((widened.low < low - 1e-9).any() or (widened.high > high + 1e-9).any())
+        reach = 1e-9 * (np.abs(u_prev) + self._problem.input_sizes)
+        conflict = bool((widened.low < low - reach).any() or (widened.high > high + reach).any())
         return np.concatenate([x, u_prev, np.zeros(len(self._problem.soft_rates))]), widened, conflict
 
     def _stages(

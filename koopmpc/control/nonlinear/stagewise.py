@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.control.limits import SOFTENED, Interval, half_width
 from koopmpc.control.nonlinear.problem import StagedProblem
 
 _SHORT = 0.995  # share of the way to the nearest bound
@@ -40,9 +41,9 @@ def sides(problem: StagedProblem) -> Sides:
     low, high = np.concatenate([inputs.low, box.low]), np.concatenate([inputs.high, box.high])
     linear = np.concatenate([np.full(nu, np.inf), problem.softness.linear])
     quadratic = np.concatenate([np.zeros(nu), problem.softness.quadratic])
-    finite = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high, 0.0))
-    with np.errstate(invalid="ignore"):
-        span = np.where(np.isfinite(high - low) & (high > low), high - low, 1 + np.abs(finite))
+    sizes = np.concatenate([problem.input_sizes, problem.softness.allowance / SOFTENED])
+    half = half_width(Interval(low, high))
+    span = 2 * np.where(half > 0, half, sizes)
     ends = [
         (i, sign)
         for soft in (False, True)

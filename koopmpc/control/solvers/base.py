@@ -284,4 +284,6 @@ class StepSolver:
         past = np.where(below, low[rows], 0.0) - np.where(below, lowest, 0.0)
         past += np.where(above, highest, 0.0) - np.where(above, high[rows], 0.0)
         low[rows], high[rows] = lowest, highest
-        return Interval(low, high), float((past / scale)[past > 1e-9].max(initial=0.0))
+        return Interval(low, high), float(
+            (past / scale)[past / scale > 1e-5 * qp.softness.allowance[rows]].max(initial=0.0)
+        )

@@ -207,7 +207,7 @@ class DAQP(QPSolver):
                 weight *= _EASING
                 least = weight
         found.iterations = iterations
-        self._far = found.status is Status.OPTIMAL and 2 * np.count_nonzero(found.y) > len(v)
+        self._far = found.status is Status.OPTIMAL and bool(2 * np.count_nonzero(found.y) > len(v))
         return found
 
     def _eased(self, P: Float[np.ndarray, "n n"], q: Float[np.ndarray, " n"]) -> "DAQP":

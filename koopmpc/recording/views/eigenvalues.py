@@ -5,41 +5,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
 from koopmpc.figures.plane import Plane, eigenfunctions_on
+from koopmpc.figures.style import CYCLIC, SEQUENTIAL, shades
 from koopmpc.predict.base import Predictor
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.views.scenes import BACKGROUND
 from koopmpc.validate.residuals import ResidualDMD
-
-# Anchors at equal steps. Lightness grows evenly along the first scale; the second ends with its first colour.
-_SEQUENCE = np.array(
-    [[68, 1, 84], [71, 45, 123], [59, 82, 139], [44, 114, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
-     [170, 220, 50], [253, 231, 37]], dtype=np.float64,
-)  # fmt: skip
-_CIRCLE = np.array(
-    [[226, 217, 226], [140, 163, 200], [97, 94, 178], [75, 32, 113], [47, 20, 55], [110, 30, 70], [170, 87, 83],
-     [205, 165, 145], [226, 217, 226]], dtype=np.float64,
-)  # fmt: skip
-
-
-def sequence(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "... 3"]:
-    """Return colours of values from 0, dark, to 1, light."""
-    return _between(_SEQUENCE, np.clip(values, 0.0, 1.0))
-
-
-def circle(phases: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "... 3"]:
-    """Return colours of phases [rad]: dark at 0, blue below, red above, light at ±π."""
-    return _between(_CIRCLE, np.clip(phases / (2 * np.pi) + 0.5, 0.0, 1.0))
-
-
-def _between(anchors: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "... 3"]:
-    places = np.linspace(0.0, 1.0, len(anchors))
-    bands: list[np.ndarray] = [np.asarray(np.interp(values, places, anchors[:, i])) for i in range(3)]
-    return np.stack(bands, axis=-1).round().astype(np.uint8)
-
 
 _WIDEST = 3.0  # largest half width of the picture
 _CROWDED = 0.35  # share of the picture below which the eigenvalues get one of their own
@@ -68,7 +41,7 @@ def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> 
         labels = [f"{label}, residual {r:.2g}" for label, r in zip(labels, residuals.residuals, strict=True)]
         share = np.clip(residuals.residuals / residuals.tolerance, _BELOW, _ABOVE)
         level = np.log(share / _BELOW) / np.log(_ABOVE / _BELOW)
-        colors = sequence(_LIGHT * level)
+        colors = shades(_LIGHT * level, SEQUENTIAL)
     drawn = {
         "model/axes": rr.LineStrips2D(axes, radii=rr.Radius.ui_points(0.5), colors=[205, 210, 216], draw_order=1),
         "model/circle": rr.LineStrips2D(
@@ -132,15 +105,16 @@ def draw_eigenfunctions(
             low, high = float(phi.real.min()), float(phi.real.max())
             level = (phi.real - low) / ((high - low) or 1.0)
             title = f"φ{j} from {low:.2g} (dark) to {high:.2g} (light), λ = {value.real:.4g}"
-            pictures.append((f"{entity}/value", title, _picture(f"{entity}/value", sequence(level), plane)))
+            pictures.append((f"{entity}/value", title, _picture(f"{entity}/value", shades(level, SEQUENTIAL), plane)))
             continue
-        shades = {"magnitude": sequence(np.abs(phi)), "phase": circle(np.angle(phi))}
+        turns = np.angle(phi) / (2 * np.pi) + 0.5  # dark at 0, blue below, red above, light at ±π
+        shaded = {"magnitude": shades(np.abs(phi), SEQUENTIAL), "phase": shades(turns, CYCLIC)}
         sign = "+" if value.imag > 0 else "−"
         titles = {
             "magnitude": f"|φ{j}|, 0 (dark) to 1 (light), λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i",
             "phase": f"phase of φ{j}: 0 dark, ±π light, + red, − blue",
         }
-        pictures += [(f"{entity}/{k}", titles[k], _picture(f"{entity}/{k}", shades[k], plane)) for k in shades]
+        pictures += [(f"{entity}/{k}", titles[k], _picture(f"{entity}/{k}", shaded[k], plane)) for k in shaded]
     return pictures
 
 
@@ -157,11 +131,11 @@ def plane_view(entity: str, title: str, plane: Plane) -> Any:
     )
 
 
-def _picture(entity: str, shades: np.ndarray, plane: Plane) -> dict[str, Any]:
+def _picture(entity: str, pixels: np.ndarray, plane: Plane) -> dict[str, Any]:
     """Return the picture, rows from the top down, and its axes in words."""
     import rerun as rr
 
-    m, n = shades.shape[:2]
+    m, n = pixels.shape[:2]
     (x, y), across, up = map(drawable, plane.names), plane.across, plane.up
     words = {
         (0.04 * n, 1.06 * m): f"{across[0]:.3g}",
@@ -172,7 +146,7 @@ def _picture(entity: str, shades: np.ndarray, plane: Plane) -> dict[str, Any]:
         (-0.09 * n, 0.04 * m): f"{up[-1]:.3g}",
     }
     return {
-        f"{entity}/picture": rr.Image(np.ascontiguousarray(shades[::-1])),
+        f"{entity}/picture": rr.Image(np.ascontiguousarray(pixels[::-1])),
         f"{entity}/axes": rr.Points2D(
             list(words), labels=list(words.values()), radii=0.0, colors=_INK, show_labels=True, draw_order=40
         ),
