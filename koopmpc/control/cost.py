@@ -195,10 +195,11 @@ class Tracking(Generic[Read]):
     """The weights and limits of a cost and its limits, on what `tracked` and `limited` read from the model's state.
 
     Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
-    `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. R_delta and
-    `rates` are None where the change of the inputs is free, and `with_rates` says whether it counts. `hard_rates` are
-    those of `SizedLimits`. `given` are the rows of a u_target that is given as numbers, None for one by name. `Q_root`
-    and `R_root` are S with SᵀS = Q and R. `sizes` are those of states, inputs, limits and cost.
+    `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. `margin`
+    moves `outputs` inwards, see `Limits`. R_delta and `rates` are None where the change of the inputs is free, and
+    `with_rates` says whether it counts. `hard_rates` are those of `SizedLimits`. `given` are the rows of a u_target
+    that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are those of
+    states, inputs, limits and cost.
     """
 
     cost: Cost
@@ -214,6 +215,7 @@ class Tracking(Generic[Read]):
     rate_softness: Softness
     outputs: Interval
     softness: Softness
+    margin: Float[np.ndarray, "K ng"]
     with_rates: bool
     given: Float[np.ndarray, "T nu"] | None
     Q_root: Float[np.ndarray, "nr nr"]
@@ -317,6 +319,7 @@ def _tracking(
         sized.rate_softness,
         sized.rows.box,
         sized.rows.softness,
+        sized.rows.margin,
         R_delta is not None or sized.rates is not None,
         rows,
         Q_root,

@@ -1,6 +1,6 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, cast
 
 import numpy as np
@@ -14,6 +14,8 @@ from koopmpc.values import Value
 
 SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
 LINEAR, QUADRATIC = 1e4, 1e2  # default weights of a slack as a share of the size of its limit, by the scale of the cost
+TIGHTEST = 0.2  # share of the range by which a limit is tightened at most
+_AHEAD = 5  # steps of an error band that tighten limits
 Slack = tuple[ArrayLike, ArrayLike]
 
 
@@ -36,11 +38,12 @@ class Softness(NamedTuple):
 
 
 class LimitRows(NamedTuple):
-    """The limited outputs [x; y] that have a limit: which they are, their limits, and how soft each is."""
+    """The limited outputs [x; y] that have a limit: which they are, their limits, how soft each is, and its margins."""
 
     kept: Bool[np.ndarray, " n"]
     box: Interval
     softness: Softness
+    margin: Float[np.ndarray, "K n"]
 
 
 class SizedLimits(NamedTuple):
@@ -81,11 +84,17 @@ class Limits(Value):
         Limits of the change of the inputs in one step; du_min is −du_max by default.
     du_slack
         (linear, quadratic) as in `slack`, a scalar or an entry an input; None, the default, keeps rates hard.
+    margin
+        (K, nx), by how much controllers move both limits of each state inwards: at step k of the horizon by row
+        min(k, K). Metrics count from the limits themselves. `tightened` makes it of a model's errors.
+    capped
+        A sentence for each state for which `tightened` made less margin than the errors ask for.
 
     Raises
     ------
     DataError
-        Crossed limits; rate limits without zero between them; y limits without `of`; a negative slack weight.
+        Crossed limits; rate limits without zero between them; y limits without `of`; a negative slack weight; a
+        negative margin, or one that makes limits cross.
     """
 
     u_min: ArrayLike | None = None
@@ -99,6 +108,8 @@ class Limits(Value):
     du_min: ArrayLike | None = None
     du_max: ArrayLike | None = None
     du_slack: Slack | None = None
+    margin: ArrayLike | None = None
+    capped: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for low, high, name in (
@@ -124,6 +135,64 @@ class Limits(Value):
             value = getattr(self, name)
             if value is not None and not (name == "slack" and isinstance(value, str) and value == "auto"):
                 object.__setattr__(self, name, _weights(cast("Slack", value), name))
+        if self.margin is not None:
+            object.__setattr__(self, "margin", self._margin(checks.array(self.margin, "margin", (None, None))))
+
+    def _margin(self, margin: Float[np.ndarray, "K nx"]) -> Float[np.ndarray, "K nx"]:
+        if (margin < 0).any() or not len(margin):
+            raise DataError(f"margin is {margin.tolist()}; pass rows of numbers of 0 or above, one a step")
+        low, high = self.states(margin.shape[1])
+        most = margin.max(axis=0)
+        crossed = np.flatnonzero(low + most > high - most)
+        if crossed.size:
+            i = crossed[0]
+            raise DataError(
+                f"the limits of state {i} cross once tightened: {low[i]:g} … {high[i]:g} with a margin of {most[i]:g}; "
+                "pass a smaller margin, or a wider range"
+            )
+        return margin
+
+    def tightened(self, band: ArrayLike, most: float = TIGHTEST) -> "Limits":
+        """Return the limits with margins: at step k of the horizon by the error band of min(k, 5) steps.
+
+        A margin is at most `most` of the range between the two limits of its state, and `capped` of the result says
+        where that was less than the errors ask for. Where a state has one limit alone there is no range, and nothing
+        is capped. Observables `of` keep their limits.
+
+        Parameters
+        ----------
+        band
+            (h, nx) half-widths of the error of a forecast 1 … h steps ahead, in the state's unit, such as the `width`
+            of a `km.validate.conformal` band. Rows beyond the fifth are not read: an error further ahead is met by
+            the steps before it, which a controller chooses anew.
+        most
+            Share of the range, below a half.
+
+        Raises
+        ------
+        DataError
+            A band that is negative, NaN, or infinite where nothing caps it; a share that makes limits cross.
+        """
+        rows = checks.array(band, "band", (None, None), infinite=True)[:_AHEAD]
+        share = checks.positive(most, "most")
+        if share >= 0.5:
+            raise DataError(f"most is {share:g}; limits cross once tightened by half of their range: pass less")
+        low, high = self.states(rows.shape[1])
+        limited = np.isfinite(low) | np.isfinite(high)
+        rows = np.where(limited, rows, 0.0)
+        cap = share * (high - low)
+        capped = rows > cap
+        said: list[str] = []
+        for i in np.flatnonzero(capped.any(axis=0)):
+            first = int(capped[:, i].argmax())
+            said.append(
+                f"state {i}: from step {first + 1} on the margin is {cap[i]:.4g}, {100 * share:.3g} % of the range, "
+                f"though the errors ask for up to {rows[:, i].max():.4g}"
+            )
+        rows = np.minimum(rows, cap)
+        if not np.isfinite(rows).all():
+            raise DataError("band is infinite for a state with one limit alone; pass a finite band")
+        return replace(self, margin=rows, capped=tuple(said))
 
     def inputs(self, nu: int) -> Interval:
         """Return the box of the inputs."""
@@ -178,12 +247,21 @@ class Limits(Value):
             linear[mine], quadratic[mine] = given
         kept = np.isfinite(low) | np.isfinite(high)
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
-        return LimitRows(kept, Interval(low[kept], high[kept]), softness)
+        margin = np.zeros((1, nx + ny))
+        if self.margin is not None:
+            given_margin = checks.array(self.margin, "margin", (None, nx))
+            margin = np.hstack([given_margin, np.zeros((len(given_margin), ny))])
+        return LimitRows(kept, Interval(low[kept], high[kept]), softness, margin[:, kept])
 
     def ends(self, nx: int, ny: int) -> Interval:
         """Return the box of [x; of(x)]; ny is 0 without `of`."""
         outputs = self.outputs(ny) if ny else Interval(np.zeros(0), np.zeros(0))
         return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
+
+
+def ahead(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray, "N n"]:
+    """Return the margins of the steps 1 … N."""
+    return margin[np.minimum(np.arange(N), len(margin) - 1)]
 
 
 def half_width(box: Interval) -> Float[np.ndarray, " n"]:

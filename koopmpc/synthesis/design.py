@@ -53,6 +53,7 @@ def design(
     candidates: Sequence[Candidate | Lifting] | None = None,
     delays: Sequence[int] = (0, 1, 2),
     bilinear: bool = True,
+    tighten: bool = True,
     sample: int = 30_000,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -97,6 +98,8 @@ def design(
         Past steps to try in an embedding.
     bilinear
         Try bilinear models too, where there are no measured disturbances; the surrogates are then bilinear.
+    tighten
+        Give every controller limits that are `tightened` by its model's errors on the fold that it does not know.
     sample
         Snapshot pairs to judge on, about.
     workers, scheduler
@@ -145,7 +148,7 @@ def design(
     told = None if progress is None else partial(progress, "models")
     results = list(spread(tried, trials, progress=told))
     floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-    test, doubts = _test(folds, asked, results, floor)
+    test, doubts = _test(folds, asked, results, floor, tighten)
     for sentence in doubts:
         warnings.warn(sentence, FitWarning, stacklevel=2)
 
@@ -166,7 +169,7 @@ def design(
         if recipe.weighted:
             near = Nearness.of(outcomes[place].visited, test.episodes)
         model = recipe.fit(source, near, workers=workers, scheduler=scheduler)
-        return recipe.controller(model, asked.cost, asked.limits, ahead)
+        return recipe.controller(model, asked.cost, test.limits(outcomes[place].band), ahead)
 
     controller = made(best)
     simple = controller if linear == best else (None if linear is None else made(linear))
@@ -178,7 +181,12 @@ def design(
         chosen=best,
         chosen_linear=linear,
         evidence=Evidence(asked, test.surrogates, test.low, test.high, expected),
-        advice=(*doubts, *_advice(rows, best, linear, expected), *unweighted(asked, held)),
+        advice=(
+            *doubts,
+            *_advice(rows, best, linear, expected),
+            *test.limits(outcomes[best].band).capped,
+            *unweighted(asked, held),
+        ),
         notes=(*notes, *short, *folds.notes),
     )
 
@@ -205,7 +213,9 @@ def _models(
     return added
 
 
-def _test(folds: Folds, asked: Asked, results: Sequence[Tried], floor: float) -> tuple[LoopTest, list[str]]:
+def _test(
+    folds: Folds, asked: Asked, results: Sequence[Tried], floor: float, tighten: bool
+) -> tuple[LoopTest, list[str]]:
     """Return the conditions of all closed loops, and doubts about what is asked.
 
     Each fold has a surrogate of either family that is fitted to the two others. The model that does not know fold k
@@ -230,7 +240,7 @@ def _test(folds: Folds, asked: Asked, results: Sequence[Tried], floor: float) ->
                 row = asked.late * (j % _STRETCHES) // (_STRETCHES - 1)
                 start = asked.starts[j % len(asked.starts)]
                 conditions.append(Condition(k, number, gain, start, row, inputs(number, gain, row)))
-    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high)
+    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, tighten)
     return test, [*unheld(surrogates[0], asked), *outside_data(asked, data, tracked, free)]
 
 

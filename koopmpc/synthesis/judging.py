@@ -7,21 +7,25 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
 from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import Asked
-from koopmpc.synthesis.folds import without
+from koopmpc.synthesis.folds import only, without
 from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
 from koopmpc.synthesis.surrogates import Surrogate
+from koopmpc.validate.scoring import AnyPredictor, score
 
 LOST = 20.0  # what a lost run counts, and the most that one counts: times the best on the same surrogate and start
 FREE = 0.005  # violation that costs nothing, as a share of the limits' range
 PRICE = 10.0  # a violation of 1 % beyond costs a tenth of the cost
 LITTLE = 0.01  # of the usual cost: so much more is no loss, as where a run starts at its goal
+_BAND = 5  # steps ahead of the errors that tighten limits
 BROKEN = 1e-3  # share of the range beyond which a step counts as one that violates
 
 
@@ -57,7 +61,7 @@ class Condition:
 class LoopTest:
     """What all runs share: the task, the data in folds, the surrogates, and the conditions.
 
-    A run that leaves the box from `low` to `high` is lost.
+    A run that leaves the box from `low` to `high` is lost. With `tighten` controllers have margins to the limits.
     """
 
     asked: Asked
@@ -67,6 +71,13 @@ class LoopTest:
     conditions: tuple[Condition, ...]
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
+    tighten: bool
+
+    def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
+        """Return the limits that a controller is given whose model has these errors."""
+        if not self.tighten:
+            return self.asked.limits
+        return self.asked.limits.tightened(np.where(np.isfinite(band), band, self.asked.high - self.asked.low))
 
     @property
     def nominal(self) -> tuple[int, ...]:
@@ -99,6 +110,8 @@ class Outcome:
         Share of each run's steps that violate a limit by more than 0.1 % of its range.
     visited
         (n, nx) states of the runs in which the inputs act as in the data.
+    band
+        (h, nx) half-width of the errors 1 … h steps ahead on the folds that the models do not know: 90 % are inside.
     failure
         Why there is no controller; empty where there is one.
     """
@@ -107,6 +120,7 @@ class Outcome:
     violation: Float[np.ndarray, " runs"]
     broken: Float[np.ndarray, " runs"]
     visited: Float[np.ndarray, "n nx"]
+    band: Float[np.ndarray, "h nx"]
     failure: str = ""
 
 
@@ -138,18 +152,13 @@ def judged(test: LoopTest, job: Job) -> Outcome:
     recipe = job.recipe
     near: Nearness | None = None
     try:
-        if recipe.weighted:
-            for _ in range(2):
-                seen = _outcome(test, replace(recipe, weighted=False), test.nominal, near)
-                if len(seen.visited):
-                    near = Nearness.of(seen.visited, test.episodes)
+        for _ in range(2 * recipe.weighted):
+            seen = _outcome(test, replace(recipe, weighted=False), test.nominal, near)
+            near = Nearness.of(seen.visited, test.episodes) if len(seen.visited) else near
         return _outcome(test, recipe, job.conditions, near)
     except (KoopmpcError, ArithmeticError, np.linalg.LinAlgError) as error:
-        n = len(job.conditions)
-        nothing = np.full(n, np.inf)
-        return Outcome(
-            nothing, nothing, np.ones(n), np.zeros((0, test.episodes.nx)), f"{type(error).__name__}: {error}"
-        )
+        nothing, none = np.full(len(job.conditions), np.inf), np.zeros((0, test.episodes.nx))
+        return Outcome(nothing, nothing, np.ones(len(nothing)), none, none, f"{type(error).__name__}: {error}")
 
 
 def _outcome(test: LoopTest, recipe: Recipe, conditions: Sequence[int], near: Nearness | None) -> Outcome:
@@ -157,12 +166,15 @@ def _outcome(test: LoopTest, recipe: Recipe, conditions: Sequence[int], near: Ne
     plants: dict[tuple[int, float], StepMap] = {}
     n, asked = len(conditions), test.asked
     cost, violation, broken = np.full(n, np.inf), np.full(n, np.inf), np.ones(n)
-    visited: list[Float[np.ndarray, "T nx"]] = []
+    visited = [np.zeros((0, test.episodes.nx))]
+    bands: list[Float[np.ndarray, "h nx"]] = []
     for j, place in enumerate(conditions):
         one = test.conditions[place]
         if one.fold not in controllers:
             model = recipe.fit(without(test.episodes, test.fold, one.fold), near)
-            controllers[one.fold] = recipe.controller(model, asked.cost, asked.limits, asked.horizon)
+            bands.append(error_band(model, only(test.episodes, test.fold, one.fold)))
+            limits = test.limits(bands[-1])
+            controllers[one.fold] = recipe.controller(model, asked.cost, limits, asked.horizon)
         key = one.surrogate, one.gain
         if key not in plants:
             plants[key] = test.surrogates[one.surrogate].plant(one.gain)
@@ -177,7 +189,15 @@ def _outcome(test: LoopTest, recipe: Recipe, conditions: Sequence[int], near: Ne
         cost[j], violation[j], broken[j] = total, over.max(), np.mean(over > BROKEN)
         if one.gain == 1.0:
             visited.append(run.X)
-    return Outcome(cost, violation, broken, np.concatenate(visited) if visited else np.zeros((0, test.episodes.nx)))
+    return Outcome(cost, violation, broken, np.concatenate(visited), np.max(bands, axis=0))
+
+
+def error_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h nx"]:
+    """Return half-widths that 90 % of the errors 1 … 5 steps ahead lie within, those of a bilinear model re-lifted."""
+    past = 0 if model.embedding is None else model.embedding.steps
+    horizon = min(_BAND, *(len(episode) - past for episode in episodes))
+    errors = score(model, episodes, horizon, relift=isinstance(model, BilinearPredictor))
+    return np.maximum(np.abs(errors.low), np.abs(errors.high))
 
 
 def _run(test: LoopTest, one: Condition, plant: StepMap, controller: Designed, seed: int) -> Run:

@@ -101,7 +101,9 @@ def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
         lost = int(rng.integers(n))
         costs[lost] = np.inf
         costs[(lost + 1) % n, 0] = 1.0
-        outcomes = [Outcome(c, np.where(np.isfinite(c), 0.0, np.inf), np.zeros(12), np.zeros((0, 2))) for c in costs]
+        outcomes = [
+            Outcome(c, np.where(np.isfinite(c), 0.0, np.inf), np.zeros(12), *[np.zeros((0, 2))] * 2) for c in costs
+        ]
         each = ratios(outcomes)
         assert (each[lost] == LOST).all()
         rows = [replace(usual().best, score=float(score), off=True) for score in scores(each)]
@@ -111,7 +113,7 @@ def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
 def test_violations_count_beyond_half_a_percent_and_beyond_what_nobody_avoids():
     ones, none = np.ones(2), np.zeros((0, 2))
     kept, broken = np.array([0.0, 0.3]), np.array([0.105, 0.4])
-    each = ratios([Outcome(ones, kept, ones, none), Outcome(ones, broken, ones, none)])
+    each = ratios([Outcome(ones, kept, ones, none, none), Outcome(ones, broken, ones, none, none)])
     np.testing.assert_allclose(each[0], 1.0)
     np.testing.assert_allclose(each[1], 1 + 0.99**-1 * 0.99 * np.array([1.0, 0.95]) / 1.01, rtol=1e-9)
 
@@ -220,3 +222,18 @@ def test_data_without_inputs_are_refused():
     free = km.Episodes([km.Episode(X=e.X, U=np.zeros((len(e), 0))) for e in data()], 0.1)
     with pytest.raises(km.KoopmpcError, match="no inputs"):
         designed(free)
+
+
+def test_limits_are_tightened_by_the_models_errors_unless_told():
+    rough = noisy(data(), 0.05)
+    kept, free = designed(rough), designed(rough, tighten=False)
+    margin = np.asarray(kept.controller.limits.margin)
+    assert margin[0, 1] > 0.03
+    assert (margin[:, 0] == 0).all()
+    assert free.controller.limits.margin is None
+    assert kept.expected.broken <= free.expected.broken
+
+
+def test_a_margin_that_is_capped_is_advice():
+    found = designed(noisy(data(), 0.3))
+    assert any("20 % of the range, though the errors ask for up to" in sentence for sentence in found.advice)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.control.cost import LiftedTracking
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.limits import Interval, Softness, ahead
 from koopmpc.control.linear.condense import Condensed, row_sizes
 from koopmpc.control.linear.horizon import Horizon
 from koopmpc.control.solvers.qp import StepQP
@@ -112,6 +112,10 @@ def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "
         parts.append([*(np.tile(each, stages) for each in (*bounds, *softness, size)), place.ravel()])
         first += stages * width
     low, high, linear, quadratic, allowance, size, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+    if track.margin.any():
+        margin = ahead(track.margin, N).ravel()
+        low[len(low) - len(margin) :] += margin
+        high[len(high) - len(margin) :] -= margin
     return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place)
 
 

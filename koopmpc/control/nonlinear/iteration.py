@@ -68,6 +68,9 @@ class RealTimeIteration:
         interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
         self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
         self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)
+        margin = problem.margin
+        self.low[:, self.low.shape[1] - margin.shape[1] :] += margin
+        self.high[:, self.high.shape[1] - margin.shape[1] :] -= margin
         self._free_stages = problem.free
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros

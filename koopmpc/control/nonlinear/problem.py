@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from koopmpc import checks
 from koopmpc.control.cost import StateTracking
-from koopmpc.control.limits import SOFTENED, Interval, Softness
+from koopmpc.control.limits import SOFTENED, Interval, Softness, ahead
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plants.compiled import Buffered
@@ -162,8 +162,8 @@ class StagedProblem(NamedTuple):
         Entries of s.
     inputs
         Limits of v, which are hard.
-    box, softness
-        Limits of `limited`, and what it costs to break them.
+    box, softness, margin
+        Limits of `limited`, what it costs to break them, and by how much each stage moves the last of them inwards.
     free
         Whether a stage has an input; else v is zero there.
     held_from
@@ -187,6 +187,7 @@ class StagedProblem(NamedTuple):
     nx: int
     sizes: Float[np.ndarray, " ns"]
     input_sizes: Float[np.ndarray, " nu"]
+    margin: Float[np.ndarray, "N nm"]
 
 
 class StageTargets(NamedTuple):
@@ -226,6 +227,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
             nx,
             x_sizes,
             u_sizes,
+            ahead(o.margin, N),
         )
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates
@@ -257,6 +259,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         ns,
         np.concatenate([x_sizes, u_sizes, u_sizes[soft]]),
         u_sizes,
+        ahead(o.margin, N),
     )
 
 

@@ -141,6 +141,10 @@ class Shooting:
         self._next_v = np.vstack([stages[1:], stages[-1:]]).ravel()
         lbg, ubg = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
         lbg[path_at], ubg[path_at] = low, high
+        if ng:  # [values − ε ≤ high; values + ε ≥ low], the last outputs of each moved inwards
+            last = path_at[:, ng - p.margin.shape[1] : ng]
+            ubg[last] -= p.margin
+            lbg[last + ng] += p.margin
         unlimited = np.full(nx, np.inf)
         lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
         ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))

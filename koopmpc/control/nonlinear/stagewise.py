@@ -122,7 +122,10 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
         soft = np.isfinite(problem.softness.linear)
         linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness[:2])
         g = problem.limited.map(N)(X[:, 1:])
-        over = ca.fmax(ca.fmax(ca.DM(problem.box.low) - g, g - ca.DM(problem.box.high)), 0)
+        inwards = np.zeros((N, len(soft)))
+        inwards[:, len(soft) - problem.margin.shape[1] :] = problem.margin
+        low, high = (ca.DM((end + sign * inwards).T) for end, sign in zip(problem.box, (1, -1), strict=True))
+        over = ca.fmax(ca.fmax(low - g, g - high), 0)
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
     return ca.Function("plan_cost", [X, U, R, U_r, M, L, m], [cost])
 
