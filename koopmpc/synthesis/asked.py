@@ -113,7 +113,8 @@ def asked_of(
     of = cost.of.bind(states)
     cost.matrices(of.nz, data.nu)
     ny = 0 if limits.of is None else limits.of.bind(states).nz
-    limits.sized(nx, ny, data.nu)
+    limits.inputs(data.nu)
+    limits.rows(nx, ny)
     rows = checks.array(reference, "reference")
     if rows.ndim > 2 or (rows.shape or (1,))[-1] != of.nz or not rows.size:
         raise ShapeError(
