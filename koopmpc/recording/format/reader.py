@@ -12,12 +12,8 @@ from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
+from koopmpc.recording.format.columns import DRAWN, Entity
 from koopmpc.recording.format.rrd import LogColumns, read_columns
-
-_ENTITIES = (
-    "/state", "/reference", "/measurement", "/control/u", "/control/u_reference", "/solver/slack", "/solver/time_ms",
-    "/solver/status", "/prediction/x", "/prediction/u", "/description", "/metrics",
-)  # fmt: skip
 
 
 def load_run(path: str | Path) -> Run:
@@ -31,7 +27,7 @@ def load_run(path: str | Path) -> Run:
         The file is missing, no log of koopmpc, damaged, or holds no whole step.
     """
     path = Path(path)
-    log = read_columns(path, _ENTITIES)
+    log = read_columns(path, tuple(f"/{entity}" for entity in Entity if entity not in DRAWN))
     try:
         return _run(log, path)
     except (ValueError, KeyError, TypeError, IndexError) as error:
@@ -40,17 +36,17 @@ def load_run(path: str | Path) -> Run:
 
 def _run(log: LogColumns, path: Path) -> Run:
     about, planned_steps = _about(log, path)
-    X, reference = log.vectors("/state"), log.vectors("/reference")
-    U = log.vectors("/control/u")
-    seconds = log.column("/solver/time_ms", "seconds")
-    iterations = log.column("/solver/time_ms", "iterations")
+    X, reference = log.vectors(Entity.STATE), log.vectors(Entity.REFERENCE)
+    U = log.vectors(Entity.INPUT)
+    seconds = log.column(Entity.SOLVER, "seconds")
+    iterations = log.column(Entity.SOLVER, "iterations")
     counts = [len(X) - 1, len(seconds)]
     counts += [len(U)] if about.inputs else []
     counts += [len(reference) - 1] if len(reference) else []
     steps = min(counts)
     if steps < 1:
         raise LogError(f"{path} holds no whole step; its run ended before the second state was written")
-    end = log.static("/metrics", "steps")
+    end = log.static(Entity.METRICS, "steps")
     total = planned_steps if end is None else end
     if total != steps:
         of = "" if total is None else f" of {total}"
@@ -75,14 +71,14 @@ def _run(log: LogColumns, path: Path) -> Run:
         solve_time=seconds[:steps],
         iterations=iterations[:steps].astype(np.int64),
         plans=_plans(log, steps),
-        u_reference=_sparse(log, "/control/u_reference", steps, len(about.inputs)),
-        slack=_sparse(log, "/solver/slack", steps, 1)[:, 0],
+        u_reference=_sparse(log, Entity.INPUT_REFERENCE, steps, len(about.inputs)),
+        slack=_sparse(log, Entity.SLACK, steps, 1)[:, 0],
         **about.about(),
     )
 
 
 def _about(log: LogColumns, path: Path) -> tuple[About, int | None]:
-    text = log.static("/description", "json")
+    text = log.static(Entity.DESCRIPTION, "json")
     if text is None:
         raise LogError(
             f"{path} is a Rerun recording, but no log of koopmpc: it has no description, or was cut before it"
@@ -92,7 +88,7 @@ def _about(log: LogColumns, path: Path) -> tuple[About, int | None]:
 
 def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
     """Return the measurements: the states, except in the rows that were written separately."""
-    k, values = log.matrix("/measurement")
+    k, values = log.matrix(Entity.MEASUREMENT)
     if not len(k):
         return X.copy()
     if values.shape[1] != X.shape[1]:
@@ -114,7 +110,7 @@ def _sparse(log: LogColumns, entity: str, steps: int, width: int) -> np.ndarray:
 
 def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
     """Return status and fallback of each step: the last change at or before it."""
-    k, _, words = log.rows("/solver/status", "state")
+    k, _, words = log.rows(Entity.STATUS, "state")
     if not len(k) or k[0] != 0:
         raise LogError(f"{path} lacks the status of its first step; it was not written by koopmpc")
     try:
@@ -133,7 +129,7 @@ def _pair(word: str) -> tuple[Status, Fallback]:
 def _plans(log: LogColumns, steps: int) -> Plans | None:
     """Return the plans, NaN where a step had none; None where no step had one."""
     parts = []
-    for entity in ("/prediction/x", "/prediction/u"):
+    for entity in (Entity.PLAN_STATES, Entity.PLAN_INPUTS):
         k, values = log.matrix(entity)
         width = log.static(entity, "last_width")
         if width is None or not len(k):

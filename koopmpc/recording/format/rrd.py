@@ -18,6 +18,7 @@ from koopmpc import disk
 from koopmpc.errors import LogError
 from koopmpc.loop.run import Plans, Run, Step, StepRows
 from koopmpc.recording.format.apart import Column, read, read_apart
+from koopmpc.recording.format.columns import Entity
 from koopmpc.recording.format.logfile import intact
 
 _MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
@@ -39,14 +40,14 @@ class LogColumns:
 
     def static(self, entity: str, component: str) -> Any:
         """Return the one value that does not change, or None."""
-        parts = self._parts.get((entity, component))
+        parts = self._parts.get(_key(entity, component))
         return None if parts is None else parts[-1][1].to_pylist()[-1][0]
 
     def rows(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray, Any]:
         """Return the steps, the width, and the flat values of a component, in order of the steps."""
         import pyarrow as pa
 
-        parts = self._parts.get((entity, component), [])
+        parts = self._parts.get(_key(entity, component), [])
         if not parts:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
         if parts[0][0] is None:
@@ -79,8 +80,8 @@ class LogColumns:
 
     def changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
-        sums: dict[str, int] = json.loads(self.static("/metrics", "sums"))
-        places: dict[str, int] = json.loads(self.static("/metrics", "places") or "{}")  # logs of before have none
+        sums: dict[str, int] = json.loads(self.static(Entity.METRICS, "sums"))
+        places: dict[str, int] = json.loads(self.static(Entity.METRICS, "places") or "{}")  # logs of before have none
         bad = [key for key, total in sums.items() if (data := self._data(key)) is not None and crc32(data) != total]
         return bad + [key for key, total in places.items() if key not in bad and self._steps(key) not in (None, total)]
 
@@ -102,6 +103,10 @@ class LogColumns:
         if isinstance(values, pa.StringArray):
             return "".join(values.to_pylist()).encode()
         return np.ascontiguousarray(values).data
+
+
+def _key(entity: str, component: str) -> tuple[str, str]:
+    return f"/{entity.removeprefix('/')}", component
 
 
 def _whole(k: np.ndarray) -> int:

@@ -24,6 +24,7 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
+from koopmpc.recording.format.columns import Entity
 from koopmpc.recording.format.logfile import CHECK, LogFile
 from koopmpc.recording.format.rrd import LogBlock, blocks
 from koopmpc.recording.views.blueprint import blueprint, input_limits, styles
@@ -120,38 +121,38 @@ class Writer:
 
         n, m = len(rows.X), len(rows.U)
         k = rows.k + np.arange(n)
-        if "state" not in self._styled:
+        if Entity.STATE not in self._styled:
             for entity, style in styles(self._about, rows).items():
                 self._style(entity, style)
         for entity, drawing in drawings.items():
             self._style(entity, drawing.style)
             self._rec.send_columns(entity, times(k, self._about.dt), drawing.columns)
         if len(rows.planned):
-            self._vectors("prediction/x", rows.planned, rows.plan_X)
-            self._vectors("prediction/u", rows.planned, rows.plan_U)
+            self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
+            self._vectors(Entity.PLAN_INPUTS, rows.planned, rows.plan_U)
         measured = _differ(rows.X, rows.Y)
-        self._vectors("measurement", k[measured], rows.Y[measured])
-        self._vectors("reference", k, rows.reference)
+        self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured])
+        self._vectors(Entity.REFERENCE, k, rows.reference)
         if m:
-            self._vectors("control/u", k[:m], rows.U)
+            self._vectors(Entity.INPUT, k[:m], rows.U)
             held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
-            self._vectors("control/u_reference", k[held], rows.u_reference[held])
+            self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
             gave = np.flatnonzero(rows.slack)
-            self._vectors("solver/slack", k[gave], rows.slack[gave, None])
+            self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
             ends = np.unique(k[[0, m - 1]])
             limits = [value for _, value in input_limits(self._about)]
-            self._vectors("control/limits", ends, np.tile(limits, (len(ends), 1)))
-            self._vectors("solver/deadline_ms", ends, np.full((len(ends), 1), 1e3 * self._about.dt))
+            self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
+            self._vectors(Entity.DEADLINE, ends, np.full((len(ends), 1), 1e3 * self._about.dt))
             exact = rr.DynamicArchetype.columns(
                 "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
             )
             scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
-            self._sum("/solver/time_ms:seconds", np.ascontiguousarray(rows.solve_time).data, k[:m])
-            self._sum("/solver/time_ms:iterations", np.ascontiguousarray(rows.iterations).data)
-            self._rec.send_columns("solver/time_ms", times(k[:m], self._about.dt), [*scalars, *exact])
+            self._sum(f"/{Entity.SOLVER}:seconds", np.ascontiguousarray(rows.solve_time).data, k[:m])
+            self._sum(f"/{Entity.SOLVER}:iterations", np.ascontiguousarray(rows.iterations).data)
+            self._rec.send_columns(Entity.SOLVER, times(k[:m], self._about.dt), [*scalars, *exact])
             self._statuses(rows)
         self.flush()  # static archetypes reach the file before the states do
-        self._vectors("state", k, rows.X)
+        self._vectors(Entity.STATE, k, rows.X)
 
     def flush(self) -> None:
         """Wait until the sinks have what was written; raise where the disk has refused it."""
@@ -178,7 +179,7 @@ class Writer:
             self._open()
         document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
         numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
-        self._rec.log("metrics", document, rr.AnyValues(**numbers), static=True)
+        self._rec.log(Entity.METRICS, document, rr.AnyValues(**numbers), static=True)
         if self._extent.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
         self.flush()
@@ -203,9 +204,9 @@ class Writer:
         else:
             self._file.attach(self._rec, *sinks)
         self._rec.send_recording_name(drawable(title_of(self._about)))
-        self._sum("/description:json", self._json.encode())
+        self._sum(f"/{Entity.DESCRIPTION}:json", self._json.encode())
         text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log("description", text, rr.AnyValues(json=self._json), static=True)
+        self._rec.log(Entity.DESCRIPTION, text, rr.AnyValues(json=self._json), static=True)
         self.flush()  # a log that is cut says what it was
         self._rec.send_blueprint(self._blueprint(), make_active=False)
         if self._model is not None:
@@ -254,14 +255,14 @@ class Writer:
         self._status = pairs[-1]
         if changed:
             words = [_word(*pairs[i]) for i in changed]
-            self._sum("/solver/status:state", "".join(words).encode(), rows.k + np.array(changed))
+            self._sum(f"/{Entity.STATUS}:state", "".join(words).encode(), rows.k + np.array(changed))
             at = times(rows.k + np.array(changed), self._about.dt)
-            self._rec.send_columns("solver/status", at, rr.StateChange.columns(state=words))
+            self._rec.send_columns(Entity.STATUS, at, rr.StateChange.columns(state=words))
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
         if fallen:
             texts = [f"step {rows.k + i}: {_word(*pairs[i])}" for i in fallen]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
-            self._rec.send_columns("log", times(rows.k + np.array(fallen), self._about.dt), columns)
+            self._rec.send_columns(Entity.FALLBACKS, times(rows.k + np.array(fallen), self._about.dt), columns)
 
     def _drawings(self, rows: LogBlock) -> dict[str, Drawing]:
         """Return the scene of every row, and of a few stages of its plan, by entity."""

@@ -1,0 +1,30 @@
+"""The columns of a log: one table for the writer and the reader."""
+
+from enum import StrEnum
+
+
+class Entity(StrEnum):
+    """Where the columns of a log stand.
+
+    An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
+    What only the viewer draws, `world` and `model` say, is in views/.
+    """
+
+    DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
+    STATE = "state"  # x_k, NaN where the plant hides it; written last, so a row that has its state is whole
+    MEASUREMENT = "measurement"  # y_k, in the rows where it is not x_k to the bit
+    REFERENCE = "reference"  # r_k
+    INPUT = "control/u"  # u_k as applied
+    INPUT_REFERENCE = "control/u_reference"  # the input that holds r_k, in the rows where it is not 0
+    INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and the last step of a block
+    SLACK = "solver/slack"  # how far the plan breaks a soft limit, in the rows where it does
+    SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" and "iterations" hold time and iterations to the bit
+    DEADLINE = "solver/deadline_ms"  # dt [ms], at the first and the last step of a block
+    STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes
+    PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
+    PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu
+    FALLBACKS = "log"  # text: a line where a fallback sets in
+    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", checksums of all columns
+
+
+DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
