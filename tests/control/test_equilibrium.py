@@ -58,6 +58,26 @@ def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
     assert np.allclose(again.x, near.x, atol=1e-9)
 
 
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_steps_with_the_factors_of_earlier_ones_end_where_full_steps_do(seed: int, tanks: bool) -> None:
+    rng = np.random.default_rng(seed)
+    each = TANKS if tanks else SWING
+    nx = each.model.nx
+    row = rng.uniform(0.2, 0.8, nx) if tanks else np.array([rng.uniform(-0.5, 1.2), 0.0])
+    e = 2e-3 * rng.standard_normal(nx)
+    each.follow(each.find(row + 1e-3), row, np.zeros(nx))  # its factors serve for what follows
+    here, exact = each.find(row), each.near(each.find(row), row, e)
+    if exact is None or here.active.any():
+        return
+    for _ in range(8):
+        here = each.follow(here, row, e)
+        if here is None:  # a limit has a say, or the way is too far
+            return
+    np.testing.assert_allclose(here.x, exact.x, atol=1e-9)
+    np.testing.assert_allclose(here.u, exact.u, atol=1e-9)
+
+
 @pytest.mark.parametrize("limits", [km.Limits(-4, 4), km.Limits(-0.35, 0.4), km.Limits(-4, 4, x_max=[0.5, np.inf])])
 @pytest.mark.parametrize("reference", [0.3, 0.9])
 def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(

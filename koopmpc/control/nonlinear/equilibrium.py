@@ -66,6 +66,18 @@ class Linearisation(NamedTuple):
     G: Float[np.ndarray, "ng nx"]
 
 
+class Chord(NamedTuple):
+    """A Gauss–Newton step at s₀, no limit active: H (F(x, u) + e − x) + T residuals; and ∂[u; g]/∂s.
+
+    s is [x; u] by its sizes, and so is F(x, u) + e − x.
+    """
+
+    s: Float[np.ndarray, " n"]
+    H: Float[np.ndarray, "n nx"]
+    T: Float[np.ndarray, "n m"]
+    limited: Float[np.ndarray, "nl n"]
+
+
 class Equilibria:
     """Reference row and disturbance e → Equilibrium: minimises ‖of(x) − r‖²_Q inside all limits.
 
@@ -81,6 +93,9 @@ class Equilibria:
         found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
         local = ca.Function("local", [x, u, theta], [ca.densify(each) for each in found])
         self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local)
+        values = ca.Function("values", [x, u, theta], [ca.densify(each) for each in (F, of, g)])
+        self._values = Buffered(values.expand() if model.F.is_a("SXFunction") else values)
+        self._chord: Chord | None = None
         self._scale, inputs = o.sizes.scale, o.sizes.inputs
         self.size = np.concatenate([point_sizes(model, o), inputs])
         self._limit_size = np.concatenate([inputs, o.softness.allowance / SOFTENED])
@@ -97,6 +112,17 @@ class Equilibria:
 
     def __reduce__(self) -> tuple[type["Equilibria"], tuple[LearnedMap, Cost, StateTracking]]:
         return Equilibria, (self.model, self._cost, self._outputs)
+
+    def update(self, model: LearnedMap) -> None:
+        """Go on with another θ."""
+        self.model, self._chord = model, None
+
+    def values(
+        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]
+    ) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nr"], Float[np.ndarray, " ng"]]:
+        """Return F(x, u), of(x) and the limited outputs g(x)."""
+        F, of, g = self._values(x, u, self.model.theta)
+        return F, of, g
 
     def linearise(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Linearisation:
         """Return the linearisation at (x, u)."""
@@ -165,6 +191,41 @@ class Equilibria:
                 x, u = np.split(s * size, [nx])
                 return Equilibrium(x, np.clip(u, *self._outputs.inputs), active)
         return None
+
+    def follow(
+        self, begin: Equilibrium, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"]
+    ) -> Equilibrium | None:
+        """Return the equilibrium by one step from `begin`, None where it is not close, or a limit has a say.
+
+        The step takes the factors of an earlier one as long as that was close by: repeated, it converges the faster
+        the closer that was, at a fraction of the time.
+        """
+        nx, size = self.model.nx, self.size
+        if begin.active.any():
+            return None
+        s, chord = np.concatenate([begin.x, begin.u]) / size, self._chord
+        close = CLOSE * (1 + np.abs(s).max())
+        if chord is None or np.abs(s - chord.s).max() > close:
+            chord = self._chord = self._factors(begin, s)
+        F, of, g = self.values(begin.x, begin.u)
+        left = np.concatenate([self._weight @ (row - of), -self._small * s])
+        step = chord.H @ ((F + e - begin.x) / size[:nx]) + chord.T @ left
+        reached = np.concatenate([begin.u, g]) + chord.limited @ step
+        if not np.abs(step).max() <= close or (reached > self._high).any() or (reached < self._low).any():
+            return None
+        x, u = np.split((s + step) * size, [nx])
+        return Equilibrium(x, u, begin.active)
+
+    def _factors(self, here: Equilibrium, s: Float[np.ndarray, " n"]) -> Chord:
+        """Return the Gauss–Newton step at an equilibrium, s in its sizes."""
+        (nx, nu), size = (self.model.nx, self.model.nu), self.size
+        at = self.linearise(here.x, here.u)
+        gain, free = _inverse(np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None])
+        W = self._residuals(at)
+        back = free @ np.linalg.pinv(W @ free)
+        limited = np.zeros((nu + len(at.G), nx + nu))
+        limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
+        return Chord(s, back @ W @ gain - gain, back, limited * size)
 
     def find(
         self,
@@ -252,7 +313,7 @@ class TerminalTargets:
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ: the last target is found anew, from where it was."""
-        self.equilibria.model = model
+        self.equilibria.update(model)
         last, self._known = list(self._known.items())[-1:], {}
         for key, target in last:
             row = np.frombuffer(key)
@@ -278,10 +339,11 @@ class TerminalTargets:
         """
         target = self(row)
         begin = (target if last is None else last).equilibrium
-        found = self.equilibria.near(begin, row, e, CLOSE) or self.equilibria.find(row, e, begin)
+        each = self.equilibria
+        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE) or each.find(row, e, begin)
         u, m = found.u * self._hold, target.m
         if self._cost.Q_N is None:
-            m = target.M @ self.equilibria.linearise(found.x, found.u).of + target.L @ found.x + target.V @ u
+            m = target.M @ each.values(found.x, found.u)[1] + target.L @ found.x + target.V @ u
         return target._replace(equilibrium=found, u=u, m=m)
 
     def _target(self, row: Float[np.ndarray, " nr"], found: Equilibrium) -> TerminalTarget:
