@@ -11,6 +11,7 @@ Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Ma
 
 from collections.abc import Mapping
 from functools import cache
+from time import perf_counter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,6 +37,9 @@ DEFAULTS: Mapping[str, Any] = {
     "eps_dual_inf": 1e-6,
 }
 
+_STRICT = 1e-12  # eps_prim_inf where a first certificate was rounding
+_CERTAIN, _ROUNDING = 100.0, 1e-9  # by how much a certificate must exceed its own residual, and rounding
+_SHORTEST = 1e-6  # seconds that a solve gets at least
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
 
@@ -109,6 +113,7 @@ class OSQP(QPSolver):
         self._rho = self._solver.get_settings().rho
         self._time_limit = self._solver.get_settings().time_limit
         self._most = self._solver.get_settings().max_iter
+        self._prim_inf = self._solver.get_settings().eps_prim_inf
         self._first = True
 
     def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Interval, float]]:
@@ -144,9 +149,43 @@ class OSQP(QPSolver):
         self._solver.update_rho(self._rho)
 
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
-        """Solve; new data also make OSQP forget its last status."""
+        """Solve; where OSQP says INFEASIBLE without a proof it solves again, and asks for one without rounding."""
+        start = perf_counter()
+        limit = self._time_limit if time_limit is None else time_limit
+        found = self._run(v, y, limit)
+        if found.status is not Status.INFEASIBLE or self._proven():
+            return found
+        self._believe(_STRICT)
+        again = self._run(v, y, max(limit - (perf_counter() - start), _SHORTEST))
+        self._believe(self._prim_inf)
+        again.iterations += found.iterations
+        if again.status is Status.INFEASIBLE and not self._proven():
+            again.status = Status.MAX_ITERATIONS
+        return again
+
+    def _proven(self) -> bool:
+        """Return whether the certificate of infeasibility shows more than its own rounding.
+
+        It is a y of low and high ends with Aᵀy = r ≈ 0, so that rᵀv ≤ s = highᵀy₊ − lowᵀy₋ < 0 for every feasible v.
+        With r = 0 this excludes all v. As a share of the terms that cancel, r has to be much less than s.
+        """
+        y = np.array(self._solver.solution.prim_inf_cert)
+        ends, A = np.where(y > 0, self.high, self.low), self._qp.A
+        s, whole = float(ends @ y), float(np.abs(ends) @ np.abs(y))
+        terms = np.abs(A).T @ np.abs(y)
+        r = float((np.abs(A.T @ y) / np.where(terms > 0, terms, 1.0)).max(initial=0.0))
+        return s < -max(_CERTAIN * r, _ROUNDING) * whole
+
+    def _believe(self, prim_inf: float) -> None:
+        """Set how small Aᵀy must be for OSQP to take y for a certificate of infeasibility."""
+        options = self._solver.get_settings()
+        options.eps_prim_inf = prim_inf
+        self._solver.update_settings(options)
+
+    def _run(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], limit: float) -> QPSolution:
+        """Return what OSQP says from this start; new data also make it forget its last status."""
         self._solver.update_data_vec(q=None, l=self.low, u=self.high)
-        self._allow(self._time_limit if time_limit is None else time_limit)
+        self._allow(limit)
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
         self._solver.solve()
         info, solution = self._solver.info, self._solver.solution

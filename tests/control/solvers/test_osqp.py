@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import koopmpc as km
@@ -22,12 +22,14 @@ def random_qp(rng, n, m):
 
 
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 8), m=st.integers(0, 12))
+@example(seed=19, n=2, m=6)  # OSQP's own certificate of infeasibility is rounding here, and in the next two
+@example(seed=312, n=1, m=7)
+@example(seed=732, n=2, m=6)
 def test_answers_meet_kkt(seed, n, m):
     rng = np.random.default_rng(seed)
     qp = random_qp(rng, n, m)
     solver = OSQP(qp, TIGHT)
     solution = solver.solve(np.zeros(n), np.zeros(m))
-    assume(solution.status is not km.Status.INFEASIBLE)  # OSQP's certificate may be wrong; test_both counts how often
     assert solution.status is km.Status.OPTIMAL
     meets_kkt(qp, solution, 1e-8, 1e-8)
     warm = solver.solve(solution.v, solution.y)
