@@ -372,7 +372,7 @@ class TerminalTargets:
         M, L, V = (np.zeros((n + nr, columns)) for columns in (nr, nx, len(u)))
         M[:n] = S[:, :nx] @ back / sr
         L[:n] = S[:, :nx] @ (np.eye(nx) - back @ J) / sx
-        V[:n, : n - nx] = S[:, nx:] / su
+        V[:n, : n - nx] = S[:, nx:] / su[: n - nx]
         mean = float((P[:nx, :nx] * inverse).sum()) / max(np.linalg.matrix_rank(seen), 1)
         M[n:] = np.sqrt(max(mean, 1.0)) * o.Q_root @ (np.eye(nr) - sr[:, None] * (J @ back) / sr)
         return TerminalTarget(found, u, M, L, V, M @ at.of + L @ found.x + V @ u, slope)
