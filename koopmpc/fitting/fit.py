@@ -1,6 +1,6 @@
 """fit_data: from a file or a folder of logs to a model file, with its report, its pictures and its Rerun log."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
@@ -13,11 +13,11 @@ from koopmpc import checks
 from koopmpc.bench.page import Page
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.files.storage import Files
 from koopmpc.errors import FullDiskError
 from koopmpc.figures.comparisons import error
 from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import rollout
+from koopmpc.fitting.audited import Data, evenly
 from koopmpc.fitting.repair import IN_MEMORY, PAST, Divided, divided, noted, shortened
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
@@ -30,7 +30,6 @@ from koopmpc.validate.report import TrustReport, trust
 from koopmpc.validate.scoring import Score, score
 from koopmpc.validate.text import labelled, written
 
-Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 Say = Callable[[str], None]
 _ROLLOUTS = 3  # held-out episodes that are drawn
 LINEAR = "linear.npz"  # beside a bilinear model.npz
@@ -122,8 +121,9 @@ def fit_data(
     tell = _silent if say is None else say
     notes: list[str] = []
     with noted(notes):
-        files = Files(_logs(data), **{name: value for name, value in reading.items() if value is not None})
-        split = divided(files, horizon, draw, memory)
+        told = {name: value for name, value in reading.items() if value is not None}
+        reads = partial(divided, horizon=horizon, rng=draw, memory=memory)
+        files, split = evenly(_logs(data), told, reads, notes)
     understood = _understood(split, shortened(notes, files.files))
     tell(understood)
     doubts: list[str] = []
@@ -131,7 +131,7 @@ def fit_data(
         selection = select(
             split.fitted,
             horizon=split.horizon,
-            delays=range(PAST + 1),
+            delays=sorted({*range(PAST + 1), split.delay}),
             bilinear=bilinear,
             relift=False,  # the report is one of forecasts in z
             workers=workers,

@@ -13,6 +13,7 @@ from koopmpc.data.episodes import Episode, Episodes, joined
 from koopmpc.data.files.storage import Files
 from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
+from koopmpc.fitting.audited import audited
 from koopmpc.synthesis.candidates import jumps
 from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
 
@@ -178,6 +179,8 @@ class Divided:
         What there is, in words.
     notes
         What was done to the data, in sentences.
+    delay
+        Steps of the past that signals which are late ask for.
     """
 
     fitted: Source | Episodes
@@ -186,6 +189,7 @@ class Divided:
     horizon: int
     size: str
     notes: tuple[str, ...]
+    delay: int
 
 
 def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory: int) -> Divided:
@@ -200,19 +204,21 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     size = sum(file.stat().st_size for file in files.files)
     told = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_bytes(size)}"
     if size <= memory or len(parts) < 2:
-        episodes = joined([part.load() for part in parts])
-        repair = needed(episodes)
-        return _in_memory(repair(episodes), horizon, rng, told, repair.notes)
-    repair = needed(sampled(files, _JUDGED)[0])
+        looked = audited(joined([part.load() for part in parts]))
+        repair = needed(looked.episodes)
+        return _in_memory(repair(looked.episodes), horizon, rng, told, (*looked.notes, *repair.notes), looked.delay)
+    looked = audited(sampled(files, _JUDGED)[0], cut=False)
+    repair = needed(looked.episodes)
+    past = max(PAST, looked.delay)
     source = repair.source(files)
     count = max(len(parts) // 10, 1)
     out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
     rest = Subset(source, [i for i in range(len(parts)) if i not in out])
     judged, _ = sampled(Subset(source, sorted(out)), _JUDGED)
-    ahead = usual_horizon(judged, PAST)[0] if horizon is None else horizon
-    held_out = _long(list(judged), ahead + PAST)
+    ahead = usual_horizon(judged, past)[0] if horizon is None else horizon
+    held_out = _long(list(judged), ahead + past)
     if len(held_out) < 2:
-        held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + PAST))], ahead + PAST)
+        held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + past))], ahead + past)
     if len(held_out) < 2:
         raise DataError(_too_short(len(judged), ahead))
     seen, _ = sampled(rest, _JUDGED)
@@ -222,23 +228,30 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     )
     return Divided(
         rest,
-        judged.with_episodes(_long(list(seen), ahead + PAST)),
+        judged.with_episodes(_long(list(seen), ahead + past)),
         judged.with_episodes(held_out),
         ahead,
         told,
-        (*repair.notes, note),
+        (*looked.notes, *repair.notes, note),
+        looked.delay,
     )
 
 
 def _in_memory(
-    episodes: Episodes, horizon: int | None, rng: np.random.Generator, files: str, repaired: tuple[str, ...]
+    episodes: Episodes,
+    horizon: int | None,
+    rng: np.random.Generator,
+    files: str,
+    repaired: tuple[str, ...],
+    delay: int,
 ) -> Divided:
+    past = max(PAST, delay)
     lengths = [len(episode) for episode in episodes]
     same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
     number = len(episodes)
     told = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
-    ahead = usual_horizon(episodes, PAST)[0] if horizon is None else horizon
-    needed = ahead + PAST
+    ahead = usual_horizon(episodes, past)[0] if horizon is None else horizon
+    needed = ahead + past
     whole = list(episodes)
     notes: tuple[str, ...] = ()
     if len(_long(whole, needed)) < _ENOUGH:
@@ -260,7 +273,9 @@ def _in_memory(
     train = episodes.with_episodes([episode for i, episode in enumerate(whole) if i not in out])
     seen, _ = sampled(Held(episodes.with_episodes(_long(list(train), needed))), _JUDGED)
     held_out, _ = sampled(Held(episodes.with_episodes([whole[i] for i in sorted(out)])), _JUDGED)
-    return Divided(train, episodes.with_episodes(_long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes))
+    return Divided(
+        train, episodes.with_episodes(_long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes), delay
+    )
 
 
 def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:

@@ -321,3 +321,53 @@ def test_of_notes_that_differ_from_file_to_file_the_first_are_shown_and_the_othe
     short = shortened([*(f"{file}: gap {i}" for i, file in enumerate(files)), "of all: one"], files)
     assert short[:2] == [f"{files[0]}: gap 0", f"{files[1]}: gap 1"]
     assert short[6:] == ["of all: one", "3 more files have such notes of their own; load_episodes says them"]
+
+
+@pytest.mark.usefixtures("quick")
+def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
+    """Spikes are left out, a late input widens the past that models may see, and a clock that jitters is evened."""
+    made, data = [], cart_pole(20)
+    for e in data:
+        X, U = e.X[:-3].copy(), e.U[3:]  # the force acts three steps late
+        X[30, 1] += 40
+        made.append(km.Episode(X=X, U=U))
+    (tmp_path / "in").mkdir()
+    data.with_episodes(made).save(tmp_path / "in" / "late.npz")
+    told = []
+    found = fit_data(tmp_path / "in", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    assert re.search(
+        r"! spikes: theta leaves its path for single rows 20 times: .*these rows were left out", told[0], re.S
+    )
+    assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", told[0])
+    assert max(np.abs(e.X[:, 1]).max() for e in found.held_out) < 20
+    assert divided(km.Files(tmp_path / "in"), 10, np.random.default_rng(0), 10**9).delay == 3
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_clock_that_jitters_is_evened_and_that_is_said(tmp_path):
+    data, rng = cart_pole(16), np.random.default_rng(0)
+    (tmp_path / "csv").mkdir()
+    for i, e in enumerate(data):
+        time = (np.arange(len(e.X)) + rng.uniform(-0.1, 0.1, len(e.X))) * 0.02
+        rows = np.column_stack([time, e.X, np.vstack([e.U, e.U[-1:]])])
+        np.savetxt(
+            tmp_path / "csv" / f"{i:02d}.csv", rows, delimiter=",", header="time [s],x,theta,v,omega,force", comments=""
+        )
+    told = []
+    fit_data(tmp_path / "csv", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    assert re.search(
+        r"sampling is unequal: \d+ of 80 steps differ.*; interpolated to 0\.0\d+ s", " ".join(told[0].split())
+    )
+    with pytest.raises(km.errors.DataError, match="sampling is unequal"):
+        km.load_episodes(tmp_path / "csv" / "00.csv")
+
+
+def test_a_clock_that_is_set_back_is_told_and_one_that_starts_anew_is_not(tmp_path):
+    def table(times):
+        rows = np.column_stack([times, np.random.default_rng(0).normal(size=(len(times), 2))])
+        np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="time [s],x,u", comments="")
+        return km.load_episodes(tmp_path / "a.csv")
+
+    assert len(table(np.tile(np.arange(10) * 0.1, 3))) == 3
+    with pytest.warns(km.FitWarning, match="the clock is set back 1 times, before row 11; an episode ends there"):
+        assert len(table(np.concatenate([np.arange(10), np.arange(5, 15)]) * 0.1)) == 2

@@ -14,6 +14,14 @@ _JITTER = 0.02  # share of dt by which a step may differ
 _GAP = 1.5  # a step longer than 1.5 dt is a gap
 
 
+class UnevenSamplingError(DataError):
+    """Steps of time differ; `dt` is the sample time [s] to interpolate to."""
+
+    def __init__(self, message: str, dt: float) -> None:
+        super().__init__(message)
+        self.dt = dt
+
+
 @dataclass(frozen=True, eq=False)
 class Signals:
     """Rows of one episode: time [s] or None, states, inputs, disturbances; `rows` are their numbers in the file."""
@@ -46,11 +54,24 @@ def sample_time(times: list[np.ndarray], where: str) -> float:
     return float(f"{np.median(steps):.6g}")
 
 
-def restarts(signals: Signals) -> list[Signals]:
-    """Return the parts between steps back in time, where a recorder was started anew."""
+def restarts(signals: Signals, where: str) -> list[Signals]:
+    """Return the parts between steps back in time, where a recorder was started anew.
+
+    A warning tells where the clock went back to another time than that of the first row: it was set, not started.
+    """
     if signals.time is None:
         return [signals]
-    at = _edges(np.diff(signals.time) < 0)
+    steps = np.diff(signals.time)
+    at = _edges(steps < 0)
+    usual = np.median(np.abs(steps)) if len(steps) else 0.0
+    set_back = [signals.rows[k] for k in at[1:-1] if abs(signals.time[k] - signals.time[0]) > 2 * usual]
+    if set_back:
+        shown = ", ".join(str(row) for row in set_back[:3]) + (", …" if len(set_back) > 3 else "")
+        warnings.warn(
+            f"{where}: the clock is set back {len(set_back)} times, before row {shown}; an episode ends there",
+            FitWarning,
+            stacklevel=2,
+        )
     return [signals.cut(a, b) for a, b in pairwise(at)]
 
 
@@ -140,10 +161,11 @@ def _runs(part: Signals, dt: float, where: str, gaps: list[int]) -> list[tuple[i
         uneven = np.flatnonzero(joined & (np.abs(steps - dt) > _JITTER * dt))
         if len(uneven):
             k = int(uneven[0])
-            raise DataError(
+            raise UnevenSamplingError(
                 f"{where}: sampling is unequal: {len(uneven)} of {len(steps)} steps differ from dt = {dt:g} s by "
                 f"more than 2 %, the first at row {part.rows[k]}, where it is {steps[k]:g} s; pass resample={dt:g} to "
-                "interpolate"
+                "interpolate",
+                dt,
             )
     breaks = np.flatnonzero(~joined)
     first_of_each = breaks[np.diff(breaks, prepend=-2) > 1]

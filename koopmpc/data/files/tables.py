@@ -207,7 +207,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
             if (np.diff(step[here]) != 1).any():
                 raise DataError(f"{where}, episode {e}: steps are missing or come twice; split it there")
         of = None if time is None else time[here]
-        parts += restarts(Signals(of, X[here], U[here], W[here], here + 1))
+        parts += restarts(Signals(of, X[here], U[here], W[here], here + 1), where)
     dt = told.resample if told.resample is not None else told.dt
     if dt is None:
         if time is None:

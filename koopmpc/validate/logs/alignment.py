@@ -1,0 +1,273 @@
+"""Faults in how signals stand to one another: who is late, where an actuator ends, where rows are missing.
+
+Each hypothesis changes the log as its fault would be undone, and predicts the next row from the present one. What
+counts is the information on all states together, −½ log det of the residuals in nats a sample: a signal put where it
+belongs raises it, and it cannot be raised by moving what one sensor knows to another.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.lifting.base import short
+from koopmpc.validate.logs.log import Fault, Log, Place, fitted, information, listed
+
+_LATEST = 8  # steps by which a signal is looked for
+_ENOUGH = 200  # rows without which no lag is looked for
+_ROWS = 5_000  # rows that are looked at
+_GAIN = 0.02  # nats a sample that a hypothesis must win
+_SURE = 30.0  # nats in all
+_PREFERRED = 1.15  # of the gain of an input that is late, over that of a sensor: the commoner fault
+_BLOCKS = 8  # parts of the log of which nearly all must agree
+
+
+@dataclass(frozen=True)
+class Shift:
+    """State or input `column` (inputs after the states) is read `steps` rows later, or earlier where negative.
+
+    A sensor is never ahead, so a state is only read later: an earlier reading would be told by the others' future.
+    """
+
+    column: int
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Present rows, their inputs, the rows before and the next ones."""
+
+    X: Float[np.ndarray, "M nx"]
+    U: Float[np.ndarray, "M nu"]
+    before: Float[np.ndarray, "M nx"]
+    after: Float[np.ndarray, "M nx"]
+
+    def regressors(self, log: Log) -> Float[np.ndarray, "M p"]:
+        """Return what the next rows are predicted from."""
+        return np.hstack([log.stacked(self.X, self.U), (self.before - log.center) / log.size])
+
+    def residuals(self, log: Log, more: Float[np.ndarray, "M q"] | None = None) -> Float[np.ndarray, "M nx"]:
+        """Return the residuals of the next rows in sizes of the states; `more` are further regressors."""
+        P = self.regressors(log)
+        P = P if more is None else np.hstack([P, more])
+        return fitted(P, (self.after - self.X) / log.size)
+
+
+def rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> Rows:
+    """Return the rows of all episodes `margin` away from both ends, every signal moved by its shifts."""
+    nx = log.data.nx
+    parts: list[tuple[np.ndarray, ...]] = []
+    count = 0
+    for episode in log.data:
+        T = len(episode)
+        if T < 2 * margin + 3:
+            continue
+        k = np.arange(margin + 1, T - margin)
+        moved = np.zeros(nx + log.data.nu, dtype=np.intp)
+        for shift in shifts:
+            moved[shift.column] += shift.steps
+        def states(at: np.ndarray, X: np.ndarray = episode.X, moved: np.ndarray = moved) -> np.ndarray:
+            return np.stack([X[at + moved[i], i] for i in range(nx)], axis=1)
+        U = np.stack([episode.U[k + moved[nx + j], j] for j in range(log.data.nu)], axis=1) if log.data.nu else episode.U[k]
+        parts.append((states(k), U, states(k - 1), states(k + 1)))
+        count += len(k)
+        if count > _ROWS:
+            break
+    if not parts:
+        none = np.zeros((0, nx))
+        return Rows(none, np.zeros((0, log.data.nu)), none, none)
+    return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def won(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
+    """Return by how much `other` predicts better than `E`, in nats a sample, by the stricter of both counts."""
+    return float((information(other, log.fine) - information(E, log.fine)).min())
+
+
+def better(
+    log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN
+) -> bool:
+    """Return True where `other` predicts better than `E` beyond chance, and nearly everywhere."""
+    parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
+    agree = sum(won(log, a, b) > 0 for a, b in parts)
+    return won(log, E, other) > max(least, _SURE / len(E)) and agree >= _BLOCKS - 1
+
+
+def late(log: Log) -> Iterator[Fault]:
+    """Find inputs that act late, and sensors that are late against the others."""
+    data, nx = log.data, log.data.nx
+    if not data.nu and nx < 2:
+        return
+    plain = rows(log)
+    if len(plain.X) < max(_ENOUGH, 8 * plain.regressors(log).shape[1]):
+        return
+    found: tuple[Shift, ...] = ()
+    E = plain.residuals(log)
+    for _ in range(2):
+        if won(log, E, 0 * E) < _GAIN:
+            return
+        scores = {shift: won(log, E, rows(log, (*found, *shift)).residuals(log)) for shift in _shifts(log, found)}
+        best = max(scores, key=lambda shift: scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0))
+        other = rows(log, (*found, *best)).residuals(log)
+        if not better(log, E, other, _least(log, best[0], E)) or not _alone(log, found, best, other):
+            return
+        found, E = (*found, *best), other
+        yield _said(log, best)
+
+
+def _least(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"]) -> float:
+    """Return what a shift must win: a sensor the more, the further the errors go below what counts.
+
+    There the log holds next to no noise, and the smooth misfit of the regression depends on which row it is read from.
+    """
+    every, fine = information(E, log.fine)
+    return _GAIN if shift.column >= log.data.nx else 0.15 * (1 + float(every - fine))
+
+
+def _shifts(log: Log, found: tuple[Shift, ...]) -> Iterator[tuple[Shift, ...]]:
+    nx, nu = log.data.nx, log.data.nu
+    taken = {shift.column for shift in found}
+    for steps in range(1, _LATEST + 1):
+        if nu > 1 and not taken.intersection(range(nx, nx + nu)):
+            yield tuple(Shift(nx + j, -steps) for j in range(nu))
+        for j in range(nu):
+            if nx + j not in taken:
+                yield (Shift(nx + j, -steps),)
+        for i in range(nx if nx > 1 else 0):
+            if i not in taken:
+                yield (Shift(i, steps),)
+
+
+def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]) -> bool:
+    """Return True where the input of this row adds next to nothing to the one that is late."""
+    nx = log.data.nx
+    if shift[0].column < nx:
+        return True
+    now, moved = rows(log, found), rows(log, (*found, *shift))
+    both = moved.residuals(log, log.scaled(now.X, now.U)[1])
+    return won(log, E, both) < 0.1 * won(log, now.residuals(log), both)
+
+
+def _said(log: Log, shift: tuple[Shift, ...]) -> Fault:
+    nx, steps = log.data.nx, shift[0].steps
+    names = tuple(log.names[one.column] for one in shift)
+    said = " and ".join(short(name) for name in names)
+    count = f"{abs(steps)} step{'s' * (abs(steps) > 1)}"
+    if shift[0].column >= nx:
+        acts = "acts" if len(names) == 1 else "act"
+        return Fault(
+            "input delay",
+            f"{said} {acts} {count} late",
+            f"let the model see the past: embedding=km.Delay({abs(steps)})",
+            names,
+            steps=abs(steps),
+        )
+    return Fault(
+        "late sensor",
+        f"{said} is {count} behind the other signals",
+        f"move its column by {count}, or let the model see the past: embedding=km.Delay({abs(steps)})",
+        names,
+        steps=abs(steps),
+    )
+
+
+_QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of an input, at which an actuator may end
+_LEFT = 0.1  # share of the gain of a clipped input that what is clipped may add
+
+
+def ending(log: Log) -> Iterator[Fault]:
+    """Find inputs whose larger values have no more effect than a smaller one: the actuator ends there."""
+    plain = rows(log, margin=1)
+    if not log.data.nu or len(plain.X) < max(_ENOUGH, 8 * plain.regressors(log).shape[1]):
+        return
+    E = plain.residuals(log)
+    for j in range(log.data.nu):
+        column = plain.U[:, j]
+        ends = [(low, high) for side in ("both", "high", "low") for low, high in _ends(column, side)]
+        if not ends:
+            continue
+        scores = [won(log, E, _clipped(plain, j, *pair).residuals(log)) for pair in ends]
+        low, high = ends[int(np.argmax(scores))]
+        if not better(log, E, _clipped(plain, j, low, high).residuals(log)):
+            continue
+        low, high = _refined(log, plain, j, low, high)
+        clipped = _clipped(plain, j, low, high)
+        rest = (column - clipped.U[:, j])[:, None] / log.input_size[j]
+        inside = clipped.residuals(log)
+        if won(log, inside, clipped.residuals(log, rest)) > _LEFT * won(log, E, inside):
+            continue
+        name = short(log.data.inputs[j])
+        said = [f"below {low:.3g}"] * bool(low > column.min()) + [f"above {high:.3g}"] * bool(high < column.max())
+        call = [f"u_min={low:.3g}"] * bool(low > column.min()) + [f"u_max={high:.3g}"] * bool(high < column.max())
+        yield Fault(
+            "actuator at its limit",
+            f"{name} has no more effect {' and '.join(said)}: the actuator ends there, and the log holds the command",
+            f"clip {name} in the log to what was applied, and tell the controller: km.Limits({', '.join(call)})",
+            (log.data.inputs[j],),
+        )
+
+
+def _ends(column: Float[np.ndarray, " M"], side: str) -> Iterator[tuple[float, float]]:
+    """Yield low and high ends at quantiles of the input, of one side or both."""
+    for q in _QUANTILES:
+        low = float(np.quantile(column, q)) if side != "high" else float(column.min())
+        high = float(np.quantile(column, 1 - q)) if side != "low" else float(column.max())
+        if low < high and (low > column.min() or high < column.max()):
+            yield low, high
+
+
+def _clipped(of: Rows, j: int, low: float, high: float) -> Rows:
+    U = of.U.copy()
+    U[:, j] = np.clip(U[:, j], low, high)
+    return Rows(of.X, U, of.before, of.after)
+
+
+def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float, float]:
+    """Return the ends that predict best, each by golden section around what the quantiles gave."""
+    bottom, top = float(of.U[:, j].min()), float(of.U[:, j].max())
+    width = 0.1 * (top - bottom)
+    for _ in range(6):
+        tries = [(a, b) for a in (low - width, low, low + width) for b in (high - width, high, high + width)]
+        tries = [
+            (a if low > bottom else bottom, b if high < top else top)
+            for a, b in tries
+            if bottom <= a < b <= top or low == bottom or high == top
+        ]
+        scores = [float(information(_clipped(of, j, a, b).residuals(log), log.fine).sum()) for a, b in tries]
+        low, high = tries[int(np.argmax(scores))]
+        width /= 2
+    return low, high
+
+
+_JUMP = 1.5  # times the largest usual change from row to row
+_OFF = 10.0  # times the largest usual residual
+
+
+def jumps(log: Log) -> Iterator[Fault]:
+    """Find places where the states go on from elsewhere: rows are missing, or two runs stand in one episode."""
+    E = np.concatenate(log.residuals)
+    changes = np.concatenate([np.diff(e.X, axis=0) for e in log.data])
+    usual = np.maximum(np.quantile(np.abs(E), 0.97, axis=0), 1e-9)
+    widest = np.quantile(np.abs(changes), 0.99, axis=0)
+    places: list[Place] = []
+    for e, episode in enumerate(log.data):
+        d = np.diff(episode.X, axis=0)
+        off = (np.abs(log.residuals[e]) / usual).max(axis=1)
+        wide = (np.abs(d) > _JUMP * widest) & (widest > 0)
+        for k in 1 + np.flatnonzero(((off > _OFF) & wide.any(axis=1))[1:]):
+            if not (np.abs(log.residuals[e][k]) * log.size > 0.5 * np.abs(d[k]))[wide[k]].any():
+                continue
+            i = int(np.argmax(np.abs(d[k]) / np.where(widest > 0, widest, np.inf)))
+            back = k + 1 < len(d) and d[k + 1, i] * d[k, i] < 0 and abs(d[k + 1, i]) > 0.5 * abs(d[k, i])
+            since = d[k - 1, i] * d[k, i] < 0 and abs(d[k - 1, i]) > 0.5 * abs(d[k, i])
+            alone = (k + 1 >= len(d) or off[k + 1] < 0.5 * off[k]) and off[k - 1] < 0.5 * off[k]
+            if not back and not since and alone:
+                places.append(Place(e, int(k), int(k) + 2, jump=True))
+    if places and len(places) < 0.02 * log.steps:
+        yield Fault(
+            "jump",
+            f"the states go on from elsewhere {len(places)} times: {listed(tuple(places))}",
+            "rows are missing there, or a new run begins: cut the episode in two",
+            places=tuple(places),
+        )

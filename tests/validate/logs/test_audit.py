@@ -1,0 +1,140 @@
+"""The audit finds one fault in logs that have it, says which call removes it, and is silent on clean ones."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError
+from tests.bare import shown
+from tests.validate.logs.corpus import BEDS, FAULTS, Draw, clean, episodes, faulty, simulated
+
+CLEAN = [0, 7, 19, 40, 51, 87]
+
+
+@pytest.mark.parametrize(
+    "seed", [*CLEAN, *(pytest.param(s, marks=pytest.mark.slow) for s in range(200) if s not in CLEAN)]
+)
+def test_it_is_silent_on_logs_of_a_sound_plant(seed):
+    """Whatever the plant, the excitation, the noise of the sensors, and the length and number of the episodes."""
+    _, data = clean(seed)
+    report = km.validate.audit(data)
+    assert report.faults == (), str(report)
+    assert str(report) == f"no fault found in {len(data)} episode{'s' * (len(data) > 1)}, {report.steps} steps"
+
+
+@pytest.mark.parametrize("kind", list(FAULTS))
+def test_each_kind_of_fault_is_found_in_a_log_that_has_it(kind):
+    _, data = faulty(kind, 0)
+    report = km.validate.audit(data)
+    assert kind in report.kinds, str(report)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(FAULTS))
+def test_most_logs_of_varied_plants_that_have_a_fault_show_it(kind):
+    found = [kind in km.validate.audit(faulty(kind, seed)[1]).kinds for seed in range(10)]
+    assert sum(found) >= 8, found
+
+
+STEADY = Draw("motor", 0.03, 20, 100, 1e-3, 0.0, "noise", 3)
+
+
+def test_a_late_input_is_told_with_the_delay_that_models_it():
+    rng = np.random.default_rng(3)
+    X, U = simulated(STEADY, rng, lambda U: np.concatenate([U[:, :1], U[:, :1], U[:, :-2]], axis=1))
+    data = episodes(STEADY, X, U)
+    report = km.validate.audit(data)
+    assert report.kinds == ("input delay",)
+    assert report.delay == 2
+    assert "voltage acts 2 steps late. Let the model see the past: embedding=km.Delay(2)." in str(report)
+    fit = lambda **how: km.score(km.edmd(data[:14], km.State() + km.Constant(), **how), data[14:], 10).total
+    assert fit(embedding=km.Delay(2)) < 0.5 * fit()  # the advice is worth something
+
+
+def test_an_actuator_that_ends_is_told_with_its_limits():
+    rng = np.random.default_rng(4)
+    X, U = simulated(STEADY, rng, lambda U: np.clip(U, -3.0, 2.0))
+    (fault,) = km.validate.audit(episodes(STEADY, X, U)).faults
+    low, high = (float(word.strip(",)").split("=")[1]) for word in fault.do.split("km.Limits(")[1].split())
+    assert low == pytest.approx(-3.0, abs=0.3)
+    assert high == pytest.approx(2.0, abs=0.3)
+
+
+def test_rows_at_fault_are_cut_out_and_nothing_else():
+    X, U = simulated(STEADY, np.random.default_rng(5))
+    X[4, 50, 1] += 100
+    X[7, 10:40, 0] = X[7, 10, 0]
+    data = episodes(STEADY, X, U)
+    report = km.validate.audit(data)
+    assert set(report.kinds) == {"spikes", "stuck sensor"}
+    rest = report.without_faults(data)
+    assert sum(len(e.X) for e in rest) == 20 * 101 - 1 - 30
+    assert km.validate.audit(rest).faults == ()
+
+
+def test_episodes_after_a_change_are_named():
+    X, U = simulated(STEADY, np.random.default_rng(6))
+    X[15:, :, 0] *= 180 / np.pi
+    (fault,) = km.validate.audit(episodes(STEADY, X, U)).faults
+    assert fault.kind == "unit change"
+    assert fault.columns == ("angle [rad]",)
+    assert "180/π times as large" in fault.says
+    assert {place.episode for place in fault.places} == set(range(15, 20))
+
+
+def test_one_signal_under_two_names_is_told():
+    X, U = simulated(STEADY, np.random.default_rng(8))
+    both = [km.Episode(X=np.column_stack([x, x[:, 0] * 180 / np.pi + 5]), U=u) for x, u in zip(X, U, strict=True)]
+    names = ["angle [rad]", "speed [rad/s]", "current [A]", "angle [deg]"]
+    faults = km.validate.audit(km.Episodes(both, 0.03, names, ["voltage [V]"])).faults
+    assert faults[0].kind == "repeated column"
+    assert "angle is 57.2958 times angle" in faults[0].says
+
+
+def _clock(data):
+    return [np.arange(len(e.X)) * data.dt for e in data]
+
+
+def test_time_stamps_show_jitter_resets_gaps_and_another_rate():
+    data = episodes(STEADY, *simulated(STEADY, np.random.default_rng(7)))
+    assert km.validate.audit(data, times=_clock(data)).faults == ()
+    rng = np.random.default_rng(0)
+    jitter = [t + rng.uniform(-0.2, 0.2, len(t)) * data.dt for t in _clock(data)]
+    assert km.validate.audit(data, times=jitter).kinds == ("jitter",)
+    reset, gap, rate = _clock(data), _clock(data), _clock(data)
+    reset[3][50:] -= 1.0
+    report = km.validate.audit(data, times=reset)
+    assert report.kinds == ("clock reset",)
+    assert [len(e) for e in report.without_faults(data)][3:5] == [49, 50]
+    gap[2][30:] += 0.5
+    assert km.validate.audit(data, times=gap).kinds == ("jump",)
+    rate[9] = 2 * rate[9]
+    assert km.validate.audit(data, times=rate).kinds == ("mixed sampling",)
+
+
+def test_what_is_no_log_is_refused_in_words():
+    assert shown("show(lambda: km.validate.audit(np.zeros((3, 2))))")[0].startswith("DataError episodes is a ndarray")
+    data = episodes(STEADY, *simulated(STEADY, np.random.default_rng(7)))
+    with pytest.raises(DataError, match="times are given for 1 episodes, the data have 20"):
+        km.validate.audit(data, times=_clock(data)[:1])
+
+
+def test_small_or_autonomous_logs_are_looked_at_as_far_as_they_go():
+    short = km.Episodes([km.Episode(X=[[0.0], [1.0]], U=[[1.0]])], 0.1)
+    assert "constant input" in km.validate.audit(short).kinds
+    rng = np.random.default_rng(0)
+    A = np.array([[0.99, 0.1], [-0.1, 0.99]])
+    free = []
+    for _ in range(10):
+        X = [rng.normal(size=2)]
+        for _ in range(60):
+            X.append(A @ X[-1])
+        free.append(km.Episode(X=X))
+    assert km.validate.audit(km.Episodes(free, 0.1)).faults == ()
+
+
+def test_the_corpus_varies_what_it_claims_to():
+    drawn = [clean(seed)[0] for seed in range(60)]
+    assert {of.bed for of in drawn} == set(BEDS)
+    assert len({of.drive for of in drawn}) == 5
+    assert {of.noise for of in drawn} == {0.0, 1e-4, 1e-3, 5e-3, 2e-2}
