@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import Fault, Log, Place, fitted, information, listed
+from koopmpc.validate.logs.log import LogFault, Log, Place, fitted, information, listed
 
 _LATEST = 8  # steps by which a signal is looked for
 _ENOUGH = 200  # rows without which no lag is looked for
@@ -94,7 +94,7 @@ def better(
     return won(log, E, other) > max(least, _SURE / len(E)) and agree >= _BLOCKS - 1
 
 
-def late(log: Log) -> Iterator[Fault]:
+def late(log: Log) -> Iterator[LogFault]:
     """Find inputs that act late, and sensors that are late against the others."""
     data, nx = log.data, log.data.nx
     if not data.nu and nx < 2:
@@ -149,21 +149,21 @@ def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Floa
     return won(log, E, both) < 0.1 * won(log, now.residuals(log), both)
 
 
-def _said(log: Log, shift: tuple[Shift, ...]) -> Fault:
+def _said(log: Log, shift: tuple[Shift, ...]) -> LogFault:
     nx, steps = log.data.nx, shift[0].steps
     names = tuple(log.names[one.column] for one in shift)
     said = " and ".join(short(name) for name in names)
     count = f"{abs(steps)} step{'s' * (abs(steps) > 1)}"
     if shift[0].column >= nx:
         acts = "acts" if len(names) == 1 else "act"
-        return Fault(
+        return LogFault(
             "input delay",
             f"{said} {acts} {count} late",
             f"let the model see the past: embedding=km.Delay({abs(steps)})",
             names,
             steps=abs(steps),
         )
-    return Fault(
+    return LogFault(
         "late sensor",
         f"{said} is {count} behind the other signals",
         f"move its column by {count}, or let the model see the past: embedding=km.Delay({abs(steps)})",
@@ -176,7 +176,7 @@ _QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of an input, 
 _LEFT = 0.1  # share of the gain of a clipped input that what is clipped may add
 
 
-def ending(log: Log) -> Iterator[Fault]:
+def ending(log: Log) -> Iterator[LogFault]:
     """Find inputs whose larger values have no more effect than a smaller one: the actuator ends there."""
     plain = rows(log, margin=1)
     if not log.data.nu or len(plain.X) < max(_ENOUGH, 8 * plain.regressors(log).shape[1]):
@@ -200,7 +200,7 @@ def ending(log: Log) -> Iterator[Fault]:
         name = short(log.data.inputs[j])
         said = [f"below {low:.3g}"] * bool(low > column.min()) + [f"above {high:.3g}"] * bool(high < column.max())
         call = [f"u_min={low:.3g}"] * bool(low > column.min()) + [f"u_max={high:.3g}"] * bool(high < column.max())
-        yield Fault(
+        yield LogFault(
             "actuator at its limit",
             f"{name} has no more effect {' and '.join(said)}: the actuator ends there, and the log holds the command",
             f"clip {name} in the log to what was applied, and tell the controller: km.Limits({', '.join(call)})",
@@ -244,7 +244,7 @@ _JUMP = 1.5  # times the largest usual change from row to row
 _OFF = 10.0  # times the largest usual residual
 
 
-def jumps(log: Log) -> Iterator[Fault]:
+def jumps(log: Log) -> Iterator[LogFault]:
     """Find places where the states go on from elsewhere: rows are missing, or two runs stand in one episode."""
     E = np.concatenate(log.residuals)
     changes = np.concatenate([np.diff(e.X, axis=0) for e in log.data])
@@ -265,7 +265,7 @@ def jumps(log: Log) -> Iterator[Fault]:
             if not back and not since and alone:
                 places.append(Place(e, int(k), int(k) + 2, jump=True))
     if places and len(places) < 0.02 * log.steps:
-        yield Fault(
+        yield LogFault(
             "jump",
             f"the states go on from elsewhere {len(places)} times: {listed(tuple(places))}",
             "rows are missing there, or a new run begins: cut the episode in two",

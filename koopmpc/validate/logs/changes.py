@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import Fault, Log, Place, episodes_of_places, solved
+from koopmpc.validate.logs.log import LogFault, Log, Place, episodes_of_places, solved
 
 _SEGMENTS = 40
 _SHORTEST = 30  # rows of a segment
@@ -45,7 +45,7 @@ Pair = tuple[np.ndarray, np.ndarray]  # X (T+1, nx) and U (T, nu) of a segment
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class OneStepLaw:
     """The one-step law x⁺ − x = size · W' φ(x, u) of the consensus, and its errors."""
 
     log: Log
@@ -73,10 +73,10 @@ class Change:
     kind: str
     columns: tuple[str, ...]
     says: str
-    errors: Callable[[Law, np.ndarray, np.ndarray], np.ndarray]
+    errors: Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]
 
 
-def midway(log: Log) -> Iterator[Fault]:
+def midway(log: Log) -> Iterator[LogFault]:
     """Find the change under which a part of the log follows the law of the rest."""
     segments = _segments(log)
     law, agreed = _consensus(log, segments)
@@ -106,7 +106,7 @@ def midway(log: Log) -> Iterator[Fault]:
     _, change, which = best
     places = tuple(segments[s] for s in which)
     where = episodes_of_places(places) if len(log.data) > 1 else f"from row {places[0].first} on"
-    yield Fault(
+    yield LogFault(
         change.kind,
         f"{change.says} in {where}: undone, these rows follow the law of the others",
         "undo it there, or leave these episodes out",
@@ -130,7 +130,7 @@ def _pair(log: Log, place: Place) -> Pair:
     return episode.X[place.first : place.last + 1], episode.U[place.first : place.last]
 
 
-def _consensus(log: Log, segments: list[Place]) -> tuple[Law | None, set[int]]:
+def _consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, set[int]]:
     """Return the law of the 60 % of the segments that agree best, and which they are."""
     if len(segments) < 5:
         return None, set()
@@ -162,12 +162,12 @@ def _consensus(log: Log, segments: list[Place]) -> tuple[Law | None, set[int]]:
         if best is None or total < best[0]:
             best = (total, which, W)
     assert best is not None
-    law = Law(log, best[2], np.zeros(log.data.nx))
+    law = OneStepLaw(log, best[2], np.zeros(log.data.nx))
     level = np.median([law.errors(*_pair(log, segments[int(s)])) for s in best[1]], axis=0)
-    return Law(log, best[2], level), {int(s) for s in best[1]}
+    return OneStepLaw(log, best[2], level), {int(s) for s in best[1]}
 
 
-def _hypotheses(log: Log, law: Law, pairs: list[Pair]) -> Iterator[Change]:
+def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change]:
     data = log.data
     for i, name in enumerate(data.states):
         yield Change("sensor sign", (name,), f"{short(name)} has the other sign", _scaled_state(i, -1.0))
@@ -197,8 +197,8 @@ def _hypotheses(log: Log, law: Law, pairs: list[Pair]) -> Iterator[Change]:
         yield Change("mixed sampling", (), f"rows are {r} times as close ({data.dt / r:.3g} s)", _faster(r))
 
 
-def _scaled_state(i: int, factor: float) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: Law, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _scaled_state(i: int, factor: float) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
+    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
         X = X.copy()
         X[:, i] *= factor
         return law.errors(X, U)
@@ -206,8 +206,8 @@ def _scaled_state(i: int, factor: float) -> Callable[[Law, np.ndarray, np.ndarra
     return errors
 
 
-def _scaled_input(j: int | slice, factor: float) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: Law, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _scaled_input(j: int | slice, factor: float) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
+    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
         U = U.copy()
         U[:, j] *= factor
         return law.errors(X, U)
@@ -215,8 +215,8 @@ def _scaled_input(j: int | slice, factor: float) -> Callable[[Law, np.ndarray, n
     return errors
 
 
-def _swapped(i: int, j: int, states: bool) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: Law, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _swapped(i: int, j: int, states: bool) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
+    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
         changed = (X if states else U).copy()
         changed[:, [i, j]] = changed[:, [j, i]]
         return law.errors(changed, U) if states else law.errors(X, changed)
@@ -224,8 +224,8 @@ def _swapped(i: int, j: int, states: bool) -> Callable[[Law, np.ndarray, np.ndar
     return errors
 
 
-def _moved(i: int, by: float) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: Law, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _moved(i: int, by: float) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
+    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
         X = X.copy()
         X[:, i] += by
         return law.errors(X, U)
@@ -233,8 +233,8 @@ def _moved(i: int, by: float) -> Callable[[Law, np.ndarray, np.ndarray], np.ndar
     return errors
 
 
-def _slower(r: int) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: Law, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _slower(r: int) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
+    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore", invalid="ignore"):
             ahead = X[:-1]
             for _ in range(r):
@@ -244,8 +244,8 @@ def _slower(r: int) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
     return errors
 
 
-def _faster(r: int) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: Law, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _faster(r: int) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
+    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
         T = len(U) - r + 1
         mean = np.mean([U[s : s + T] for s in range(r)], axis=0)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -254,7 +254,7 @@ def _faster(r: int) -> Callable[[Law, np.ndarray, np.ndarray], np.ndarray]:
     return errors
 
 
-def _best_offset(log: Log, law: Law, pairs: list[Pair], i: int) -> float:
+def _best_offset(log: Log, law: OneStepLaw, pairs: list[Pair], i: int) -> float:
     """Return the offset of state i under which the segments follow the law best."""
 
     def total(b: float) -> float:

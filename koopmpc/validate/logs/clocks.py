@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.validate.logs.log import Fault, Place, listed
+from koopmpc.validate.logs.log import LogFault, Place, listed
 from koopmpc.validate.text import percent
 
 _JITTER = 0.02  # share of dt by which a step may differ, as in load_episodes
@@ -17,7 +17,7 @@ _GAP = 1.5  # a step longer than 1.5 dt is a gap
 _OTHER = 0.1  # share of dt by which the median step of an episode must differ to be another rate
 
 
-def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Fault]:
+def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFault]:
     """Find what the time stamps of the rows tell.
 
     Raises
@@ -38,7 +38,7 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Fault]:
     dt = float(np.median(forward))
     resets = _places(stamps, lambda d: d <= 0)
     if resets:
-        yield Fault(
+        yield LogFault(
             "clock reset",
             f"the clock goes back or stands still {len(resets)} times: {listed(resets)}",
             "cut the episodes there: load_episodes does where it goes back",
@@ -48,7 +48,7 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Fault]:
     other = [e for e, t in enumerate(stamps) if abs(np.median(np.diff(t)) - dt) > _OTHER * dt]
     if other:
         shown = ", ".join(f"episode {e} {np.median(np.diff(stamps[e])):.4g} s" for e in other[:3])
-        yield Fault(
+        yield LogFault(
             "mixed sampling",
             f"{len(other)} of {len(data)} episodes have another step than {dt:.4g} s: {shown}",
             f"bring them to one step: load_episodes(…, resample={dt:.4g})",
@@ -56,7 +56,7 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Fault]:
         )
     gaps = tuple(p for p in gaps if p.episode not in other)
     if gaps:
-        yield Fault(
+        yield LogFault(
             "jump",
             f"rows are missing {len(gaps)} times, by the clock: {listed(gaps)}",
             "cut the episodes there: load_episodes does",
@@ -67,7 +67,7 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Fault]:
     usual = usual[(usual > 0) & (usual <= _GAP * dt)]
     uneven = np.abs(usual - dt) > _JITTER * dt
     if uneven.any():
-        yield Fault(
+        yield LogFault(
             "jitter",
             f"{percent(float(uneven.mean()))} of the steps differ from {dt:.4g} s by more than 2 %, from "
             f"{usual.min():.4g} to {usual.max():.4g} s",

@@ -8,7 +8,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import short
 from koopmpc.validate.identifiability import persistency
 from koopmpc.validate.logs.alignment import better, rows
-from koopmpc.validate.logs.log import Fault, Log, fitted, information
+from koopmpc.validate.logs.log import LogFault, Log, fitted, information
 from koopmpc.validate.text import percent
 
 _PAST = 10  # inputs of the past that may tell the next one
@@ -17,12 +17,12 @@ _FREE = 1e-4  # share of an input that its own past must leave open
 _ENOUGH = 200  # rows without which no effect is looked for
 
 
-def constant(log: Log) -> Iterator[Fault]:
+def constant(log: Log) -> Iterator[LogFault]:
     """Find inputs that never move."""
     U = np.concatenate([e.U for e in log.data])
     for j in np.flatnonzero(np.ptp(U, axis=0) == 0):
         name = short(log.data.inputs[j])
-        yield Fault(
+        yield LogFault(
             "constant input",
             f"{name} is {U[0, j]:.4g} throughout: what it does cannot be learned",
             f"excite {name}, with km.Noise or km.PRBS, or leave it out",
@@ -30,7 +30,7 @@ def constant(log: Log) -> Iterator[Fault]:
         )
 
 
-def together(log: Log) -> Iterator[Fault]:
+def together(log: Log) -> Iterator[LogFault]:
     """Find inputs of which one follows from the others."""
     U = np.concatenate([e.U for e in log.data])
     moving = [j for j in range(log.data.nu) if np.ptp(U[:, j]) > 0]
@@ -38,7 +38,7 @@ def together(log: Log) -> Iterator[Fault]:
     for n, j in enumerate(moving):
         if n and float((fitted(V[:, :n], V[:, [n]]) ** 2).mean()) < 1e-4:
             others = ", ".join(short(log.data.inputs[i]) for i in moving[:n])
-            yield Fault(
+            yield LogFault(
                 "inputs together",
                 f"{short(log.data.inputs[j])} follows from {others}: their effects cannot be told apart",
                 "excite each input by its own noise",
@@ -46,7 +46,7 @@ def together(log: Log) -> Iterator[Fault]:
             )
 
 
-def excitation(log: Log) -> Iterator[Fault]:
+def excitation(log: Log) -> Iterator[LogFault]:
     """Find inputs that excite to a lower order than the plant has states."""
     U = np.concatenate([e.U for e in log.data])
     order = log.data.nx + 1
@@ -60,7 +60,7 @@ def excitation(log: Log) -> Iterator[Fault]:
         good = int((found.conditions < 1e7).sum())
         if good < min(order, 3):
             name = short(log.data.inputs[j])
-            yield Fault(
+            yield LogFault(
                 "little excitation",
                 f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or steps "
                 "that hardly ever come",
@@ -69,7 +69,7 @@ def excitation(log: Log) -> Iterator[Fault]:
             )
 
 
-def without_effect(log: Log) -> Iterator[Fault]:
+def without_effect(log: Log) -> Iterator[LogFault]:
     """Find inputs that move and change no state within a few steps."""
     nu = log.data.nu
     near = rows(log, margin=6)
@@ -88,7 +88,7 @@ def without_effect(log: Log) -> Iterator[Fault]:
         chance = own.shape[1] * Y.shape[1] / (2 * len(Y))
         if information(other, log.fine)[0] - information(E, log.fine)[0] < 4 * chance + 2e-4 and not better(log, E, other, 1e-3):
             name = short(log.data.inputs[j])
-            yield Fault(
+            yield LogFault(
                 "input without effect",
                 f"{name} moves, and no state follows within {6} steps",
                 f"check that {name} was applied and is in the right column; excite it more strongly; else leave it out",
@@ -102,7 +102,7 @@ def _past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
     return np.hstack([U[k - lag] for lag in range(count)])
 
 
-def feedback(log: Log) -> Iterator[Fault]:
+def feedback(log: Log) -> Iterator[LogFault]:
     """Find inputs whose news follow from the state.
 
     The past of an input leaves a part of it open. In an open loop the state cannot tell that part, for it has not
@@ -128,7 +128,7 @@ def feedback(log: Log) -> Iterator[Fault]:
         exact = alone[j] < 1e-8 * around[j]
         if exact or (told > _EXPLAINED and left[j] > _FREE * around[j] and alone[j] < 0.1 * around[j]):
             name = short(log.data.inputs[j])
-            yield Fault(
+            yield LogFault(
                 "feedback",
                 f"the states tell {percent(1 - alone[j] / around[j])} of {name}: it was a feedback, so that A and B "
                 "cannot be told apart",

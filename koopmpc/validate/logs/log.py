@@ -33,7 +33,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Fault(Value):
+class LogFault(Value):
     """One fault of the logs.
 
     Attributes

@@ -12,7 +12,7 @@ from koopmpc.validate.logs.alignment import ending, jumps, late
 from koopmpc.validate.logs.changes import midway
 from koopmpc.validate.logs.clocks import clock_faults
 from koopmpc.validate.logs.inputs import constant, excitation, feedback, together, without_effect
-from koopmpc.validate.logs.log import Fault, Log, Place, runs
+from koopmpc.validate.logs.log import LogFault, Log, Place, runs
 from koopmpc.validate.logs.values import (
     coarse,
     held,
@@ -30,7 +30,7 @@ from koopmpc.validate.logs.values import (
 from koopmpc.validate.text import labelled, written
 from koopmpc.values import Value
 
-Check = Callable[[Log], Iterator[Fault]]
+Check = Callable[[Log], Iterator[LogFault]]
 _VALUES: tuple[Check, ...] = (
     repeated_columns,
     repeated_episodes,
@@ -58,7 +58,7 @@ class AuditReport(Value):
         How much was looked at.
     """
 
-    faults: tuple[Fault, ...]
+    faults: tuple[LogFault, ...]
     episodes: int
     steps: int
 
@@ -189,7 +189,7 @@ class Remainder:
                 origins.append(Place(e, a, b))
         return Remainder(self.data.with_episodes(pieces), tuple(origins)) if pieces else None
 
-    def original(self, fault: Fault) -> Fault:
+    def original(self, fault: LogFault) -> LogFault:
         """Return the fault with its places in the data that this was cut from."""
         moved = [
             Place(self.origins[p.episode].episode, p.first + first, p.last + first, p.jump)

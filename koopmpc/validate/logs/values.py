@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import Fault, Log, Place, episodes_of_places, listed, runs
+from koopmpc.validate.logs.log import LogFault, Log, Place, episodes_of_places, listed, runs
 from koopmpc.validate.text import percent
 
 _GRID = 0.95  # share of a sensor's different values that stand on a grid
@@ -18,7 +18,7 @@ _OVERLAP = 10  # rows that two episodes share
 _FAR = 3.0  # times the largest usual step: a jump
 
 
-def repeated_columns(log: Log) -> Iterator[Fault]:
+def repeated_columns(log: Log) -> Iterator[LogFault]:
     """Find states that are another one times a constant: two names of one signal."""
     Z = log.X - log.X.mean(axis=0)
     norm = np.linalg.norm(Z, axis=0)
@@ -30,7 +30,7 @@ def repeated_columns(log: Log) -> Iterator[Fault]:
                 if np.abs(unit).max() * np.sqrt(len(Z)) < 1e-7:
                     first, second = short(log.data.states[i]), short(log.data.states[j])
                     factor = norm[j] / norm[i] * np.sign(Z[:, i] @ Z[:, j])
-                    yield Fault(
+                    yield LogFault(
                         "repeated column",
                         f"{second} is {factor:.6g} times {first}, up to a constant: one signal under two names",
                         f"leave {second} out: load_episodes(…, states=[…])",
@@ -39,7 +39,7 @@ def repeated_columns(log: Log) -> Iterator[Fault]:
                     break
 
 
-def repeated_episodes(log: Log) -> Iterator[Fault]:
+def repeated_episodes(log: Log) -> Iterator[LogFault]:
     """Find rows that stand in two episodes: they would train a model and judge it."""
     seen: dict[bytes, tuple[int, int]] = {}
     places: list[Place] = []
@@ -58,7 +58,7 @@ def repeated_episodes(log: Log) -> Iterator[Fault]:
         for k, key in enumerate(keys):
             seen.setdefault(key, (e, k))
     if places:
-        yield Fault(
+        yield LogFault(
             "repeated episode",
             f"{episodes_of_places(tuple(places))} repeat rows of episode {min(first_of)}"
             + ("" if len(first_of) == 1 else " and others"),
@@ -82,12 +82,12 @@ def grid(column: Float[np.ndarray, " M"]) -> float:
     return step if np.mean(off < 0.01) >= _GRID else 0.0
 
 
-def quantised(log: Log) -> Iterator[Fault]:
+def quantised(log: Log) -> Iterator[LogFault]:
     """Find sensors whose grid is coarse against a usual step."""
     for i, step in coarse(log).items():
         name = short(log.data.states[i])
         changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
-        yield Fault(
+        yield LogFault(
             "quantised",
             f"{name} moves in steps of {step:.3g}, and half of its changes from row to row are below "
             f"{np.median(changes):.3g}: its resolution hides what a model is to learn",
@@ -108,13 +108,13 @@ def coarse(log: Log) -> dict[int, float]:
     return found
 
 
-def slow(log: Log) -> Iterator[Fault]:
+def slow(log: Log) -> Iterator[LogFault]:
     """Find sensors that show a new value every second row, or less often."""
     for i in slow_states(log):
         zero = np.concatenate([np.diff(e.X[:, i]) == 0 for e in log.data])
         every = round(1 / max(1 - float(zero.mean()), 1e-3))
         name = short(log.data.states[i])
-        yield Fault(
+        yield LogFault(
             "slow sensor",
             f"{name} shows a new value every {every} rows only and repeats it in between",
             f"log every {every}th row, or pass embedding=km.Delay({every - 1})",
@@ -138,7 +138,7 @@ def slow_states(log: Log) -> list[int]:
     return found
 
 
-def stuck(log: Log) -> Iterator[Fault]:
+def stuck(log: Log) -> Iterator[LogFault]:
     """Find sensors that stand still for a while though the other states move."""
     rough, lazy = coarse(log), slow_states(log)
     places: dict[int, list[Place]] = {}
@@ -164,7 +164,7 @@ def stuck(log: Log) -> Iterator[Fault]:
             places.setdefault(i, []).extend(found)
     for i, found in places.items():
         name = short(log.data.states[i])
-        yield Fault(
+        yield LogFault(
             "stuck sensor",
             f"{name} stands still while other signals move: {listed(tuple(found))}",
             "leave these rows out",
@@ -192,7 +192,7 @@ def limits(log: Log) -> dict[int, tuple[float, ...]]:
     return {i: ends for i, ends in found.items() if i not in coarse(log) and i not in slow_states(log)}
 
 
-def saturated(log: Log) -> Iterator[Fault]:
+def saturated(log: Log) -> Iterator[LogFault]:
     """Find sensors that stay at the same extreme value again and again."""
     for i, ends in limits(log).items():
         places = tuple(
@@ -204,7 +204,7 @@ def saturated(log: Log) -> Iterator[Fault]:
         )
         share = np.mean(np.isin(log.X[:, i], ends))
         name, said = short(log.data.states[i]), " and ".join(f"{end:.4g}" for end in ends)
-        yield Fault(
+        yield LogFault(
             "sensor at its limit",
             f"{name} stays at {said} in {percent(float(share))} of the rows: the sensor goes no further",
             "leave these rows out, and hold the controller inside: "
@@ -214,7 +214,7 @@ def saturated(log: Log) -> Iterator[Fault]:
         )
 
 
-def held(log: Log) -> Iterator[Fault]:
+def held(log: Log) -> Iterator[LogFault]:
     """Find rows in which no sensor moves though the plant did: held samples, or rows written twice."""
     whole = [i for i in range(log.data.nx) if i not in coarse(log) and np.ptp(log.X[:, i]) > 0]
     if not whole or len(slow_states(log)) == len(whole):
@@ -242,14 +242,14 @@ def held(log: Log) -> Iterator[Fault]:
     found, rows = tuple(places), sum(p.last - p.first for p in places)
     longest = max(p.last - p.first for p in places)
     if longest > 2 or not travels or float(np.median(travels)) > 0.72:
-        yield Fault(
+        yield LogFault(
             "held samples",
             f"no sensor moves in {rows} rows, up to {longest} in sequence, though the plant does: {listed(found)}",
             "leave these rows out: the logger held its last values",
             places=found,
         )
     else:
-        yield Fault(
+        yield LogFault(
             "rows twice",
             f"{rows} rows repeat the row before them, and the plant goes on from there: {listed(found)}",
             "drop the second of each pair",
@@ -268,7 +268,7 @@ def _smoothest(log: Log, among: list[int]) -> int:
     return among[int(np.argmax(likeness))]
 
 
-def outliers(log: Log) -> Iterator[Fault]:
+def outliers(log: Log) -> Iterator[LogFault]:
     """Find single rows far off both neighbours: the same number each time, a mark of loss, or spikes."""
     for i in range(log.data.nx):
         name = short(log.data.states[i])
@@ -278,7 +278,7 @@ def outliers(log: Log) -> Iterator[Fault]:
         marks = _marked(log, i, changes)
         if marks is not None:
             value, places = marks
-            yield Fault(
+            yield LogFault(
                 "lost samples",
                 f"{name} jumps to {value:.6g} and back {len(places)} times: {listed(places)}",
                 f"{value:.6g} marks a lost sample: leave these rows out",
@@ -288,7 +288,7 @@ def outliers(log: Log) -> Iterator[Fault]:
             continue
         places = tuple(_spikes(log, i, changes))
         if places and sum(p.last - p.first for p in places) < 0.05 * len(log.X):
-            yield Fault(
+            yield LogFault(
                 "spikes",
                 f"{name} leaves its path for single rows {len(places)} times: {listed(places)}",
                 "leave these rows out",
@@ -354,12 +354,12 @@ def turns(log: Log) -> dict[int, float]:
     return found
 
 
-def wrapped(log: Log) -> Iterator[Fault]:
+def wrapped(log: Log) -> Iterator[LogFault]:
     """Find angles that jump by a whole turn."""
     for i, turn in turns(log).items():
         changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
         count = int((np.abs(changes - turn) < 0.25 * turn).sum())
-        yield Fault(
+        yield LogFault(
             "wrapped angle",
             f"{short(log.data.states[i])} jumps by {'360' if turn == 360 else '2π'} {count} times: it is wrapped",
             f"unwrap it along each episode (koopmpc fit does), or lift it by km.Fourier(2, states=[{i}]) alone",
