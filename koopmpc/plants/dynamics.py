@@ -36,13 +36,8 @@ class Dynamics(Named, ABC):
         return None
 
 
-@runtime_checkable
-class Plant(Protocol):
-    """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`.
-
-    Two members more are used where a plant has them: `ended`, a text that is empty until the plant itself ends the
-    episode and then says why, and `scene`, scene(x, u) → shapes for the animation in the logs.
-    """
+class Sampled(Protocol):
+    """What has a sample time, and names for its states, inputs and outputs."""
 
     @property
     def dt(self) -> float:
@@ -63,6 +58,15 @@ class Plant(Protocol):
     def outputs(self) -> tuple[str, ...]:
         """Names of y, with units."""
         ...
+
+
+@runtime_checkable
+class Plant(Sampled, Protocol):
+    """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`.
+
+    Two members more are used where a plant has them: `ended`, a text that is empty until the plant itself ends the
+    episode and then says why, and `scene`, scene(x, u) → shapes for the animation in the logs.
+    """
 
     @property
     def state(self) -> np.ndarray | None:

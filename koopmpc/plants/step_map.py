@@ -14,7 +14,7 @@ from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.batch import Batch, march, warn_of
 from koopmpc.plants.compiled import Buffered, dense
-from koopmpc.plants.dynamics import Dynamics, drawn_by, output, right_side
+from koopmpc.plants.dynamics import Dynamics, Sampled, drawn_by, output, right_side
 from koopmpc.plants.integrators import RK4, Integrator
 from koopmpc.scene import Scene
 from koopmpc.values import Named, Value, freeze
@@ -181,28 +181,8 @@ class StepMap(Named):
 
 
 @runtime_checkable
-class Transition(Protocol):
+class Transition(Sampled, Protocol):
     """x⁺ = F(x, u), y = h(x): what a `SimulatedPlant` needs of a step map."""
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        ...
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of x."""
-        ...
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of u."""
-        ...
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of y."""
-        ...
 
     @property
     def nx(self) -> int:

@@ -13,6 +13,7 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
+from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import StageProgress, map_tasks
 from koopmpc.predict.predictors import LinearPredictor
@@ -149,26 +150,11 @@ def select(
 
     def refit(row: LeaderboardRow) -> AnyPredictor:
         told = None if progress is None else partial(progress, f"fit of {row.title}")
+        read = ReadOptions(workers=workers, scheduler=scheduler, progress=told)
+        psi, embedding, ridge = row.lifting, row.embedding, row.ridge
         if row.kind == "linear":
-            return edmd(
-                source,
-                row.lifting,
-                embedding=row.embedding,
-                ridge=row.ridge,
-                workers=workers,
-                scheduler=scheduler,
-                progress=told,
-            )
-        return bilinear_edmd(
-            source,
-            row.lifting,
-            embedding=row.embedding,
-            ridge=row.ridge,
-            difference=True,
-            workers=workers,
-            scheduler=scheduler,
-            progress=told,
-        )
+            return edmd(source, psi, embedding=embedding, ridge=ridge, **read)
+        return bilinear_edmd(source, psi, embedding=embedding, ridge=ridge, difference=True, **read)
 
     predictor = refit(rows[chosen])
     best_linear = predictor if linear == chosen else refit(rows[linear])
