@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.bare import shown
 from tests.example_plants import CartPole
 
 MAP = km.discretize(CartPole(), 0.05)
@@ -69,7 +70,6 @@ def test_what_a_function_returns_wrongly_is_named(returned, message):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"step": 3}, "step is a int; pass a function"),
         ({"measure": lambda x: x}, "measure and outputs belong together"),
         ({"outputs": ("y",)}, "measure and outputs belong together"),
         ({"states": ()}, "states is empty"),
@@ -77,10 +77,14 @@ def test_what_a_function_returns_wrongly_is_named(returned, message):
     ],
 )
 def test_what_cannot_be_a_plant_is_refused(changed, message):
-    given = {"step": lambda x, u: x, "dt": 0.1, "states": ("a",), "inputs": ("u",)} | changed
-    step = given.pop("step")
+    given = {"dt": 0.1, "states": ("a",), "inputs": ("u",)} | changed
     with pytest.raises(km.KoopmpcError, match=message):
-        km.black_box(step, **given)
+        km.black_box(lambda x, u: x, **given)
+
+
+def test_a_step_that_is_no_function_is_refused():
+    (line,) = shown('show(lambda: km.black_box(3, dt=0.1, states=("a",), inputs=("u",)))')
+    assert "step is a int; pass a function" in line
 
 
 def test_a_map_that_has_no_state_of_its_own_asks_for_x0():
