@@ -128,6 +128,28 @@ def test_it_finds_a_load_on_the_input():
     np.testing.assert_allclose(observer.d, B[:, 0] * 0.7, atol=1e-8)
 
 
+def load_seen(horizon, steps, noise=0.0, seed=0):
+    """What a filter finds of a load on the input, of size 1, that begins after it has settled."""
+    A, B = np.array([[0.95, 0.1], [-0.1, 0.9]]), np.array([[0.0], [0.1]])
+    observer = km.LiftedKalman(["x0", "x1"]).start(linear(A, B), horizon)
+    rng, x, u = np.random.default_rng(seed), np.zeros(2), np.zeros(1)
+    found = []
+    for k in range(100 + steps):
+        observer.observe(x + noise * rng.normal(size=2), u, NO_W)
+        found.append(observer.d[1] / B[1, 0])
+        u = rng.normal(size=1)
+        x = A @ x + B @ (u + float(k >= 100))
+    return np.array(found)
+
+
+def test_a_load_is_found_within_the_horizon_and_a_longer_one_takes_less_noise_for_it():
+    for horizon in (8, 16, 32, 400):
+        late = min(horizon, 38)  # 400 steps settle as those of a mean with gain 0.1
+        assert abs(load_seen(horizon, late + 3)[-1] - 1) < 0.05
+    quick, slow = (load_seen(horizon, 2000, noise=0.1)[-1500:].std() for horizon in (8, 32))
+    assert slow < 0.7 * quick
+
+
 @given(st.integers(1, 5), st.integers(0, 10**6))
 def test_a_late_measurement_gives_the_estimate_of_then_predicted_through_the_inputs_since(delay, seed):
     rng = np.random.default_rng(seed)
