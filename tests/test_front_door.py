@@ -71,11 +71,21 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         km.edmdd  # noqa: B018
 
 
+def named(node: ast.stmt) -> list[str]:
+    """Return the public class, or alias of a type, that a statement of a module defines."""
+    if isinstance(node, ast.ClassDef):
+        names = [node.name]
+    else:
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        names = [target.id for target in targets if isinstance(target, ast.Name) and not target.id.isupper()]
+    return [name for name in names if name[0].isupper()]
+
+
 def test_the_name_of_a_class_means_one_thing() -> None:
     homes: dict[str, list[str]] = {}
     for file in ROOT.rglob("*.py"):
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                homes.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+            for name in named(node):
+                homes.setdefault(name, []).append(str(file.relative_to(ROOT)))
     twice = {name: files for name, files in homes.items() if len(files) > 1}
     assert not twice

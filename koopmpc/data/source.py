@@ -10,7 +10,7 @@ from koopmpc.data.episodes import Episodes, PlantSignature, joined
 from koopmpc.errors import DataError
 from koopmpc.values import Named
 
-Change = Callable[[Episodes], Episodes]
+EpisodesMap = Callable[[Episodes], Episodes]
 
 
 class Part(ABC):
@@ -103,7 +103,7 @@ class Changed(Source):
     def __init__(
         self,
         source: Source,
-        change: Change,
+        change: EpisodesMap,
         states: tuple[str, ...],
         inputs: tuple[str, ...],
         disturbances: tuple[str, ...] = (),
@@ -140,7 +140,7 @@ class ChangedPart(Part):
     """A part whose episodes go through `change` when it is loaded."""
 
     part: Part
-    change: Change
+    change: EpisodesMap
 
     def __str__(self) -> str:
         return str(self.part)
