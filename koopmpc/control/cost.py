@@ -147,9 +147,9 @@ class Sizes(NamedTuple):
         if nu == 0:
             raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
         tracked = cost.of.bind(states)
+        (Q, R), known = cost.matrices(tracked.nz, nu), dict(ranges or {})
         names = [*states, *(() if limits.of is None else limits.of.bind(states).names)]
         ends, inputs = limits.ends(len(states), len(names) - len(states)), limits.inputs(nu)
-        (Q, R), known = cost.matrices(tracked.nz, nu), dict(ranges or {})
         known |= {name: float(half) for name, half in zip(names, half_width(ends), strict=True) if half > 0}
         weights = dict(zip(tracked.names, Q.diagonal(), strict=True))
         widths = half_width(inputs)

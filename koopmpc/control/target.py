@@ -17,6 +17,7 @@ from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
+ROUNDING = 1e-9  # by how much of its value and its limit a target may stand outside before it is moved
 KEPT = 10_000  # coordinates remembered before the memory starts anew
 
 
@@ -41,6 +42,7 @@ class Targets:
     rows_disturbance: Float[np.ndarray, "nl nz"]
     low: Float[np.ndarray, " nl"]
     high: Float[np.ndarray, " nl"]
+    size: Float[np.ndarray, " nl"]  # the finite end of each limit that is farther from 0
     hard: int
     weighted: Float[np.ndarray, "nr na"]
     from_disturbance: Float[np.ndarray, "na nz"]
@@ -62,7 +64,7 @@ class Targets:
         pushed = np.zeros(len(self.rows)) if e is None else self.rows_disturbance @ e
         values = alpha @ self.rows.T
         low, high = self.low - pushed, self.high - pushed
-        slack = margin(values, self.low, self.high)
+        slack = ROUNDING * (np.abs(values) + self.size)
         outside = ((values < low - slack) | (values > high + slack)).any(axis=1)
         for k in np.flatnonzero(outside):
             key = R[k].tobytes() + (b"" if e is None else e.tobytes())
@@ -148,6 +150,7 @@ def targets(
     back = np.linalg.pinv(weighted, rcond=TOLERANCE) @ Q_root
     rows, values = np.vstack([W, G @ Z]), np.concatenate([u0, G @ z0])
     rows_disturbance = np.vstack([pushed[nz:], G @ pushed[:nz]])
+    low, high = (np.concatenate([inputs[i], outputs[i]]) - values for i in (0, 1))
     return Targets(
         z0=z0,
         Z=Z,
@@ -159,8 +162,9 @@ def targets(
         offset=-back @ C @ z0,
         rows=rows,
         rows_disturbance=rows_disturbance,
-        low=np.concatenate([inputs.low, outputs.low]) - values,
-        high=np.concatenate([inputs.high, outputs.high]) - values,
+        low=low,
+        high=high,
+        size=magnitude(Interval(low, high)),
         hard=nu,
         weighted=weighted,
         from_disturbance=-back @ C @ pushed[:nz],
@@ -179,10 +183,3 @@ def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: 
         )
     R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
     return np.ascontiguousarray(R[np.minimum(np.arange(first, first + N + 1), len(R) - 1)])
-
-
-def margin(
-    values: Float[np.ndarray, "..."], low: Float[np.ndarray, " nl"], high: Float[np.ndarray, " nl"]
-) -> Float[np.ndarray, "..."]:
-    """Return by how much a target may stand outside its limits before it is moved: 1e-9 of what both are, rounding."""
-    return 1e-9 * (np.abs(values) + magnitude(Interval(low, high)))

@@ -80,8 +80,8 @@ def simulate(
         n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
     measured
         w_k, (nw,) or (steps, nw): disturbances that the controller is told as `w`, rows k … k+horizon−1, the last
-        one repeated; with ``preview=False`` row k throughout. What they do to the plant is a `disturbance`, such as
-        W @ E.T. Kept in the metadata.
+        one repeated; with ``preview=False`` row k throughout. They do not move the plant: pass their effect as
+        `disturbance`, for example ``disturbance=W @ E.T``. The metadata keep them under "measured".
     faults
         What breaks, see `km.faults`. A signal passes through them in order, y_k after its noise. Run.Y is what the
         controller got. Run.U is what the plant got, which the controller is told at the next step. The metadata
@@ -213,7 +213,7 @@ def simulate(
 def _rows_ahead(
     values: ArrayLike, name: str, columns: str, count: int, horizon: int, counted: str
 ) -> Float[np.ndarray, "T n"]:
-    """Return `count` rows of a signal that is told ahead, and the last of them again for the horizon behind the end."""
+    """Return `count` rows of a signal that is previewed, and after them `horizon` copies of the last one."""
     rows = np.atleast_1d(checks.array(values, name))
     if rows.ndim == 1:
         rows = np.broadcast_to(rows, (count, len(rows)))

@@ -11,17 +11,15 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
+from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Interval, Limits, admitted
-from koopmpc.control.linear.condense import Coordinates, condense, scaled
-from koopmpc.control.linear.horizon import horizon_of, stages, terminal_of
-from koopmpc.control.linear.plan import PlanMap
+from koopmpc.control.linear.condense import Coordinates
+from koopmpc.control.linear.plan import plan_map
 from koopmpc.control.move import Move, Plan, Status, blocked
-from koopmpc.control.riccati import recursion
 from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
-from koopmpc.control.target import reference_rows, targets_of
+from koopmpc.control.target import reference_rows
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
@@ -37,8 +35,8 @@ class KoopmanMPC(MPCBase):
     [z, u_{−1}, w, d, 1] where those matter; where that plan meets every limit it is the optimum (status
     UNCONSTRAINED). Otherwise the condensed QP is solved for the deviation from it, warm-started with the last
     solution moved on by one step (OPTIMAL, or SOFTENED where a limit had to give way). A failed step falls back on
-    the last plan, then on the clipped unconstrained input, then on the last input. Inputs never leave their limits,
-    nor their rates where these are hard and within reach of the limits.
+    the last plan, then on the clipped unconstrained input, then on the last input. Inputs always keep their limits.
+    Their changes keep hard limits wherever the two do not exclude each other.
 
     Parameters
     ----------
@@ -55,17 +53,17 @@ class KoopmanMPC(MPCBase):
         Estimates z and a disturbance d of every lifted coordinate, so that no offset is left: `LiftedDisturbance`
         where y is the state, `LiftedKalman` where y is some of it. Without one y is the state, and d zero.
     latency
-        Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts
-        from the state predicted for then, under the inputs that are still to act; zero moved inside the limits
-        acts before the first. `horizon` grows by it: more of the reference is read.
+        Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts at
+        the state that is predicted for that time. Until the first input of a run arrives, zero is supposed to act,
+        or the limit nearest to it. The attribute `horizon`, the steps of reference that are read, is N + latency.
     solver
-        Who is asked first: "osqp", an operator-splitting method, which hands over to the other one after 100 iterations
-        unless `settings` say so, or "daqp", an active-set method.
+        The solver that is asked first: "osqp", an operator-splitting method, or "daqp", an active-set method. A QP that
+        OSQP has not solved in 100 iterations, or in the ``max_iter`` of `settings`, is handed over to DAQP.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}``.
     time_limit
-        Wall-clock time a step may take [s]. A QP that is not solved by then is given up for the fallback; what is
-        late although it was solved is used. Either way the status is TIME_LIMIT.
+        Wall-clock time that a step may take [s]. A QP that is not solved in this time is given up, and the fallback
+        acts. A solution that was found, but late, is used. In both cases the status is TIME_LIMIT.
 
     Raises
     ------
@@ -119,7 +117,7 @@ class KoopmanMPC(MPCBase):
         self.predictor, self._disturbed = predictor, estimator is not None
         self._options = {"solver": solver, "settings": dict(settings or {})}
         asked = SOLVERS[solver]
-        self._map = self._plan_map(predictor, track, self._wanted or asked.coordinates)
+        self._map = plan_map(predictor, track, blocks, self._wanted or asked.coordinates, disturbed=self._disturbed)
         exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
         choices = [Choice(asked, {**asked.impatient, **(settings or {})}), *exact]
         self._qps = StepSolver(self._map.qp, [*choices, Choice(SOLVERS["osqp"], {}, late=True)])
@@ -129,16 +127,6 @@ class KoopmanMPC(MPCBase):
         self._reference_key: bytes | None = None
         self._given_row, self._rows_left = 0, False  # of a u_target that is given in rows, for the next call
         self._see()
-
-    def _plan_map(self, predictor: LinearPredictor, track: LiftedTracking, coordinates: Coordinates) -> PlanMap:
-        """Return the plan of a predictor: its horizon by the Riccati recursion, condensed, with the limits."""
-        targets = targets_of(predictor, self.cost, track)
-        horizon = horizon_of(predictor, track, self._blocks, disturbed=self._disturbed)
-        steps = stages(horizon, targets)
-        end = terminal_of(predictor, self.cost, horizon, targets)
-        law = recursion(steps, end.P, end.p)
-        maps = condense(horizon, law, end, targets, coordinates)
-        return PlanMap(track, targets, horizon, scaled(maps, track.inputs, len(self._blocks)))
 
     def _see(self) -> None:
         """Make the views of the bytes that say which limits are met; a copy makes its own."""
@@ -186,7 +174,8 @@ class KoopmanMPC(MPCBase):
             if getattr(predictor, name) != getattr(old, name):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits)
-        self._map = self._plan_map(predictor, track, "plain" if self.coordinates == "plain" else "riccati")
+        coordinates = "plain" if self.coordinates == "plain" else "riccati"
+        self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=self._disturbed)
         self.predictor = predictor
         self._qps.update(self._map.qp)
         self._reference_key = None

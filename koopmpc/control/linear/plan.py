@@ -7,11 +7,13 @@ from jaxtyping import Float, Int
 
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.limits import Interval, Softness, ahead
-from koopmpc.control.linear.condense import Condensed, row_sizes
-from koopmpc.control.linear.horizon import Horizon
+from koopmpc.control.linear.condense import Condensed, Coordinates, condense, row_sizes, scaled
+from koopmpc.control.linear.horizon import Horizon, horizon_of, stages, terminal_of
+from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.qp import StepQP
-from koopmpc.control.target import Targets, margin
+from koopmpc.control.target import ROUNDING, Targets, targets_of
 from koopmpc.lifting.base import HUGE
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class PlanLimits(NamedTuple):
@@ -81,7 +83,7 @@ class PlanMap:
             first = np.vstack([first + every @ from_disturbance, moved, moved])
             free = np.full(len(moved), np.inf)
             t_low, t_high = targets.low[checked], targets.high[checked]
-            reach = margin(np.zeros_like(t_low), t_low, t_high)
+            reach = ROUNDING * targets.size[checked]
             low = np.concatenate([low, t_low - reach, -free])
             high = np.concatenate([high, free, t_high + reach])
         self.planned = nv
@@ -90,6 +92,24 @@ class PlanMap:
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
+
+
+def plan_map(
+    predictor: LinearPredictor,
+    track: LiftedTracking,
+    blocks: tuple[int, ...],
+    coordinates: Coordinates,
+    *,
+    disturbed: bool,
+) -> PlanMap:
+    """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
+    targets = targets_of(predictor, track.cost, track)
+    horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
+    steps = stages(horizon, targets)
+    end = terminal_of(predictor, track.cost, horizon, targets)
+    law = recursion(steps, end.P, end.p)
+    maps = condense(horizon, law, end, targets, coordinates)
+    return PlanMap(track, targets, horizon, scaled(maps, track.inputs, len(blocks)))
 
 
 def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "nv nw"]) -> PlanLimits:

@@ -38,7 +38,9 @@ DEFAULTS: Mapping[str, Any] = {
 }
 
 _STRICT = 1e-12  # eps_prim_inf where a first certificate was rounding
-_CERTAIN, _ROUNDING = 100.0, 1e-9  # by how much a certificate must exceed its own residual, and rounding
+# By how much a certificate must exceed its own residual, and rounding: of 29 false ones all but one reach 3 times the
+# residual, that one 23 times, and of 1489 true ones all reach 6600 times.
+_CERTAIN, _ROUNDING = 1000.0, 1e-9
 _SHORTEST = 1e-6  # seconds that a solve gets at least
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
@@ -172,8 +174,8 @@ class OSQP(QPSolver):
         y = np.array(self._solver.solution.prim_inf_cert)
         ends, A = np.where(y > 0, self.high, self.low), self._qp.A
         s, whole = float(ends @ y), float(np.abs(ends) @ np.abs(y))
-        terms = np.abs(A).T @ np.abs(y)
-        r = float((np.abs(A.T @ y) / np.where(terms > 0, terms, 1.0)).max(initial=0.0))
+        terms = float((np.abs(y) @ np.abs(A)).max(initial=0.0))
+        r = float(np.abs(y @ A).max(initial=0.0)) / max(terms, 1e-300)
         return s < -max(_CERTAIN * r, _ROUNDING) * whole
 
     def _believe(self, prim_inf: float) -> None:
