@@ -130,39 +130,82 @@ def fit(
     ] = None,
     logs: Logs = Path("logs"),
     name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "fit",
+    goal: Annotated[Path | None, typer.Option("--goal", help="A goal file: design a controller that keeps it.")] = None,
+    goal_template: Annotated[
+        bool, typer.Option("--goal-template", help="Write goal.toml for these logs, to be changed, and stop.")
+    ] = False,
 ) -> None:
-    """Choose a model for logged data, fit it, and say whether to trust it; no option is needed."""
+    """Choose a model for logged data, fit it, and say whether to trust it; with a goal, design a controller."""
+    from koopmpc.fitting.control import design_data, template_of
     from koopmpc.fitting.fit import fit_data
 
     out, err = _console(), Console(stderr=True)
-    with _friendly():
-        folder = _new_folder(logs, name)
-        try:
-            with _bar("reading") as progress:
-                done = fit_data(
-                    data[0] if len(data) == 1 else data,
-                    folder,
-                    dt=dt,
-                    states=None if states is None else _split(states),
-                    inputs=None if inputs is None else _split(inputs),
-                    resample=resample,
-                    horizon=horizon,
-                    bilinear=not linear,
-                    workers=workers,
-                    scheduler=scheduler,
-                    say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
-                    progress=progress,
-                )
-        except KoopmpcError:
-            if not any(folder.iterdir()):
-                folder.rmdir()
-            raise
+    source: Any = data[0] if len(data) == 1 else data
+    reading: dict[str, Any] = {
+        "dt": dt,
+        "states": None if states is None else _split(states),
+        "inputs": None if inputs is None else _split(inputs),
+        "resample": resample,
+    }
+    if goal_template:
+        with _friendly():
+            path = _new_file(Path("goal.toml"), template_of(source, **reading))
+        out.print(Text(f"written: {path}; say in it what you want"), soft_wrap=True)
+        again = [*_program(), "fit", *map(str, data), "--goal", str(path)]
+        out.print(Text(f"then: {shlex.join(again)}"), soft_wrap=True)
+        return
+    if goal is not None:
+        with _friendly(), _folder_of(logs, name) as folder, _bar("reading") as progress:
+            designed = design_data(
+                source,
+                goal,
+                folder,
+                bilinear=not linear,
+                workers=workers,
+                scheduler=scheduler,
+                say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
+                progress=progress,
+                **reading,
+            )
+        out.print(Text(f"controller: {designed.controller}, report: {designed.page}"), soft_wrap=True)
+        checked = shlex.join([*_program(), "check", str(designed.controller)])
+        out.print(Text(f"check it: {checked}\nuse it:\n{designed.usage}"), soft_wrap=True)
+        return
+    with _friendly(), _folder_of(logs, name) as folder, _bar("reading") as progress:
+        done = fit_data(
+            source,
+            folder,
+            horizon=horizon,
+            bilinear=not linear,
+            workers=workers,
+            scheduler=scheduler,
+            say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
+            progress=progress,
+            **reading,
+        )
     for failure in done.failures:
         err.print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
     out.print(Text(f"model, report and pictures: {folder}"), soft_wrap=True)
     if done.recording is not None:
         out.print(Text(f"look at it: {shlex.join([*_program(), 'view', str(done.recording)])}"), soft_wrap=True)
     out.print(Text(f"use it:\n{done.usage}"), soft_wrap=True)
+
+
+@app.command()
+def check(
+    controller: Annotated[Path, typer.Argument(help="What `koopmpc fit --goal` or the save of a design wrote.")],
+    runs: Annotated[int, typer.Option("--runs", help="Runs of each kind.")] = 12,
+    logs: Logs = Path("logs"),
+) -> None:
+    """Drive a designed controller from random starts, with noise, models 20 % off and faults; exit 1 where it fails."""
+    from koopmpc.fitting.check import check_controller
+
+    out = _console()
+    with _friendly(), _folder_of(logs, "check") as folder, _bar("runs") as progress:
+        done = check_controller(controller, folder, runs=runs, progress=progress)
+    out.print(Text(f"{done}\n\nreport: {done.page}"), soft_wrap=True)
+    if not done.kept:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -287,6 +330,30 @@ def _new_folder(logs: Path, what: str) -> Path:
             ) from error
         else:
             return folder
+
+
+@contextmanager
+def _folder_of(logs: Path, what: str) -> Generator[Path]:
+    """Yield a new folder; an error of koopmpc takes it away again where nothing was written."""
+    folder = _new_folder(logs, what)
+    try:
+        yield folder
+    except KoopmpcError:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+
+
+def _new_file(path: Path, text: str) -> Path:
+    """Write a file that is not there yet, and return its path."""
+    try:
+        with path.open("x") as stream:
+            stream.write(text)
+    except FileExistsError as error:
+        raise LogError(f"{path} is there already; move it away first, or pass it with --goal") from error
+    except OSError as error:
+        raise LogError(f"{path} cannot be written: {error.strerror}") from error
+    return path
 
 
 @contextmanager

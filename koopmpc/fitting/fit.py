@@ -118,14 +118,14 @@ def fit_data(
     """
     place, draw = Path(folder), checks.generator(rng)
     horizon = None if horizon is None else checks.count(horizon, "horizon")
-    tell = _silent if say is None else say
+    tell = silent if say is None else say
     notes: list[str] = []
     with noted(notes):
         told = {name: value for name, value in reading.items() if value is not None}
         reads = partial(divided, horizon=horizon, rng=draw, memory=memory)
-        files, split = evenly(_logs(data), told, reads, notes)
-    understood = _understood(split, shortened(notes, files.files))
-    tell(understood)
+        files, split = evenly(logs_of(data), told, reads, notes)
+    about = understood(split, shortened(notes, files.files))
+    tell(about)
     doubts: list[str] = []
     with noted(doubts):
         selection = select(
@@ -164,7 +164,7 @@ def fit_data(
     page.text("# Model report", judged.partition("\n")[0])
     page.code(usage, "python")
     page.text("## Data")
-    page.code(understood)
+    page.code(about)
     page.text("## Trust")
     page.code(judged)
     for name, caption, draw_picture in pictures:
@@ -239,14 +239,14 @@ def drawn(
     yield "spectrum", caption, partial(spectrum, predictor, report.residuals)
 
 
-def _logs(data: Data) -> Data:
+def logs_of(data: Data) -> Data:
     """Return the logs of a folder of runs, which holds their table too; all else as it is."""
     if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
         return sorted(Path(data).glob("*.rrd"))
     return data
 
 
-def _understood(split: Divided, notes: list[str]) -> str:
+def understood(split: Divided, notes: list[str]) -> str:
     """Return lines on the data: sizes, sample time, names and ranges, and all repairs."""
     seen, X = split.seen, np.concatenate([e.X for e in split.seen])
     pairs = [("data", split.size), ("step", f"dt = {seen.dt:g} s")]
@@ -281,5 +281,5 @@ def _beside(score: Score, plain: Score) -> str:
     return f"RMSE {score.horizon} steps ahead over that of the plain linear fit x⁺ = A x + B u + c:\n  {named}"
 
 
-def _silent(_: str) -> None:
-    pass
+def silent(_: str) -> None:
+    """Say nothing."""

@@ -148,7 +148,7 @@ def design(
     told = None if progress is None else partial(progress, "models")
     results = list(spread(tried, trials, progress=told))
     floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-    test, doubts = _test(folds, asked, results, floor, tighten)
+    test, doubts, holds = _test(folds, asked, results, floor, tighten)
     for sentence in doubts:
         warnings.warn(sentence, FitWarning, stacklevel=2)
 
@@ -180,7 +180,7 @@ def design(
         leaderboard=rows,
         chosen=best,
         chosen_linear=linear,
-        evidence=Evidence(asked, test.surrogates, test.low, test.high, expected),
+        evidence=Evidence(asked, test.surrogates, test.low, test.high, expected, holds),
         advice=(
             *doubts,
             *_advice(rows, best, linear, expected),
@@ -215,8 +215,8 @@ def _models(
 
 def _test(
     folds: Folds, asked: Asked, results: Sequence[Tried], floor: float, tighten: bool
-) -> tuple[LoopTest, list[str]]:
-    """Return the conditions of all closed loops, and doubts about what is asked.
+) -> tuple[LoopTest, list[str], bool]:
+    """Return the conditions of all closed loops, doubts about what is asked, and whether the goal can be held.
 
     Each fold has a surrogate of either family that is fitted to the two others. The model that does not know fold k
     meets surrogates of which one does not know fold k + 1, the other fold k + 2.
@@ -241,7 +241,9 @@ def _test(
                 start = asked.starts[j % len(asked.starts)]
                 conditions.append(Condition(k, number, gain, start, row, inputs(number, gain, row)))
     test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, tighten)
-    return test, [*unheld(surrogates[0], asked), *outside_data(asked, data, tracked, free)]
+    unreachable = unheld(surrogates[0], asked)
+    holds = not asked.moves and not unreachable
+    return test, [*unreachable, *outside_data(asked, data, tracked, free)], holds
 
 
 class _FreeInputs:

@@ -120,6 +120,8 @@ class Evidence(Value):
         (nx,) a run that leaves this box is lost.
     expected
         Of the chosen controller.
+    goal_can_be_held
+        Whether the reference rests, and an input inside the limits holds it.
     """
 
     asked: Asked
@@ -127,6 +129,7 @@ class Evidence(Value):
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
     expected: Expected
+    goal_can_be_held: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,11 +124,11 @@ class Outcome:
     failure: str = ""
 
 
-class _LostError(Exception):
+class LostError(Exception):
     """The run has left what the surrogates were fitted to."""
 
 
-class _Fenced(SimulatedPlant):
+class Fenced(SimulatedPlant):
     """A plant that ends the run where its state leaves the box from low to high."""
 
     def __init__(self, step_map: StepMap, low: Float[np.ndarray, " nx"], high: Float[np.ndarray, " nx"]) -> None:
@@ -139,7 +139,7 @@ class _Fenced(SimulatedPlant):
         """Return y of the next step, or end the run."""
         y = super().step(u, disturbance)
         if not ((y >= self._low) & (y <= self._high)).all():
-            raise _LostError
+            raise LostError
         return y
 
 
@@ -180,7 +180,7 @@ def _outcome(test: LoopTest, recipe: Recipe, conditions: Sequence[int], near: Ne
             plants[key] = test.surrogates[one.surrogate].plant(one.gain)
         try:
             run = _run(test, one, plants[key], controllers[one.fold], place)
-        except _LostError:
+        except LostError:
             continue
         total = metrics(run).cost
         if not np.isfinite(total):
@@ -204,7 +204,7 @@ def _run(test: LoopTest, one: Condition, plant: StepMap, controller: Designed, s
     """Return the closed loop, with the states without their past."""
     asked, surrogate = test.asked, test.surrogates[one.surrogate]
     run = simulate(
-        _Fenced(plant, test.low, test.high),
+        Fenced(plant, test.low, test.high),
         controller,
         x0=surrogate.start(one.x0),
         reference=asked.reference[one.first : one.first + asked.steps + 1],

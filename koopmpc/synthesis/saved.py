@@ -10,12 +10,11 @@ from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.predict.base import load_value
 from koopmpc.synthesis.designed import SavedDesign
 
-_KINDS: dict[str, type[KoopmanMPC | BilinearMPC | NonlinearMPC]] = {
-    kind.__name__: kind for kind in (KoopmanMPC, BilinearMPC, NonlinearMPC)
-}
+Loaded = KoopmanMPC | BilinearMPC | NonlinearMPC
+_KINDS: dict[str, type[Loaded]] = {kind.__name__: kind for kind in (KoopmanMPC, BilinearMPC, NonlinearMPC)}
 
 
-def load_controller(path: str | Path) -> KoopmanMPC | BilinearMPC | NonlinearMPC:
+def load_controller(path: str | Path) -> Loaded:
     """Return the controller that `save` of a controller or of a Design wrote, as after `reset`.
 
     The file holds numbers and names only; reading it runs no code of it.
@@ -33,7 +32,7 @@ def saved_controller(path: str | Path) -> SavedController | SavedDesign:
     return load_value(path, SavedController, SavedDesign)
 
 
-def made(saved: SavedController | SavedDesign, path: str | Path) -> KoopmanMPC | BilinearMPC | NonlinearMPC:
+def made(saved: SavedController | SavedDesign, path: str | Path) -> Loaded:
     """Return the controller; raise LogError where its parts do not go together."""
     one = saved.controller if isinstance(saved, SavedDesign) else saved
     try:

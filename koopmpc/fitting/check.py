@@ -1,0 +1,352 @@
+"""check_controller: acceptance of a designed controller on the stand-ins of its plant, and a page with the verdict."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.bench.page import Page
+from koopmpc.control.move import Move, Status
+from koopmpc.errors import LogError
+from koopmpc.lifting.state import State
+from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
+from koopmpc.loop.metrics import duration
+from koopmpc.loop.simulate import simulate
+from koopmpc.parallel import StageProgress
+from koopmpc.synthesis.designed import Evidence, SavedDesign
+from koopmpc.synthesis.judging import Fenced, LostError
+from koopmpc.synthesis.saved import Loaded, made, saved_controller
+from koopmpc.validate.text import percent, table, written
+
+ALLOWED, ALLOWED_OFF = 0.01, 0.05  # violation, as a share of the range: as in the data, and with noise or inputs off
+ARRIVED = 0.05  # error over the last tenth of a run, as a share of the data's range
+OFF, LOUD = 0.2, 3.0  # share by which inputs are off, and factor of the noise
+_GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of run: how its inputs and noise differ from the data, what breaks, and what violation is allowed."""
+
+    name: str
+    gain: float = 1.0
+    noise: float = 1.0
+    faults: tuple[Fault, ...] = ()
+    allowed: float = ALLOWED_OFF
+
+
+def kinds(horizon: int, *, bounded: bool) -> list[Kind]:
+    """Return the kinds of runs; faults last for half of a horizon. Actuators are broken where inputs have limits."""
+    begin, end = horizon // 4, horizon // 4 + max(horizon // 2, 1)
+    broken: dict[str, Fault] = {
+        "sensor frozen": FrozenSensor(begin=begin, end=end),
+        "sensor NaN": NaNSensor(begin=begin, end=end),
+        "half of the samples dropped": DroppedSamples(0.5, begin=begin, end=end),
+        "measurements a step late": SensorDelay(1),
+        "half of the solves fail": SolverFailure(0.5, begin=begin, end=end),
+    }
+    if bounded:
+        broken["inputs lose 30 %"] = ActuatorLoss(0.3, begin=begin, end=end)
+    return [
+        Kind("as in the data", allowed=ALLOWED),
+        Kind(f"noise × {LOUD:g}", noise=LOUD),
+        Kind("inputs 20 % weaker", gain=1 - OFF),
+        Kind("inputs 20 % stronger", gain=1 + OFF),
+        *(Kind(name, faults=(fault,)) for name, fault in broken.items()),
+    ]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What came of the runs of a kind.
+
+    `lost` of `runs` left the data or ended in no number; `violation` is the worst, as a share of the range; `error` the
+    largest over the last tenth of a run, as a share of the data's range; `bad` counts steps without a good status, in
+    runs that nothing breaks.
+    """
+
+    kind: Kind
+    runs: int
+    lost: int
+    cost: float
+    violation: float
+    error: float
+    statuses: tuple[tuple[str, int], ...]
+    bad: int
+
+
+@dataclass(frozen=True)
+class Checked:
+    """The verdict, with the figures of each kind of run; `print` shows it.
+
+    Attributes
+    ----------
+    kept
+        Whether the goal is kept.
+    reasons
+        Why not, in sentences; or what was not asked.
+    figures
+        Of each kind of run.
+    cold, hot
+        Time of the first step of a fresh controller, and the 99 % quantile of all others [s].
+    dt
+        Sampling time [s].
+    page
+        Path of the report.
+    """
+
+    kept: bool
+    reasons: tuple[str, ...]
+    figures: tuple[Figures, ...]
+    cold: float
+    hot: float
+    dt: float
+    page: Path
+
+    def __str__(self) -> str:
+        """Return the verdict and a line for each kind of run."""
+        verdict = "the goal is kept" if self.kept else "THE GOAL IS NOT KEPT"
+        rows = [_row(one) for one in self.figures]
+        times = (
+            f"a step takes {duration(self.hot)} (99 %), the first one {duration(self.cold)}; dt is {duration(self.dt)}"
+        )
+        return written(verdict, *(f"- {reason}" for reason in self.reasons), "", table(_HEADINGS, rows), "", times)
+
+
+_HEADINGS = (
+    "kind of run",
+    "lost",
+    "median\ncost",
+    "worst\nviolation",
+    "error\nat the end",
+    "steps without\na good status",
+)
+
+
+def _row(one: Figures) -> list[str]:
+    lost = f"{one.lost} of {one.runs}"
+    numbers = [f"{one.cost:.4g}", percent(one.violation), percent(one.error)]
+    return [one.kind.name, lost, *(numbers if one.lost < one.runs else ["-"] * 3), str(one.bad)]
+
+
+def check_controller(
+    path: str | Path,
+    folder: str | Path,
+    *,
+    runs: int = 12,
+    progress: StageProgress | None = None,
+    rng: np.random.Generator | int = 0,
+) -> Checked:
+    """Drive the surrogates of a saved design from random starts, in every kind of run, and judge what comes of it.
+
+    The goal is kept where, of the runs that nothing breaks, none is lost, no limit is violated by more than 1 % of its
+    range (5 % with three times the noise, or with inputs 20 % off), every step has a good status, the first and 99 % of
+    all others take less than dt; and where, as in the data, a reference that rests and can be held is reached to 5 %
+    of the data's range. With faults inputs must stay inside their limits, and no run may be lost whose fault
+    ends. The surrogates are learned from the same logs as the controller: they are no plant.
+
+    Parameters
+    ----------
+    path
+        The file of a design.
+    folder
+        Where check.md is written.
+    runs
+        Of each kind.
+    progress
+        Called with what is done, how many of it are, and how many there are.
+    rng
+        Draws starts, noise and faults.
+
+    Raises
+    ------
+    LogError
+        The file holds no design, or is damaged.
+    """
+    saved, draw, runs = saved_controller(path), checks.generator(rng), checks.count(runs, "runs")
+    if not isinstance(saved, SavedDesign):
+        raise LogError(
+            f"{path} holds a controller without the evidence that a check needs; pass what `koopmpc fit --goal` or the "
+            "save of a km.design wrote"
+        )
+    evidence = saved.evidence
+    controller = made(saved, path)
+    asked = evidence.asked
+    controller.reset(asked.starts[0])
+    start = perf_counter()
+    controller(asked.starts[0], asked.reference[: controller.horizon + 1])
+    cold = perf_counter() - start
+    every, times, figures = (
+        kinds(asked.horizon, bounded=bool(np.isfinite(asked.limits.inputs(controller.nu)).all())),
+        list[float](),
+        list[Figures](),
+    )
+    done, total = 0, runs * len(every)
+    picked = draw.integers(len(asked.first_states), size=runs)
+    for kind in every:
+        outcomes: list[_Outcome] = []
+        for j in range(runs):
+            one = evidence.surrogates[j % len(evidence.surrogates)]
+            plant = Fenced(one.plant(kind.gain), evidence.low, evidence.high)
+            outcomes.append(
+                _driven(evidence, controller, kind, plant, one.start(asked.first_states[picked[j]]), j, times)
+            )
+            done += 1
+            if progress is not None:
+                progress(kind.name, done, total)
+        figures.append(_figures(kind, outcomes))
+    hot = float(np.quantile(times, 0.99)) if times else np.inf
+    reasons = _reasons(evidence, figures, cold, hot, controller.dt)
+    result = Checked(not reasons, tuple(reasons), tuple(figures), cold, hot, controller.dt, Path(folder, "check.md"))
+    _page(result, Path(folder), path, saved)
+    return result
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    cost: float
+    violation: float
+    error: float
+    statuses: Counter[str]
+
+
+class _Timed:
+    """A controller that keeps the statuses of its steps and how long they took."""
+
+    def __init__(self, controller: Loaded, times: list[float]) -> None:
+        self._controller, self._times = controller, times
+        self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon
+        self.reset, self.statuses = controller.reset, Counter[str]()
+
+    @property
+    def solver_fails(self) -> bool:
+        """Whether the solver loses its answers."""
+        return self._controller.solver_fails
+
+    @solver_fails.setter
+    def solver_fails(self, fails: bool) -> None:
+        self._controller.solver_fails = fails
+
+    def __call__(self, y: object, reference: object, applied: object = None, w: object = None) -> Move:
+        move = self._controller(y, reference, applied, w)  # pyright: ignore[reportArgumentType]  # as simulate asks
+        self.statuses[move.status.name] += 1
+        self._times.append(move.solve_time)
+        return move
+
+
+def _driven(
+    evidence: Evidence,
+    controller: Loaded,
+    kind: Kind,
+    plant: Fenced,
+    x0: Float[np.ndarray, " n"],
+    seed: int,
+    times: list[float],
+) -> _Outcome:
+    asked, one = evidence.asked, evidence.surrogates[seed % len(evidence.surrogates)]
+    timed = _Timed(controller, times)
+    try:
+        run = simulate(
+            plant,
+            timed,  # pyright: ignore[reportArgumentType]
+            x0=x0,
+            reference=asked.reference[: asked.steps + 1],
+            steps=asked.steps,
+            noise=kind.noise * one.noise,
+            measured=one.w if len(one.w) else None,
+            limits=asked.limits,
+            faults=kind.faults,
+            rng=seed,
+        )
+    except LostError:
+        return _Outcome(np.inf, np.inf, np.inf, timed.statuses)
+    nx, states = len(evidence.low), one.model.states
+    X = run.X[:, :nx]
+    of = asked.cost.of.bind(states)
+    error = of(X) - run.reference
+    if isinstance(of, State):
+        for column, i in enumerate(of.chosen):
+            if i in asked.angles:
+                error[:, column] = np.pi - np.mod(np.pi - error[:, column], 2 * np.pi)
+    Q, R = asked.cost.matrices(of.nz, run.U.shape[1])
+    cost = float(np.einsum("ki,ij,kj->", error[1:], Q, error[1:]) + np.einsum("ki,ij,kj->", run.U, R, run.U))
+    size = np.abs(np.diff(of(np.array([asked.low, asked.high])), axis=0))[0]
+    weighed = np.diag(Q) > 0
+    late = np.abs(error[-max(len(error) // 10, 1) :]) / np.where(size > 0, size, 1.0)
+    return _Outcome(cost, float(asked.beyond(X[1:], states).max()), float(late[:, weighed].max()), timed.statuses)
+
+
+def _figures(kind: Kind, outcomes: Sequence[_Outcome]) -> Figures:
+    ended = [one for one in outcomes if np.isfinite(one.cost)]
+    statuses = sum((one.statuses for one in outcomes), Counter[str]())
+    good = {status.name for status in _GOOD}
+    return Figures(
+        kind=kind,
+        runs=len(outcomes),
+        lost=len(outcomes) - len(ended),
+        cost=float(np.median([one.cost for one in ended])) if ended else np.inf,
+        violation=max((one.violation for one in ended), default=np.inf),
+        error=max((one.error for one in ended), default=np.inf),
+        statuses=tuple(sorted(statuses.items())),
+        bad=sum(count for name, count in statuses.items() if name not in good),
+    )
+
+
+def _reasons(evidence: Evidence, figures: Sequence[Figures], cold: float, hot: float, dt: float) -> list[str]:
+    """Return why the goal is not kept, in sentences."""
+    said: list[str] = []
+    for one in figures:
+        name = one.kind.name
+        if one.lost:
+            said.append(f"{name}: {one.lost} of {one.runs} runs left the data, or ended in no number")
+        if one.kind.faults:
+            continue
+        if one.lost < one.runs and one.violation > one.kind.allowed:
+            allowed = percent(one.kind.allowed)
+            said.append(f"{name}: a limit is violated by {percent(one.violation)} of its range, {allowed} are allowed")
+        if one.bad:
+            told = ", ".join(f"{count} {status}" for status, count in one.statuses)
+            said.append(f"{name}: {one.bad} steps had no good status: {told}")
+    as_learned = figures[0]
+    if evidence.goal_can_be_held and as_learned.lost < as_learned.runs and as_learned.error > ARRIVED:
+        said.append(
+            f"{as_learned.kind.name}: a run ends {percent(as_learned.error)} of the data's range off its reference, "
+            f"{percent(ARRIVED)} are allowed"
+        )
+    for what, taken in (("the first step", cold), ("one step in a hundred", hot)):
+        if taken > dt:
+            said.append(f"{what} takes {duration(taken)} or more, and dt is {duration(dt)}")
+    return said
+
+
+def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -> None:
+    one = saved.controller
+    page = Page(folder)
+    page.text("# Acceptance", "**The goal is kept.**" if result.kept else "**The goal is not kept.**")
+    page.items(result.reasons or ["Nothing speaks against it."])
+    page.text(
+        f"`{Path(path).name}`: a {one.name} with a horizon of {one.horizon} steps of {result.dt:g} s, driven on "
+        f"{len(saved.evidence.surrogates)} models that were learned from its logs. They are no plant: what all of them "
+        "have learned wrongly shows in none of these runs."
+    )
+    page.table(["kind of run", *(heading.replace("\n", " ") for heading in _HEADINGS[1:])], map(_row, result.figures))
+    page.text("## Statuses")
+    page.table(
+        ["kind of run", "steps"],
+        [[f.kind.name, ", ".join(f"{count} {name}" for name, count in f.statuses)] for f in result.figures],
+    )
+    page.text("## Times")
+    page.items(
+        [
+            f"the first step of a fresh controller: {duration(result.cold)}",
+            f"99 % of all others: at most {duration(result.hot)}",
+        ]
+    )
+    page.text("## What was expected at its design")
+    page.code(str(saved.evidence.expected))
+    page.write(result.page.name)

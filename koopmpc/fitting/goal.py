@@ -1,0 +1,239 @@
+"""Goal: what a controller shall do with the plant of some logs, as a file that a person writes."""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks, disk
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError, LogError
+from koopmpc.lifting.state import State
+from koopmpc.synthesis.folds import usual_horizon
+from koopmpc.validate.text import quantity
+
+_TOP = {"horizon", "states", "inputs"}
+_STATE = {"reference", "weight", "limits", "angle"}
+_INPUT = {"weight", "limits", "change", "change_weight"}
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """What a design is asked for.
+
+    Attributes
+    ----------
+    cost, limits, horizon
+        Of the controller.
+    reference
+        (nr,) or rows (T+1, nr) of the states that the cost weighs.
+    angles
+        Indices of states whose errors wrap.
+    """
+
+    cost: Cost
+    limits: Limits
+    horizon: int
+    reference: Float[np.ndarray, "..."]
+    angles: tuple[int, ...]
+
+
+def goal_template(data: Episodes) -> str:
+    """Return a goal file for the plant of these data: it rests at the last states' medians, inputs stay in their range.
+
+    A weight is 1 / (half the range)², a tenth of it for inputs, so that errors of the size of the data weigh alike.
+    """
+    X = np.concatenate([episode.X for episode in data])
+    U = np.concatenate([episode.U for episode in data])
+    horizon = usual_horizon(data)[0]
+    rest = np.median([episode.X[-1] for episode in data], axis=0)
+    lines = [
+        "# What the controller shall do. Numbers are in the units of the names; inf is no limit.",
+        "# koopmpc fit LOGS --goal this-file designs it, koopmpc check CONTROLLER says whether it keeps the goal.",
+        "",
+        f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead: {horizon * data.dt:.3g} s",
+    ]
+    for i, name in enumerate(data.states):
+        low, high = X[:, i].min(), X[:, i].max()
+        unit = _unit(name)
+        lines += [
+            "",
+            f'[states."{_escaped(name)}"]  # in the data from {low:.4g} to {high:.4g}',
+            f"reference = {_number(rest[i])}  # [{unit}] where it shall be; or a list, one value a step",
+            f"weight = {_number(4 / max(high - low, 1e-12) ** 2)}  # of its squared error, per [{unit}]²; 0 for none",
+            f"limits = [-inf, inf]  # [{unit}] kept wherever that is possible",
+            "angle = false  # true where errors wrap at ±pi",
+        ]
+    for i, name in enumerate(data.inputs):
+        low, high = U[:, i].min(), U[:, i].max()
+        unit = _unit(name)
+        lines += [
+            "",
+            f'[inputs."{_escaped(name)}"]  # in the data from {low:.4g} to {high:.4g}',
+            f"weight = {_number(0.4 / max(high - low, 1e-12) ** 2)}  # of its squared distance from what holds the "
+            f"reference, per [{unit}]²",
+            f"limits = [{_number(low)}, {_number(high)}]  # [{unit}] always kept",
+            f"change = inf  # [{unit}] most change from step to step",
+            f"change_weight = 0.0  # of its squared change, per [{unit}]²",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
+    """Return the goal in a file, for the plant of these data.
+
+    Raises
+    ------
+    LogError
+        The file is missing or no TOML.
+    DataError
+        An unknown key, name or unit, NaN, a number that is none, limits that cross, lists of unequal lengths, or no
+        state with a weight.
+    """
+    file = Path(path)
+    disk.existing(file, "koopmpc fit LOGS --goal-template writes one")
+    try:
+        tree = tomllib.loads(file.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LogError(f"{file} is no TOML: {error}; koopmpc fit LOGS --goal-template shows one") from error
+    _known(tree, _TOP, str(file))
+    states = _sections(tree, "states", data.states, _STATE, file)
+    inputs = _sections(tree, "inputs", data.inputs, _INPUT, file)
+    nx, nu = data.nx, data.nu
+    Q, R, R_delta = np.zeros(nx), np.zeros(nu), np.zeros(nu)
+    low, high = np.full(nx, -np.inf), np.full(nx, np.inf)
+    u_low, u_high, change = np.full(nu, -np.inf), np.full(nu, np.inf), np.full(nu, np.inf)
+    angles: list[int] = []
+    rows: dict[int, Float[np.ndarray, ...]] = {}
+    for i, (name, section) in enumerate(zip(data.states, states, strict=True)):
+        where = f"{file}, {name}"
+        Q[i] = _one(section, "weight", 0.0, where)
+        low[i], high[i] = _pair(section, where)
+        if section.get("angle", False) not in (True, False):
+            raise DataError(f"{where}: angle is {section['angle']!r}; write true or false")
+        angles += [i] * bool(section.get("angle", False))
+        if "reference" in section:
+            rows[i] = checks.array(_numbers(section["reference"], f"{where}: reference"), f"{where}: reference")
+        elif Q[i] > 0:
+            raise DataError(f"{where} has a weight and no reference; say where it shall be, or set weight = 0")
+    for i, (name, section) in enumerate(zip(data.inputs, inputs, strict=True)):
+        where = f"{file}, {name}"
+        R[i] = _one(section, "weight", 0.0, where)
+        R_delta[i] = _one(section, "change_weight", 0.0, where)
+        change[i] = _one(section, "change", np.inf, where)
+        u_low[i], u_high[i] = _pair(section, where)
+    tracked = [i for i in range(nx) if Q[i] > 0]
+    if not tracked:
+        raise DataError(f"{file} gives no state a weight above 0, so nothing is asked; set one")
+    lengths = {len(np.atleast_1d(rows[i])) for i in tracked} - {1}
+    if len(lengths) > 1:
+        raise DataError(f"{file} has references of {sorted(lengths)} values; write lists of one length, or numbers")
+    steps = lengths.pop() if lengths else 1
+    reference = np.column_stack([np.broadcast_to(rows[i], steps) for i in tracked])
+    horizon = tree.get("horizon", usual_horizon(data)[0])
+    if not isinstance(horizon, int) or isinstance(horizon, bool) or horizon < 1:
+        raise DataError(f"{file}: horizon is {horizon!r}; write a whole number of steps of {data.dt:g} s, 1 or more")
+    limited = np.isfinite(change).any()
+    return Goal(
+        cost=Cost(
+            Q=Q[tracked],
+            R=R,
+            R_delta=R_delta if R_delta.any() else None,
+            of=State() if len(tracked) == nx else State([data.states[i] for i in tracked]),
+        ),
+        limits=Limits(u_min=u_low, u_max=u_high, x_min=low, x_max=high, du_max=change if limited else None),
+        horizon=horizon,
+        reference=reference[0] if steps == 1 else reference,
+        angles=tuple(angles),
+    )
+
+
+def _sections(
+    tree: Mapping[str, Any], what: str, names: tuple[str, ...], keys: set[str], file: Path
+) -> list[Mapping[str, Any]]:
+    """Return the section of each name, empty where there is none.
+
+    Raises
+    ------
+    DataError
+        A section is of no column of the data, or in another unit than it.
+    """
+    given = tree.get(what, {})
+    if not isinstance(given, dict):
+        raise DataError(f'{file}: {what} is {given!r}; write a section for each, such as [{what}."{names[0]}"]')
+    sections = cast("dict[str, Any]", given)
+    for name, section in sections.items():
+        where = f'{file}: [{what}."{name}"]'
+        if name not in names:
+            own = next((known for known in names if _stem(known) == _stem(name)), None)
+            if own is not None:
+                raise DataError(
+                    f"{where} is in another unit than the logs, which have {own!r}; write its numbers in that"
+                )
+            raise DataError(
+                f"{where} is of nothing in the logs{checks.nearest(name, names)}; there are {', '.join(names)}"
+            )
+        if not isinstance(section, dict):
+            raise DataError(f"{where} is {section!r}; write it as a section with keys {', '.join(sorted(keys))}")
+        _known(cast("dict[str, Any]", section), keys, where)
+    return [cast("Mapping[str, Any]", sections.get(name, {})) for name in names]
+
+
+def _known(tree: Mapping[str, Any], keys: set[str], where: str) -> None:
+    for key in tree:
+        if key not in keys:
+            raise DataError(f"{where} has {key!r}{checks.nearest(key, keys)}; there are {', '.join(sorted(keys))}")
+
+
+def _one(section: Mapping[str, Any], key: str, default: float, where: str) -> float:
+    value = section.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value) or value < 0:
+        raise DataError(f"{where}: {key} is {value!r}; write a number of 0 or above")
+    return float(value)
+
+
+def _pair(section: Mapping[str, Any], where: str) -> tuple[float, float]:
+    value = _numbers(section.get("limits", [-math.inf, math.inf]), f"{where}: limits")
+    if not isinstance(value, list) or len(value) != 2 or any(math.isnan(end) for end in value):
+        raise DataError(f"{where}: limits is {value!r}; write [low, high], with -inf or inf where there is none")
+    low, high = value
+    if low > high:
+        raise DataError(
+            f"{where}: limits {quantity('', f'{low:g} … {high:g}').strip()} cross; write the lower one first"
+        )
+    return low, high
+
+
+def _numbers(value: Any, where: str) -> float | list[float]:
+    """Return a number, or a list of numbers."""
+    many = cast("list[Any]", value) if isinstance(value, list) else [value]
+    for one in many:
+        if isinstance(one, bool) or not isinstance(one, int | float):
+            raise DataError(f"{where} is {value!r}; write a number, or a list of numbers")
+    return [float(one) for one in many] if isinstance(value, list) else float(value)
+
+
+def _stem(name: str) -> str:
+    return name.partition("[")[0].strip().lower()
+
+
+def _unit(name: str) -> str:
+    return name.partition("[")[2].rstrip("] ") or "1"
+
+
+def _escaped(name: str) -> str:
+    return name.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _number(value: float) -> str:
+    """Return three digits as TOML writes a float."""
+    text = f"{float(value):.3g}"
+    return text if any(letter in text for letter in ".en") else f"{text}.0"

@@ -1,0 +1,195 @@
+"""From logs and a goal to a controller and its check: the files, the verdicts, and what a goal file must not say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import koopmpc as km
+from koopmpc.cli.app import app
+from koopmpc.fitting.check import check_controller
+from koopmpc.fitting.control import design_data
+from koopmpc.fitting.goal import goal_template, read_goal
+
+A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
+NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)
+
+
+def logs(count=16, steps=40):
+    rng, made = np.random.default_rng(0), []
+    for _ in range(count):
+        X, U = [rng.uniform(-1, 1, 2)], np.repeat(rng.uniform(-2, 2, (steps // 4, 1)), 4, axis=0)
+        for u in U:
+            X.append(A @ X[-1] + B @ u)
+        made.append(km.Episode(X=np.array(X), U=U))
+    return km.Episodes(made, 0.1, *NAMES)
+
+
+GOAL = """
+horizon = 15
+
+[states."position [m]"]
+reference = 0.5
+weight = 1.0
+
+[states."speed [m/s]"]
+reference = 0.0
+weight = 0.1
+limits = [-0.8, 0.8]
+
+[inputs."force [N/kg]"]
+weight = 0.01
+limits = [-2.0, 2.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("designed")
+    logs().save(folder / "logs.npz")
+    (folder / "goal.toml").write_text(GOAL)
+    return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
+
+
+def goal_of(text, tmp_path):
+    (tmp_path / "goal.toml").write_text(text)
+    return read_goal(tmp_path / "goal.toml", logs(4))
+
+
+def test_logs_and_a_goal_end_in_a_controller_file_that_keeps_the_goal_on_the_plant(made):
+    assert sorted(path.name for path in made.controller.parent.iterdir()) == ["controller.md", "controller.npz"]
+    controller = km.load_controller(made.controller)
+    x = np.array([-0.8, 0.0])
+    controller.reset(x)
+    speeds = []
+    for _ in range(150):
+        u = controller(x, [0.5, 0.0]).u
+        assert abs(u[0]) <= 2.0
+        x = A @ x + B @ u
+        speeds.append(x[1])
+    np.testing.assert_allclose(x, [0.5, 0.0], atol=0.01)
+    assert max(speeds) <= 0.8 + 1e-3 * 1.6
+
+
+def test_the_page_shows_what_to_expect_and_the_goal(made):
+    text = made.page.read_text()
+    for part in ("# Controller report", "## What to expect", "no promise", 'states."position [m]"', "load_controller"):
+        assert part in text
+
+
+def test_a_design_that_keeps_its_goal_passes_the_check_and_its_page_says_so(made, tmp_path):
+    done = check_controller(made.controller, tmp_path, runs=4)
+    assert done.kept, str(done)
+    text = done.page.read_text()
+    assert "**The goal is kept.**" in text
+    assert "inputs 20 % weaker" in text
+    assert {one.kind.name for one in done.figures} >= {"as in the data", "sensor NaN", "half of the solves fail"}
+    assert 0 < done.hot < done.dt
+
+
+def test_a_check_repeats_for_a_seed(made, tmp_path):
+    first, second = (check_controller(made.controller, tmp_path, runs=2).figures for _ in range(2))
+    assert first == second
+
+
+def test_a_controller_that_misses_its_goal_fails_the_check_with_the_reason(tmp_path):
+    logs().save(tmp_path / "logs.npz")
+    text = GOAL.replace("weight = 0.01", "weight = 1000.0")  # an input so dear that nothing is reached
+    (tmp_path / "goal.toml").write_text(text)
+    made = design_data(tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path / "out", bilinear=False)
+    done = check_controller(made.controller, tmp_path, runs=3)
+    assert not done.kept
+    assert any("off its reference, 5 % are allowed" in reason for reason in done.reasons)
+    assert str(done).startswith("THE GOAL IS NOT KEPT")
+
+
+def test_a_controller_without_evidence_cannot_be_checked(tmp_path):
+    model = km.edmd(logs(), km.State() + km.Constant())
+    km.KoopmanMPC(model, km.Cost(Q=[1, 1], R=0.1), None, 5).save(tmp_path / "c.npz")
+    with pytest.raises(km.KoopmpcError, match="without the evidence that a check needs"):
+        check_controller(tmp_path / "c.npz", tmp_path)
+
+
+def test_the_template_is_a_goal_file_with_the_ranges_of_the_logs(tmp_path):
+    data = logs()
+    text = goal_template(data)
+    goal = goal_of(text, tmp_path)
+    U = np.concatenate([episode.U for episode in data])
+    np.testing.assert_allclose(goal.limits.inputs(1), [[U.min()], [U.max()]], rtol=1e-2)
+    X = np.concatenate([episode.X for episode in data])
+    np.testing.assert_allclose(np.diag(goal.cost.matrices(2, 1)[0]), 4 / np.ptp(X, axis=0) ** 2, rtol=1e-2)
+    assert f"in the data from {X[:, 0].min():.4g} to {X[:, 0].max():.4g}" in text
+    assert "steps of 0.1 s" in text
+
+
+def test_states_without_weight_are_not_tracked_and_a_list_is_a_reference_for_each_step(tmp_path):
+    text = GOAL.replace("reference = 0.5", "reference = [0.0, 0.1, 0.2]").replace("weight = 0.1", "weight = 0")
+    goal = goal_of(text, tmp_path)
+    assert goal.cost.of == km.State(["position [m]"])
+    np.testing.assert_array_equal(goal.reference, [[0.0], [0.1], [0.2]])
+    assert goal.limits.states(2).high[1] == 0.8
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("position [m]", "position [cm]", r"is in another unit than the logs, which have 'position \[m\]'"),
+        ("position [m]", "postion [m]", r"of nothing in the logs"),
+        ("reference = 0.5", "refrence = 0.5", "has 'refrence'.*reference"),
+        ("reference = 0.5", "reference = nan", "NaN"),
+        ("reference = 0.5", 'reference = "up"', "write a number, or a list"),
+        ("reference = 0.5", "", "has a weight and no reference"),
+        ("weight = 1.0", "weight = -1.0", "weight is -1.0; write a number of 0 or above"),
+        ("weight = 1.0", "weight = nan", "weight is nan"),
+        ("[-0.8, 0.8]", "[0.8, -0.8]", "cross; write the lower one first"),
+        ("[-0.8, 0.8]", "[0.8]", r"write \[low, high\]"),
+        ("horizon = 15", "horizon = 0", "horizon is 0; write a whole number"),
+        ("horizon = 15", "horizont = 15", "has 'horizont'"),
+        ("horizon = 15", "horizon = ", "is no TOML"),
+        ("reference = 0.0", "reference = [0.0, 1.0]\nangle = 3", "angle is 3; write true or false"),
+    ],
+)
+def test_a_goal_file_that_makes_no_sense_is_refused_in_a_sentence(old, new, sentence, tmp_path):
+    assert old in GOAL
+    with pytest.raises(km.KoopmpcError, match=sentence):
+        goal_of(GOAL.replace(old, new, 1), tmp_path)
+
+
+def test_references_of_unequal_lengths_and_goals_that_ask_nothing_are_refused(tmp_path):
+    two = GOAL.replace("reference = 0.5", "reference = [0, 1]").replace("reference = 0.0", "reference = [0, 1, 2]")
+    with pytest.raises(km.KoopmpcError, match=r"references of \[2, 3\] values"):
+        goal_of(two, tmp_path)
+    none = GOAL.replace("weight = 1.0", "weight = 0").replace("weight = 0.1", "weight = 0")
+    with pytest.raises(km.KoopmpcError, match="nothing is asked"):
+        goal_of(none, tmp_path)
+
+
+def test_the_commands_write_a_template_design_and_check(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    logs().save("logs.npz")
+    call = CliRunner().invoke
+    result = call(app, ["fit", "logs.npz", "--goal-template"])
+    assert result.exit_code == 0, result.output
+    assert "fit logs.npz --goal goal.toml" in result.stdout
+    again = call(app, ["fit", "logs.npz", "--goal-template"])
+    assert (again.exit_code, "goal.toml is there already" in again.stderr) == (2, True)
+    Path("goal.toml").write_text(GOAL)
+    result = call(app, ["fit", "logs.npz", "--goal", "goal.toml", "--linear"])
+    assert result.exit_code == 0, result.output
+    file = result.stdout.split("controller: ")[1].split(", report")[0]
+    checked = call(app, ["check", file, "--runs", "2"])
+    assert checked.exit_code == 0, checked.output
+    assert "the goal is kept" in checked.stdout
+    missing = call(app, ["check", "none.npz"])
+    assert missing.exit_code == 2
+    assert "none.npz" in missing.stderr
+
+
+def test_the_check_exits_with_1_where_the_goal_is_not_kept(tmp_path, monkeypatch, made):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("koopmpc.fitting.check.ALLOWED_OFF", -1.0)
+    monkeypatch.setattr("koopmpc.fitting.check.ARRIVED", -1.0)
+    result = CliRunner().invoke(app, ["check", str(made.controller), "--runs", "1"])
+    assert result.exit_code == 1, result.output
+    assert "THE GOAL IS NOT KEPT" in result.stdout
