@@ -20,7 +20,7 @@ from koopmpc.loop.simulate import simulate
 from koopmpc.parallel import StageProgress
 from koopmpc.synthesis.designed import Evidence, SavedDesign
 from koopmpc.synthesis.judging import Fenced, LostError
-from koopmpc.synthesis.saved import Loaded, made, saved_controller
+from koopmpc.synthesis.saved import AnyMPC, made, saved_controller
 from koopmpc.validate.text import percent, table, written
 
 ALLOWED, ALLOWED_OFF = 0.01, 0.05  # violation, as a share of the range: as in the data, and with noise or inputs off
@@ -30,7 +30,7 @@ _GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 
 @dataclass(frozen=True)
-class Kind:
+class RunKind:
     """A kind of run: how its inputs and noise differ from the data, what breaks, and what violation is allowed."""
 
     name: str
@@ -40,7 +40,7 @@ class Kind:
     allowed: float = ALLOWED_OFF
 
 
-def kinds(horizon: int, *, bounded: bool) -> list[Kind]:
+def kinds(horizon: int, *, bounded: bool) -> list[RunKind]:
     """Return the kinds of runs; faults last for half of a horizon. Actuators are broken where inputs have limits."""
     begin, end = horizon // 4, horizon // 4 + max(horizon // 2, 1)
     broken: dict[str, Fault] = {
@@ -53,11 +53,11 @@ def kinds(horizon: int, *, bounded: bool) -> list[Kind]:
     if bounded:
         broken["inputs lose 30 %"] = ActuatorLoss(0.3, begin=begin, end=end)
     return [
-        Kind("as in the data", allowed=ALLOWED),
-        Kind(f"noise × {LOUD:g}", noise=LOUD),
-        Kind("inputs 20 % weaker", gain=1 - OFF),
-        Kind("inputs 20 % stronger", gain=1 + OFF),
-        *(Kind(name, faults=(fault,)) for name, fault in broken.items()),
+        RunKind("as in the data", allowed=ALLOWED),
+        RunKind(f"noise × {LOUD:g}", noise=LOUD),
+        RunKind("inputs 20 % weaker", gain=1 - OFF),
+        RunKind("inputs 20 % stronger", gain=1 + OFF),
+        *(RunKind(name, faults=(fault,)) for name, fault in broken.items()),
     ]
 
 
@@ -70,7 +70,7 @@ class Figures:
     runs that nothing breaks.
     """
 
-    kind: Kind
+    kind: RunKind
     runs: int
     lost: int
     cost: float
@@ -218,7 +218,7 @@ class _Outcome:
 class _Timed:
     """A controller that keeps the statuses of its steps and how long they took."""
 
-    def __init__(self, controller: Loaded, times: list[float]) -> None:
+    def __init__(self, controller: AnyMPC, times: list[float]) -> None:
         self._controller, self._times = controller, times
         self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon
         self.reset, self.statuses = controller.reset, Counter[str]()
@@ -241,8 +241,8 @@ class _Timed:
 
 def _driven(
     evidence: Evidence,
-    controller: Loaded,
-    kind: Kind,
+    controller: AnyMPC,
+    kind: RunKind,
     plant: Fenced,
     x0: Float[np.ndarray, " n"],
     seed: int,
@@ -281,7 +281,7 @@ def _driven(
     return _Outcome(cost, float(asked.beyond(X[1:], states).max()), float(late[:, weighed].max()), timed.statuses)
 
 
-def _figures(kind: Kind, outcomes: Sequence[_Outcome]) -> Figures:
+def _figures(kind: RunKind, outcomes: Sequence[_Outcome]) -> Figures:
     ended = [one for one in outcomes if np.isfinite(one.cost)]
     statuses = sum((one.statuses for one in outcomes), Counter[str]())
     good = {status.name for status in _GOOD}

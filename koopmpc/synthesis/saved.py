@@ -10,11 +10,11 @@ from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.predict.base import load_value
 from koopmpc.synthesis.designed import SavedDesign
 
-Loaded = KoopmanMPC | BilinearMPC | NonlinearMPC
-_KINDS: dict[str, type[Loaded]] = {kind.__name__: kind for kind in (KoopmanMPC, BilinearMPC, NonlinearMPC)}
+AnyMPC = KoopmanMPC | BilinearMPC | NonlinearMPC
+_KINDS: dict[str, type[AnyMPC]] = {kind.__name__: kind for kind in (KoopmanMPC, BilinearMPC, NonlinearMPC)}
 
 
-def load_controller(path: str | Path) -> Loaded:
+def load_controller(path: str | Path) -> AnyMPC:
     """Return the controller that `save` of a controller or of a Design wrote, as after `reset`.
 
     The file holds numbers and names only; reading it runs no code of it.
@@ -32,7 +32,7 @@ def saved_controller(path: str | Path) -> SavedController | SavedDesign:
     return load_value(path, SavedController, SavedDesign)
 
 
-def made(saved: SavedController | SavedDesign, path: str | Path) -> Loaded:
+def made(saved: SavedController | SavedDesign, path: str | Path) -> AnyMPC:
     """Return the controller; raise LogError where its parts do not go together."""
     one = saved.controller if isinstance(saved, SavedDesign) else saved
     try:
