@@ -1,5 +1,5 @@
 """``python -m koopmpc`` is ``koopmpc``."""
 
-from koopmpc.cli.app import app
+from koopmpc.cli import app
 
 app(prog_name="koopmpc")

@@ -111,7 +111,7 @@ class _Pool:
             raise DataError(
                 f"{job} cannot be sent to a worker: {error}; run with workers=1, or define its parts in a module"
             ) from error
-        with _one_thread():  # `submit` starts the processes
+        with _one_thread(), _undisturbed():  # `submit` starts the processes
             return self._executor.submit(_work, sent)
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
     for _ in range(_TRIES):
         pool = _Pool(function, 1)
         try:
-            with _one_thread():
+            with _one_thread(), _undisturbed():
                 begun = pool._executor.submit(os.getpid)
             try:
                 begun.result()
@@ -201,6 +201,23 @@ def _one_thread() -> Generator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _undisturbed() -> Generator[None]:
+    """Let processes that start meanwhile inherit a blocked Ctrl-C, which is the parent's to answer, at the end of this.
+
+    A worker that met it while it imports would print a traceback of its own.
+    """
+    block = getattr(signal, "pthread_sigmask", None)  # Windows has none
+    if block is None:
+        yield
+        return
+    before = block(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        block(signal.SIG_SETMASK, before)
 
 
 _function: Callable[[Any], Any] | None = None  # the function that this worker calls; None in the parent

@@ -108,7 +108,6 @@ def sweep(
         for name in (asked if controllers else controller_names(problem.controllers))
     ]
     rows: list[RunRow] = []
-    write_results(rows, folder / RESULTS)  # and after every run: what interrupts the next one finds these on the disk
     parts: Prepared | None = None
     for problem, task in tasks:
         if parts is None or parts.problem is not problem:
@@ -116,6 +115,8 @@ def sweep(
         if progress is not None:
             progress(f"{problem.name}:{' '.join(filter(None, task))}", len(rows), len(tasks))
         rows.append(_row(parts, task, folder, live))
+        write_results(rows, folder / RESULTS)  # after every run, for the next one may be interrupted
+    if not tasks:
         write_results(rows, folder / RESULTS)
     if progress is not None:
         progress("done", len(tasks), len(tasks))

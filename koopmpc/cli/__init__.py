@@ -1,3 +1,18 @@
-"""The command line."""
+"""The command line: `app` is the program."""
 
-from koopmpc.cli.app import app as app
+import sys
+from typing import Any
+
+from koopmpc.cli.ending import ENDING
+
+
+def app(*arguments: Any, **options: Any) -> None:
+    """Run the program; Ctrl-C and SIGTERM end it within a second, with exit code 130 and one line.
+
+    The handlers stand before the commands are imported, which takes a part of a second.
+    """
+    with ENDING:
+        from koopmpc.cli.app import app as commands
+
+        commands(*arguments, **options)
+    sys.exit(0)

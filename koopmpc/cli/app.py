@@ -15,7 +15,8 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from koopmpc.errors import FitWarning, KoopmpcError, LogError
+from koopmpc.cli.ending import ENDING
+from koopmpc.errors import FitWarning, FullDiskError, KoopmpcError, LogError
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
@@ -329,6 +330,7 @@ def _new_folder(logs: Path, what: str) -> Path:
                 f"--logs {logs}: no folder can be made there, {error.strerror}; pass a folder that you may write to"
             ) from error
         else:
+            ENDING.folder = folder
             return folder
 
 
@@ -358,7 +360,7 @@ def _new_file(path: Path, text: str) -> Path:
 
 @contextmanager
 def _friendly() -> Generator[None]:
-    """Show each warning and each error of koopmpc as one message on stderr; an error exits with 2."""
+    """Show each warning and error of koopmpc as one message on stderr; an error exits with 2, a full disk with 1."""
     err = Console(stderr=True)
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
@@ -371,4 +373,4 @@ def _friendly() -> Generator[None]:
             yield
         except KoopmpcError as error:
             err.print(Text.assemble((f"{type(error).__name__}: ", "red"), str(error)), soft_wrap=True)
-            raise typer.Exit(2) from error
+            raise typer.Exit(1 if isinstance(error, FullDiskError) else 2) from error
