@@ -29,6 +29,10 @@ class LogError(KoopmpcError, OSError):
     """A file is no log, no model, or no data of koopmpc, or cannot be read to its end."""
 
 
+class ThreadError(KoopmpcError, RuntimeError):
+    """Two threads entered one controller at once."""
+
+
 class FullDiskError(LogError):
     """There is no room for a file; what stood at its path before is as it was."""
 

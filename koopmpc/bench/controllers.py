@@ -87,7 +87,8 @@ class Prepared:
         equilibria = Equilibria(learned_map(plant), problem.cost, seen)
         rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
         distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
-        return np.array([equilibria.find(row).u for row in distinct])[of.ravel()]
+        held = [equilibria.find(row) or equilibria.guess(row) for row in distinct]
+        return np.array([each.u for each in held])[of.ravel()]
 
     @cached_property
     def data(self) -> Episodes:

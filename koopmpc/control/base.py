@@ -16,6 +16,7 @@ from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import admitted
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.saved import Kind, SavedController
+from koopmpc.control.turns import token
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
 from koopmpc.lifting.base import HUGE
@@ -167,6 +168,8 @@ class MPCBase:
     A subclass calls `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step returns the
     next input of the last good plan, then the unconstrained input clipped, then the last input.
 
+    One thread at a time may call it: a second one gets a ThreadError. Give each thread a copy of its own.
+
     Parameters
     ----------
     dt
@@ -216,6 +219,7 @@ class MPCBase:
         self._initial = InitialCondition(
             model, observer, self._N, self._latency, with_rates=with_rates, estimated=estimator is not None
         )
+        self._token, self._inside = token(), 0
         MPCBase.reset(self)
 
     def as_data(self) -> SavedController:
@@ -265,6 +269,10 @@ class MPCBase:
     def __copy__(self) -> "MPCBase":
         """Return a copy that shares nothing with this one that moves in a step."""
         return copy.deepcopy(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._token, self._inside = token(), 0  # that of the original may be in use
 
     @property
     def observer(self) -> StateObserver:

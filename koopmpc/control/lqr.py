@@ -1,5 +1,6 @@
 """LQR: the controller u = −K ψ(x) + feedforward inside the limits of the inputs, and the gains of `lqr` and `dlqr`."""
 
+import copy
 from time import perf_counter
 
 import numpy as np
@@ -14,6 +15,7 @@ from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
+from koopmpc.control.turns import alone, token
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.base import HUGE
@@ -29,6 +31,8 @@ class LQR:
     the disturbance w held: the gain K and the feedforward are where the Riccati difference equation rests. Where r is
     an equilibrium and u_r holds it, u = u_r − K (ψ(x) − z_r). With R_delta it acts on [ψ(x); u_{k−1}]. The input is
     clipped to the limits of its change, soft or hard, and to its own (status SATURATED); other limits are not seen.
+
+    One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
     Parameters
     ----------
@@ -64,6 +68,7 @@ class LQR:
         self._feedforward = np.zeros(self.nu)
         self._row = 0  # of a given u_target, for the next call
         self._last = np.zeros(self.nu)
+        self._token, self._inside = token(), 0
         self.reset()
 
     @property
@@ -81,6 +86,11 @@ class LQR:
         """No preview."""
         return 0
 
+    def __copy__(self) -> "LQR":
+        """Return a copy that shares nothing with this one that moves in a step."""
+        return copy.deepcopy(self)
+
+    @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Set the last input, from which rates count, and which is held if the first measurement is bad.
 
@@ -91,6 +101,7 @@ class LQR:
         zero = np.clip(np.zeros(self.nu), *self._inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
 
+    @alone
     def __call__(
         self,
         y: ArrayLike,

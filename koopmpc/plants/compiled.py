@@ -20,6 +20,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.interrupts import heard
+
 Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
 
 # No fused multiply-adds and no -march: the interpreter's numbers, on any machine of this kind.
@@ -61,6 +63,8 @@ class Buffered(threading.local):
         self.arguments = tuple(np.zeros(function.size1_in(i)) for i in range(function.n_in()))
         self.results = tuple(np.zeros(function.nnz_out(i)) for i in range(function.n_out()))
         self.evaluate, self._buffer = _interpreter(function, self.arguments, self.results)
+        if not function.is_a("SXFunction"):  # it may hold an integrator
+            self.evaluate = heard(self.evaluate)
 
     def __call__(self, *arguments: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return fresh results; `arguments` have the shapes of the function's inputs, (n,) each."""

@@ -98,7 +98,8 @@ class Holding:
         """Return the equilibrium of a row; that of the row before it is where the search begins."""
         key = row.tobytes()
         if key not in self._known:
-            self._known[key] = self._last = self._equilibria.find(row, self._push, self._last)
+            found = self._equilibria.find(row, self._push, self._last) or self._last
+            self._known[key] = self._last = self._equilibria.guess(row) if found is None else found
         return self._known[key]
 
 

@@ -20,6 +20,7 @@ from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows
+from koopmpc.control.turns import alone, busy
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
@@ -37,6 +38,8 @@ class KoopmanMPC(MPCBase):
     solution moved on by one step (OPTIMAL, or SOFTENED where a limit had to give way). A failed step falls back on
     the last plan, then on the clipped unconstrained input, then on the last input. Inputs always keep their limits.
     Their changes keep hard limits wherever the two do not exclude each other.
+
+    One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
     Parameters
     ----------
@@ -139,7 +142,7 @@ class KoopmanMPC(MPCBase):
         return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
+        super().__setstate__(state)
         self._see()
 
     def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:
@@ -153,6 +156,7 @@ class KoopmanMPC(MPCBase):
         """
         return self._map.maps.coordinates
 
+    @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; see `MPCBase`."""
         super().reset(x0, u_prev)
@@ -160,6 +164,7 @@ class KoopmanMPC(MPCBase):
         if self._given_row:
             self._given_row, self._rows_left, self._reference_key = 0, False, None
 
+    @alone
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with new A, B, C and E: the plan, the warm start and the last input are kept.
 
@@ -202,6 +207,17 @@ class KoopmanMPC(MPCBase):
             (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N−1}, the last repeated,
             w_{k+N+latency−1} with latency; by default zero.
         """
+        try:
+            held = self._token.pop()
+        except IndexError:
+            raise busy(self) from None
+        try:
+            return self._step(y, reference, applied, w)
+        finally:
+            self._token.append(held)
+
+    def _step(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None, w: ArrayLike | None) -> Move:
+        """Return the move of this step; no other thread is here."""
         start = perf_counter()
         target = numbers(reference, "reference")
         key = target.tobytes()

@@ -18,6 +18,8 @@ class LinearMPC(KoopmanMPC):
     A and B are the Jacobians of `step_map` at (x̄, ū). It is a KoopmanMPC on `LinearPredictor.local(step_map, x, u)`,
     whose observables are the state and a constant, and it steps, copies and fails like one.
 
+    One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
+
     Parameters
     ----------
     step_map

@@ -17,6 +17,7 @@ from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
 from koopmpc.estimate.observer import Estimator
+from koopmpc.interrupts import heard
 from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 
@@ -60,6 +61,8 @@ class BilinearMPC(StagedMPC):
     are Riccati recursions. Where changes of the inputs count, or moves are blocked, the changes are the inputs of the
     program, and the last input is part of its state.
 
+    One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
+
     Parameters
     ----------
     model
@@ -91,6 +94,7 @@ class BilinearMPC(StagedMPC):
     SIAM J. Control Optim. 43, 2005.
     """
 
+    @heard  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
         model: ModelOrMap,

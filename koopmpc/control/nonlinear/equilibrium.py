@@ -16,6 +16,7 @@ from koopmpc.control.nonlinear.problem import LearnedMap, point_sizes
 from koopmpc.control.riccati import root
 from koopmpc.control.terminal_cost import one_step, stationary, tail_of, tail_stage
 from koopmpc.errors import ShapeError
+from koopmpc.interrupts import listening
 from koopmpc.lifting.state import State
 from koopmpc.plants.compiled import Buffered
 
@@ -227,20 +228,26 @@ class Equilibria:
         limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
         return Chord(s, back @ W @ gain - gain, back, limited * size)
 
+    def guess(self, row: Float[np.ndarray, " nr"]) -> Equilibrium:
+        """Return where the search for the equilibrium of a row begins: the state that it names, inputs at zero."""
+        model, u = self.model, np.clip(np.zeros(self.model.nu), *self._outputs.inputs)
+        x = np.zeros(model.nx)
+        if self.of_state:
+            weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
+            x = row if center is None else np.where(weighed, row, center)
+            x = x if model.embedding is None else model.embedding.held(x, u)
+        return Equilibrium(x, u, np.zeros(len(self._low), dtype=np.intp))
+
     def find(
         self,
         row: Float[np.ndarray, " nr"],
         e: Float[np.ndarray, " nx"] | None = None,
         near: Equilibrium | None = None,
-    ) -> Equilibrium:
-        """Return the equilibrium that holds a reference row, by ipopt: from `near`, or from several guesses."""
+    ) -> Equilibrium | None:
+        """Return the equilibrium that holds a row, by ipopt, from `near` or several guesses, or None."""
         model, inputs, box = self.model, self._outputs.inputs, self._outputs.outputs
-        nx, u = model.nx, np.clip(np.zeros(model.nu), *inputs)
-        x, e = np.zeros(nx), np.zeros(nx) if e is None else e
-        if self.of_state:
-            weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
-            x = row if center is None else np.where(weighed, row, center)
-            x = x if model.embedding is None else model.embedding.held(x, u)
+        x, u, _ = self.guess(row)
+        nx, e = model.nx, np.zeros(model.nx) if e is None else e
         size, limit_size = self.size, self._limit_size
         guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
         if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
@@ -248,7 +255,7 @@ class Equilibria:
             guesses += [np.concatenate([x, u]) for x in scatter]
         unlimited = np.full(len(box.low), np.inf)
         good = _MISSED * float(row @ self._outputs.Q @ row) / self._scale
-        best = guesses[0]
+        best = None
         for limits in (box, Interval(-unlimited, unlimited)):
             found, least = None, np.inf
             for guess in guesses:
@@ -259,14 +266,18 @@ class Equilibria:
                     "ubg": np.concatenate([np.zeros(nx), limits.high / limit_size[model.nu :]]),
                 }
                 p = np.concatenate([row, model.theta, e])
-                solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
-                if self._solver.stats()["success"] and float(solved["f"]) < least:
-                    found, least = solved["x"].full().ravel() * size, float(solved["f"])
+                with listening():
+                    solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
+                    success, f, s = self._solver.stats()["success"], float(solved["f"]), solved["x"].full().ravel()
+                if success and f < least:
+                    found, least = s * size, f
                 if least <= good:
                     break
             if found is not None:
                 best = found
                 break
+        if best is None:
+            return None
         x, u = best[:nx], best[nx:]
         values = np.concatenate([u, self.linearise(x, u).g])
         reach = _AT * (limit_size + np.abs(values))
@@ -310,10 +321,18 @@ class TerminalTargets:
             if not self.equilibria.of_state:
                 raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
         self._known: dict[bytes, TerminalTarget] = {}
+        self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
+
+    def forget_missed(self) -> None:
+        """Look again for the equilibria that were not found."""
+        for key in self._missed:
+            del self._known[key]
+        self._missed.clear()
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ: the last target is found anew, from where it was."""
         self.equilibria.update(model)
+        self.forget_missed()
         last, self._known = list(self._known.items())[-1:], {}
         for key, target in last:
             row = np.frombuffer(key)
@@ -322,13 +341,26 @@ class TerminalTargets:
                 self._known[key] = self._target(row, found)
 
     def __call__(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
-        """Return the target of a reference row, kept for the next time."""
+        """Return the target of a row, kept for the next time, or until `forget_missed` where none was found."""
         key = row.tobytes()
         if key not in self._known:
             if len(self._known) > _MOST:
                 self._known.clear()
-            self._known[key] = self._target(row, self.equilibria.find(row))
+                self._missed.clear()
+            found = self.equilibria.find(row)
+            if found is None:
+                self._missed.add(key)
+            self._known[key] = self._unheld(row) if found is None else self._target(row, found)
         return self._known[key]
+
+    def _unheld(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
+        """Return the target of a row whose equilibrium was not found: ‖of(x_N) − r‖²_Q, and inputs at zero."""
+        o, (nx, nu, nr) = self._outputs, (self.equilibria.model.nx, self.equilibria.model.nu, len(row))
+        n = nx + nu * (o.R_delta is not None and self._cost.Q_N is None) + nr
+        M, L, V = (np.zeros((n, columns)) for columns in (nr, nx, nu))
+        M[:nr] = root(o.Q if self._cost.Q_N is None else checks.weight(self._cost.Q_N, "Q_N", nr))
+        begin = self.equilibria.guess(row)
+        return TerminalTarget(begin, begin.u * self._hold, M, L, V, M @ row, np.zeros((nu, nx)))
 
     def disturbed(
         self, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"], last: TerminalTarget | None
@@ -341,6 +373,8 @@ class TerminalTargets:
         begin = (target if last is None else last).equilibrium
         each = self.equilibria
         found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE) or each.find(row, e, begin)
+        if found is None or row.tobytes() in self._missed:
+            return target
         u, m = found.u * self._hold, target.m
         if self._cost.Q_N is None:
             m = target.M @ each.values(found.x, found.u)[1] + target.L @ found.x + target.V @ u

@@ -17,6 +17,7 @@ from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
+from koopmpc.interrupts import heard
 
 _HOLD = 5  # steps for which a random guess holds an input
 _WIDE = 1.0  # the range of random inputs where they have no limit
@@ -29,6 +30,8 @@ class NonlinearMPC(StagedMPC):
     inputs count they are the variables. Every step starts from the last solution moved on by one step, multipliers
     included. Without a Q_N the terminal weight is the Riccati solution of the linearisation at the equilibrium that
     holds the last reference row. It finds a local optimum, as every method of its kind.
+
+    One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
     Parameters
     ----------
@@ -65,6 +68,7 @@ class NonlinearMPC(StagedMPC):
     nonlinear programming", Math. Prog. 106, 2006.
     """
 
+    @heard  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
         model: ModelOrMap,

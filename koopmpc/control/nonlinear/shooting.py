@@ -11,6 +11,7 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.errors import DataError
+from koopmpc.interrupts import listening
 
 NLPSolver = Literal["ipopt", "fatrop", "sqpmethod"]
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
@@ -161,7 +162,8 @@ class Shooting:
                 "ng": [0] + [npath] * N,
             }
         try:
-            self._solver = ca.nlpsol("shooting", solver, nlp, {**OPTIONS[solver], **given, **settings})
+            with listening():
+                self._solver = ca.nlpsol("shooting", solver, nlp, {**OPTIONS[solver], **given, **settings})
         except (RuntimeError, NotImplementedError, TypeError) as error:
             reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
             raise DataError(
@@ -189,11 +191,12 @@ class Shooting:
         self._bounds["lbx"][:nu], self._bounds["ubx"][:nu] = first
         p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
-        found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
-        stats = self._solver.stats()
+        with listening():
+            found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
+            stats = self._solver.stats()
+            v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         unified = str(stats.get("unified_return_status"))
         status = _STATUS.get(str(stats["return_status"]), _STATUS.get(unified, Status.FAILED))
-        v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         if not np.isfinite(v).all():
             status = Status.FAILED
         U, X, slacks = np.split(v.reshape(self._shape), self._split, axis=1)

@@ -17,6 +17,7 @@ from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.target import reference_rows
+from koopmpc.control.turns import alone
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
@@ -98,14 +99,17 @@ class StagedMPC(MPCBase):
         """The model as a map, x⁺ = F(x, u)."""
         return self.model if isinstance(self.model, StepMap) else self.model.step_map()
 
+    @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         super().reset(x0, u_prev)
         self._warm = self._moved = False
+        self._terminal.forget_missed()
         self._forget_targets()
         self._row = 0
         self._e[:] = 0.0
 
+    @alone
     def update(self, model: ModelOrMap) -> None:
         """Go on with new A, B, N, C and E of the same lifting: the plan and the last input are kept.
 
@@ -128,6 +132,7 @@ class StagedMPC(MPCBase):
         """Return the plan of the last call; None where it had none."""
         return Plan(self._X[:, : self._map.ny].copy(), self._U.copy()) if self._planned else None
 
+    @alone
     def __call__(
         self,
         y: ArrayLike,

@@ -42,6 +42,7 @@ _STRICT = 1e-12  # eps_prim_inf where a first certificate was rounding
 # residual, that one 23 times, and of 1489 true ones all reach 6600 times.
 _CERTAIN, _ROUNDING = 1000.0, 1e-9
 _SHORTEST = 1e-6  # seconds that a solve gets at least
+_INTERRUPTED = 10  # the status of a solve that Ctrl-C ended: OSQP takes the signal for itself
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
 
@@ -191,6 +192,8 @@ class OSQP(QPSolver):
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
         self._solver.solve()
         info, solution = self._solver.info, self._solver.solution
+        if int(info.status_val) == _INTERRUPTED:
+            raise KeyboardInterrupt
         status = self._status.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
             status = Status.TIME_LIMIT

@@ -1,0 +1,163 @@
+"""Ctrl-C: one line and exit code 130 from every command, KeyboardInterrupt in Python, and no file lost."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import koopmpc as km
+from koopmpc.cli.ending import kept
+from tests.bench.tiny import write
+
+SECONDS = 5.0  # of patience of a test on a busy machine; on a quiet one each command ends within one
+BOUND = km.Limits(u_min=-1, u_max=1, x_min=[-0.2, -1.0], x_max=[0.2, 1.0])
+PENDULUM = km.load_problem("pendulum")
+PLANT = km.discretize(PENDULUM.dynamics, 0.05)
+
+
+def data(episodes=30, steps=40):
+    return km.collect(PLANT, km.Uniform([-3, -4], [3, 4]), km.Noise(-8, 8), episodes=episodes, steps=steps)
+
+
+LIFTING = km.State() + km.Fourier(2, states=[0]) + km.Constant()
+
+
+def stepping(controller):
+    def again():
+        controller.reset()
+        controller([0.5, 0.0], [np.random.default_rng().uniform(-0.1, 0.1), 0.0])
+
+    return again
+
+
+def _koopman(solver):
+    return stepping(km.KoopmanMPC(km.edmd(data(), LIFTING), PENDULUM.cost, BOUND, 40, solver=solver))
+
+
+def _bilinear():
+    model = km.bilinear_edmd(data(), LIFTING)
+    return lambda: km.BilinearMPC(model, PENDULUM.cost, BOUND, 8)([0.5, 0.0], [np.random.default_rng().random(), 0.0])
+
+
+def _cvodes():
+    plant = km.discretize(PENDULUM.dynamics, 0.05, km.CVODES())
+    return lambda: plant.rollout([0.1, 0.0], np.zeros((200, 1)))
+
+
+def _record(tmp_path):
+    run = km.simulate(
+        PLANT, km.LinearMPC(PLANT, [0, 0], [0], PENDULUM.cost, None, 5), x0=[0.1, 0], reference=[0, 0], steps=50
+    )
+    return lambda: km.record(run, tmp_path / "run.rrd")
+
+
+BUSY = {
+    "osqp": lambda _: _koopman("osqp"),
+    "daqp": lambda _: _koopman("daqp"),
+    "ipopt": lambda _: stepping(km.NonlinearMPC(PLANT, PENDULUM.cost, BOUND, 20)),
+    "sqpmethod": lambda _: stepping(km.NonlinearMPC(PLANT, PENDULUM.cost, BOUND, 20, solver="sqpmethod")),
+    "equilibria": lambda _: _bilinear(),
+    "cvodes": lambda _: _cvodes(),
+    "record": _record,
+}
+
+
+def _until(end, busy):
+    while time.monotonic() < end:
+        busy()
+
+
+@pytest.mark.parametrize("name", BUSY)
+@pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.slow)])
+def test_an_interrupt_is_never_swallowed_in_python(tmp_path: Path, name: str, count: int) -> None:
+    busy, rng = BUSY[name](tmp_path), random.Random(name)
+    for _ in range(count):
+        timer = threading.Timer(rng.uniform(0.01, 0.2), lambda: os.kill(os.getpid(), signal.SIGINT))
+        end = time.monotonic() + SECONDS
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            _until(end, busy)
+        timer.join()
+    assert not list(tmp_path.glob(".*.part"))
+
+
+def moments(what: str, count: int) -> list[float]:
+    """Return seconds after the start of a command: a third of them while it still imports."""
+    rng = random.Random(what)
+    return [rng.uniform(0.2, 2.0) if i % 3 == 0 else rng.uniform(1.0, 12.0) for i in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sent"),
+    [
+        (["bench", "tiny.py", "pendulum"], signal.SIGINT),
+        (["fit", "data.csv"], signal.SIGINT),
+        (["fit", "data.csv", "--workers", "2"], signal.SIGINT),
+        (["fit", "data.csv"], signal.SIGTERM),
+        (["reproduce", "snyder"], signal.SIGINT),
+    ],
+    ids=["bench", "fit", "fit with workers", "fit, SIGTERM", "reproduce"],
+)
+@pytest.mark.parametrize("count", [1, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_command_ends_at_once_with_one_line_and_whole_files(
+    tmp_path: Path, arguments: list[str], sent: signal.Signals, count: int
+) -> None:
+    write(tmp_path)
+    data(episodes=60).save(tmp_path / "data.csv")
+    interrupted = 0
+    for moment in moments(" ".join(arguments), count):
+        running = subprocess.Popen(
+            [sys.executable, "-m", "koopmpc", *arguments],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            running.communicate(timeout=moment)
+            continue  # it was done before
+        except subprocess.TimeoutExpired:
+            pass
+        if sent is signal.SIGINT:  # of a terminal, to all processes of the command
+            os.killpg(running.pid, sent)
+        else:
+            running.send_signal(sent)
+        said = running.communicate(timeout=SECONDS)[1]
+        interrupted += 1
+        if moment < 0.5 and running.returncode in (-sent, 130) and "interrupted; " not in said:
+            continue  # Python itself was still starting
+        assert running.returncode == 130, said
+        assert "Traceback" not in said
+        *_, last = said.replace("\r", "\n").splitlines()
+        assert "interrupted; nothing was written" in last or "interrupted; kept in logs" in last
+        for path in (tmp_path / "logs").rglob("*") if (tmp_path / "logs").exists() else ():
+            assert path.suffix != ".part"
+            if path.suffix == ".parquet":
+                pq.read_table(path)
+            if path.name == "model.npz":
+                km.load_model(path)
+            if path.suffix == ".rrd" and "bench" in arguments:
+                km.load_run(path)
+    assert interrupted > 0
+
+
+def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
+    assert kept(None) == "nothing was written"
+    folder = tmp_path / "logs"
+    (folder / "pictures").mkdir(parents=True)
+    assert kept(folder) == "nothing was written"
+    assert not folder.exists()
+    folder.mkdir()
+    for name in ("a.rrd", "b.rrd", "results.parquet", ".c.rrd.1234.part"):
+        (folder / name).write_text("x")
+    assert kept(folder) == f"kept in {folder}: 2 finished runs, results.parquet"
+    assert not list(folder.glob(".*"))
