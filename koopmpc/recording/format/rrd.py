@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from koopmpc import disk
 from koopmpc.errors import LogError
 from koopmpc.loop.run import Plans, Run, Step, StepRows
-from koopmpc.recording.format.apart import Column, read, read_apart
 from koopmpc.recording.format.columns import Entity
 from koopmpc.recording.format.logfile import intact
+from koopmpc.recording.format.rerun_reader import Column, read, read_in_child
 
 _MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
 _FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
@@ -128,7 +128,7 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
         if intact(path):
             return LogColumns(read(path, entities), entities, torn=False)
         with _whole_messages(path) as (whole, torn):
-            return LogColumns(read_apart(whole, entities, path), entities, torn)
+            return LogColumns(read_in_child(whole, entities, path), entities, torn)
     except LogError:
         raise
     except Exception as error:  # Rerun's reader raises exceptions of many kinds

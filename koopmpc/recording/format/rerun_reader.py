@@ -48,7 +48,7 @@ def read(path: Path, entities: tuple[str, ...]) -> list[Column]:
     return found
 
 
-def read_apart(path: Path, entities: tuple[str, ...], told: Path) -> list[Column]:
+def read_in_child(path: Path, entities: tuple[str, ...], told: Path) -> list[Column]:
     """Return the columns of these entities, read in a child process; messages call the file `told`.
 
     Raises
