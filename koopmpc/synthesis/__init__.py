@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from koopmpc.synthesis.recipes import Recipe as Recipe
     from koopmpc.synthesis.selection import LeaderboardRow as LeaderboardRow
     from koopmpc.synthesis.selection import Selection as Selection
+    from koopmpc.synthesis.stabilise import Stabilised as Stabilised
     from koopmpc.synthesis.surrogates import Surrogate as Surrogate
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

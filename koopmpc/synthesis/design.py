@@ -347,7 +347,9 @@ def _advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: 
     if expected.lost:
         said.append(
             f"{expected.lost} of {runs} runs were lost: the loop went where there are no data, or fell over; collect "
-            "episodes around the reference and on the way to it, ask for less, or start nearer"
+            "episodes around the reference and on the way to it, ask for less, or start nearer; where the plant falls "
+            "over by itself, km.stabilise finds a feedback under which it can be excited, from short episodes near its "
+            "equilibrium, and without the plant at hand only logs taken under some feedback, with noise on top, will do"
         )
     known = expected.cost[np.isfinite(expected.cost)]
     if not known.size:

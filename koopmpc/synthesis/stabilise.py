@@ -1,0 +1,258 @@
+"""stabilise: from short episodes near an equilibrium to a feedback that holds an unstable plant, and to data."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.lqr import dlqr
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.excitation import Excitation, Feedback, Noise
+from koopmpc.errors import DataError, FitWarning, KoopmpcError
+from koopmpc.plants.dynamics import Plant, require_plant
+from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.values import Value
+
+FIRST = 0.05  # share of `reach` from which the first episodes start
+WIDEST = 0.5  # share of `reach` from which the last ones may start
+LOUD = (1.0, 0.5, 0.25, 0.1)  # shares of the input range that the noise of the first episodes has, tried in turn
+GROWTH = 2.0  # from round to round, of starts and of lengths, while nothing is lost
+_RIDGE = 1e-9
+_HELD = 20  # runs without noise that the feedback is judged by, from nearer where too few of them stay
+_ENOUGH = 0.95  # share of them that shall stay
+
+
+@dataclass(frozen=True, eq=False)
+class Stabilised(Value):
+    """A feedback u = u_ref − K (x − x_ref) inside the input bounds, and the data that it took.
+
+    Attributes
+    ----------
+    feedback
+        An excitation for `collect`: the feedback with noise on top, so that its data tell what inputs do.
+    data
+        All episodes, those that were lost too, up to where they left.
+    held
+        Share of the runs without noise that stayed within `reach` for all their steps.
+    start
+        Share of `reach` from which these runs started.
+    lost
+        Episodes that left `reach`.
+    """
+
+    feedback: Feedback
+    data: Episodes
+    held: float
+    start: float
+    lost: int
+
+    @property
+    def K(self) -> Float[np.ndarray, "nu nx"]:
+        """The gain."""
+        return self.feedback.K
+
+    def __str__(self) -> str:
+        """Return what was reached, in a sentence."""
+        steps = sum(map(len, self.data))
+        return (
+            f"held in {self.held:.0%} of {_HELD} runs from within {self.start:.0%} of the reach, after "
+            f"{len(self.data)} episodes of {steps} steps in all, {self.lost} of which were lost"
+        )
+
+
+def stabilise(
+    plant: StepMap | Plant,
+    equilibrium: tuple[ArrayLike, ArrayLike],
+    *,
+    reach: ArrayLike,
+    u_min: ArrayLike,
+    u_max: ArrayLike,
+    episodes: int = 12,
+    steps: int = 60,
+    rounds: int = 8,
+    rng: np.random.Generator | int = 0,
+) -> Stabilised:
+    """Find a feedback that holds a plant at an unstable equilibrium, and data for `design`, without a model or a gain.
+
+    The first episodes start close to the equilibrium under noise alone, and end where a state leaves `reach`: a plant
+    that falls over has to be reset often, and each fall tells how it falls. An affine model x⁺ = A x + B u + c of all
+    steps so far gives the LQR gain, with Q = 1/reach² and R = 1/(input range)², and the input that holds the
+    equilibrium. The next episodes run under this feedback with noise on top, longer and from further away where none
+    was lost, with half of the noise and from nearer where some were. Inputs never leave their bounds.
+
+    Parameters
+    ----------
+    plant
+        A step map, or a plant whose `reset` goes to the state that it is given, or near it; all states are measured.
+    equilibrium
+        (x, u): the state to hold, and about the input that holds it.
+    reach
+        (nx,) how far each state may go from the equilibrium. An episode ends there: choose what the plant survives.
+    u_min, u_max
+        (nu,) finite bounds of the inputs.
+    episodes, steps
+        Of each round; an episode has `steps` steps at most.
+    rounds
+        How many, at most.
+    rng
+        Draws starts and noise.
+
+    Raises
+    ------
+    DataError
+        A bound is missing, the equilibrium's input is outside of it, or a reach is not above zero.
+    ShapeError
+        Sizes do not fit the plant.
+
+    Warns
+    -----
+    FitWarning
+        The feedback holds the plant in less than 95 % of the runs, even from 5 % of the reach: the input range is too
+        small, the sample time too long, a state is not measured, or the plant is far from linear within the reach.
+    """
+    if isinstance(plant, StepMap):
+        plant = SimulatedPlant(plant)
+    require_plant(plant)
+    draw = checks.generator(rng)
+    nu = len(plant.inputs)
+    x_ref = np.atleast_1d(checks.array(equilibrium[0], "the equilibrium's state"))
+    nx = len(x_ref)
+    if len(plant.outputs) != nx:
+        raise DataError(
+            f"the equilibrium has {nx} states and the plant measures {len(plant.outputs)}: pass all that is measured; "
+            "a feedback of states needs every one of them"
+        )
+    u_ref = checks.vector(equilibrium[1], "the equilibrium's input", nu)
+    size = checks.vector(reach, "reach", nx)
+    low, high = checks.vector(u_min, "u_min", nu), checks.vector(u_max, "u_max", nu)
+    checks.crossed(low, high, "input")
+    if (size <= 0).any():
+        raise DataError(f"reach is {size}; pass a distance above zero for each state, beyond which an episode ends")
+    if ((u_ref < low) | (u_ref > high)).any() or (low == high).any():
+        raise DataError(f"the equilibrium's input is {u_ref}; it must lie inside u_min {low} and u_max {high}")
+    episodes, steps, rounds = (
+        checks.count(value, name) for value, name in ((episodes, "episodes"), (steps, "steps"), (rounds, "rounds"))
+    )
+    test = _Trials(plant, x_ref, size, draw)
+    room = np.minimum(u_ref - low, high - u_ref)
+    room = np.where(room > 0, room, (high - low) / 2)
+    start, lost = FIRST, 0
+    made: list[Episode] = []
+    for i in range(episodes):
+        loud = LOUD[i % len(LOUD)] * room
+        policy = Noise(np.maximum(u_ref - loud, low), np.minimum(u_ref + loud, high), hold=2)
+        episode, whole = test.run(policy, start, max(steps // 4, 5))
+        made.append(episode)
+        lost += not whole
+    share, feedback = 0.5, None
+    length = max(steps // 2, 5)
+    for _ in range(rounds):
+        found = _feedback(made, x_ref, u_ref, size, low, high)
+        if found is None:
+            continue
+        gain, held_by = found
+        loud = share * room
+        feedback = Feedback(gain, Noise(-loud, loud, hold=2), x_ref, held_by, low, high)
+        fallen = 0
+        for _ in range(episodes):
+            episode, whole = test.run(feedback, start, length)
+            made.append(episode)
+            fallen += not whole
+        lost += fallen
+        if fallen:
+            share, start = share / 2, max(start / GROWTH, FIRST)
+        else:
+            done = length == steps and start == WIDEST
+            length, start = min(int(GROWTH * length), steps), min(GROWTH * start, WIDEST)
+            if done:
+                break
+    if feedback is None:
+        raise KoopmpcError(
+            f"{len(made)} episodes near the equilibrium gave no model with a stabilising gain; pass wider input bounds "
+            "or a larger reach, or more episodes"
+        )
+    still = Feedback(feedback.K, None, x_ref, feedback.u_ref, low, high)
+    start *= GROWTH
+    held = 0.0
+    while held < _ENOUGH and start > FIRST:
+        start = max(start / GROWTH, FIRST)
+        held = float(np.mean([test.run(still, start, steps)[1] for _ in range(_HELD)]))
+    kept = Episodes([e for e in made if len(e)], plant.dt, plant.states, plant.inputs)
+    result = Stabilised(feedback, kept, held, start, lost)
+    if held < _ENOUGH:
+        warnings.warn(
+            f"{result}: give the inputs a wider range, sample faster, or measure what is not measured; a smaller reach "
+            "keeps the plant where it is nearly linear",
+            FitWarning,
+            stacklevel=2,
+        )
+    return result
+
+
+class _Trials:
+    """Runs of a plant near x_ref, which end where it leaves the box of half-widths `size`."""
+
+    def __init__(
+        self, plant: Plant, x_ref: Float[np.ndarray, " nx"], size: Float[np.ndarray, " nx"], draw: np.random.Generator
+    ) -> None:
+        self._plant, self._x_ref, self._size, self._draw = plant, x_ref, size, draw
+
+    def run(self, excitation: Excitation, start: float, steps: int) -> tuple[Episode, bool]:
+        """Return an episode from within `start` of the box, and whether it stayed for all steps."""
+        policy = excitation.start(steps, self._plant.dt, self._draw)
+        x0 = self._x_ref + start * self._size * self._draw.uniform(-1, 1, len(self._size))
+        y = np.asarray(self._plant.reset(x0, self._draw), dtype=np.float64)
+        X, U = [y], list[Float[np.ndarray, " nu"]]()
+        for k in range(steps):
+            if not (np.abs(y - self._x_ref) <= self._size).all() or getattr(self._plant, "ended", ""):
+                return self._episode(X, U), False
+            u = np.asarray(policy(k, y), dtype=np.float64)
+            y = np.asarray(self._plant.step(u.copy()), dtype=np.float64)
+            if not np.isfinite(y).all():
+                return self._episode(X, U), False
+            X.append(y)
+            U.append(u)
+        inside = bool((np.abs(y - self._x_ref) <= self._size).all())
+        return self._episode(X, U), inside
+
+    def _episode(self, X: list[Float[np.ndarray, " nx"]], U: list[Float[np.ndarray, " nu"]]) -> Episode:
+        return Episode(X=np.array(X), U=np.array(U).reshape(len(U), len(self._plant.inputs)))
+
+
+def _feedback(
+    made: list[Episode],
+    x_ref: Float[np.ndarray, " nx"],
+    u_ref: Float[np.ndarray, " nu"],
+    size: Float[np.ndarray, " nx"],
+    low: Float[np.ndarray, " nu"],
+    high: Float[np.ndarray, " nu"],
+) -> tuple[Float[np.ndarray, "nu nx"], Float[np.ndarray, " nu"]] | None:
+    """Return the LQR gain of the affine model of all steps, and the input that holds x_ref; None where there is none.
+
+    Steps weigh by exp(−d²), d the distance to the equilibrium in units of the reach: what is learned is how the plant
+    leaves it.
+    """
+    room = (high - low) / 2
+    X = np.concatenate([episode.X[:-1] for episode in made])
+    X_next = np.concatenate([episode.X[1:] for episode in made])
+    U = np.concatenate([episode.U for episode in made])
+    Z, V, Z_next = (X - x_ref) / size, (U - u_ref) / room, (X_next - x_ref) / size
+    nx, nu = Z.shape[1], V.shape[1]
+    P = np.hstack([Z, V, np.ones((len(Z), 1))])
+    if len(P) < 2 * P.shape[1]:
+        return None
+    weight = np.exp(-(Z**2).sum(axis=1) / 2)[:, None]  # its square is the weight
+    ridge = np.sqrt(_RIDGE * len(P)) * np.eye(P.shape[1])
+    theta = np.linalg.lstsq(
+        np.vstack([P * weight, ridge]), np.vstack([(Z_next - Z) * weight, np.zeros((len(ridge), nx))]), rcond=None
+    )[0]
+    A, B, c = np.eye(nx) + theta[:nx].T, theta[nx : nx + nu].T, theta[-1]
+    try:
+        K = dlqr(A, B, np.eye(nx), np.eye(nu)).K
+    except KoopmpcError:
+        return None
+    hold = u_ref - room * (np.linalg.pinv(B, rcond=1e-6) @ c)
+    return room[:, None] * K / size, np.clip(hold, low, high)
