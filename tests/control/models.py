@@ -117,53 +117,6 @@ def dense_plan(model, cost, z0, rows, targets, C=None):
     return np.linalg.lstsq(np.vstack(blocks), np.concatenate(right), rcond=None)[0].reshape(N, nu)
 
 
-def cvxpy_plan(model, cost, limits, z0, rows, targets, C=None, of=None):
-    """The plan U (N, nu) with the lifted states as variables, by CLARABEL; None where there is none."""
-    import cvxpy as cp
-
-    C = model.C if C is None else C
-    N, nu, nz = len(rows) - 1, model.nu, model.nz
-    Q, R = cost.matrices(len(C), nu)
-    F, h = end_of(model, cost, targets, rows, C=C)
-    psd = cp.psd_wrap
-    Z, U = cp.Variable((N + 1, nz)), cp.Variable((N, nu))
-    box = limits.inputs(nu)
-    G, low, high = model.C, *limits.states(model.nx)
-    if of is not None:
-        y = limits.outputs(len(of))
-        G, low, high = np.vstack([G, of]), np.append(low, y.low), np.append(high, y.high)
-    held = [Z[0] == z0]
-    objective = 0
-    for k in range(N):
-        held += [Z[k + 1] == model.A @ Z[k] + model.B @ U[k]]
-        for i in np.flatnonzero(np.isfinite(box.low)):
-            held += [U[k, i] >= box.low[i]]
-        for i in np.flatnonzero(np.isfinite(box.high)):
-            held += [U[k, i] <= box.high[i]]
-        objective += cp.quad_form(U[k] - targets[k][1], psd(R))
-        if k + 1 < N:
-            objective += cp.quad_form(C @ Z[k + 1] - rows[k + 1], psd(Q))
-    objective += cp.sum_squares(F @ Z[N] - h)
-    limited = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
-    for i in limited:
-        values = Z[1:] @ G[i]
-        slack = 0
-        if limits.slack is not None:
-            slack = cp.Variable(N, nonneg=True)
-            objective += limits.slack[0] * cp.sum(slack) + limits.slack[1] * cp.sum_squares(slack)
-        if np.isfinite(low[i]):
-            held += [values + slack >= low[i]]
-        if np.isfinite(high[i]):
-            held += [values - slack <= high[i]]
-    problem = cp.Problem(cp.Minimize(objective), held)
-    tight = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
-    try:
-        problem.solve(cp.CLARABEL, **tight)
-    except cp.error.SolverError:
-        return None
-    return U.value if problem.status in ("optimal", "optimal_inaccurate") else None
-
-
 def in_coordinates(wanted, controller=km.KoopmanMPC):
     """The class of controller whose QP is in these coordinates, whatever is usually chosen; None leaves the choice."""
     return controller if wanted is None else type(controller.__name__, (controller,), {"_wanted": wanted})

@@ -3,20 +3,26 @@
 import warnings
 
 import numpy as np
+import scipy.linalg
+
+from tests.control.models import end_of
 
 TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 
 
-def oracle(model, cost, limits, z0, R, targets, *, end, u_prev, W=None, d=None, blocks=None, C=None, of=None):
+def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=None, C=None, of=None, targets=None):
     """U (N, nu) and the least cost, by CLARABEL; None where there is none.
 
-    `targets` are (z_r, u_r) of each row of R; the end costs ‖F ξ_N − h‖², `end` being (F, h) and ξ_N = z_N or
-    [z_N; u_{N−1}] by the size of F; `of` are the matrix of the limited observables.
+    `of` is the matrix of limited observables; the targets are found anew unless they are passed.
     """
     import cvxpy as cp
 
     C = model.C if C is None else C
     N, nu, nz = len(R) - 1, model.nu, model.nz
+    e = np.zeros(nz) if W is None else model.E @ W[-1]
+    e = e if d is None else e + d
+    targets = targets_of(model, cost, limits, R, e, C, of) if targets is None else targets
+    u_prev = np.zeros(nu) if u_prev is None else u_prev
     blocks = (1,) * N if blocks is None else blocks
     Q, Ru = cost.matrices(len(C), nu)
     psd = cp.psd_wrap
@@ -54,7 +60,7 @@ def oracle(model, cost, limits, z0, R, targets, *, end, u_prev, W=None, d=None, 
             objective += cp.quad_form(U[k] - before, psd(cost.rate(nu)))
         if k + 1 < N:
             objective += cp.quad_form(C @ Z[k + 1] - R[k + 1], psd(Q))
-    F, h = end
+    F, h = end_of(model, cost, targets, R, e, C)
     objective += cp.sum_squares(F @ (Z[N] if F.shape[1] == nz else cp.hstack([Z[N], U[N - 1]])) - h)
 
     box = limits.inputs(nu)
@@ -78,6 +84,14 @@ def oracle(model, cost, limits, z0, R, targets, *, end, u_prev, W=None, d=None, 
     for i, linear, quadratic in zip(places, *weights(limits.slack, len(places)), strict=True):
         limit(Z[1:] @ G[i], low[i], high[i], linear, quadratic)
 
+    value = minimum(objective, held)
+    return None if value is None else (U.value, value)
+
+
+def minimum(objective, held):
+    """The least objective, by CLARABEL; None where there is none."""
+    import cvxpy as cp
+
     problem = cp.Problem(cp.Minimize(objective), held)
     try:
         with warnings.catch_warnings():
@@ -85,14 +99,68 @@ def oracle(model, cost, limits, z0, R, targets, *, end, u_prev, W=None, d=None, 
             problem.solve(cp.CLARABEL, **TIGHT)
     except cp.error.SolverError:
         return None
-    return (U.value, problem.value) if problem.status in ("optimal", "optimal_inaccurate") else None
+    return problem.value if problem.status in ("optimal", "optimal_inaccurate") else None
 
 
-def targets_of(mpc, R, e=None):
-    """(z_r, u_r) of each row of R, as the controller finds them; the laws of a target have their own tests."""
+def beyond(value, low, high):
+    """Whether an entry is outside its limits."""
+    return (value < low - 1e-9).any() or (value > high + 1e-9).any()
+
+
+def targets_of(model, cost, limits, R, e, C, of=None):
+    """(z_r, u_r) of each row r: the equilibrium z = A z + B u + e with the least ‖C z − r‖²_Q, and of these the least.
+
+    Where it is outside the limits of u, C x and `of`, it is the one inside them of which C z is nearest in Q; where
+    none is, the one inside those of u. A Constant's coordinate is 1.
+    """
+    import cvxpy as cp
+
+    nz, nu, constant = model.nz, model.nu, model.lifting.constant_index
+    keep = [i for i in range(nz) if i != constant]
+    free = [*keep, *range(nz, nz + nu)]
+    E = np.hstack([model.A - np.eye(nz), model.B])[keep]
+    base = np.zeros(nz + nu)
+    if constant is not None:
+        base[constant] = 1.0
+    base[free] = np.linalg.lstsq(E[:, free], -e[keep] - E @ base, rcond=1e-8)[0]
+    basis = scipy.linalg.null_space(E[:, free], rcond=1e-8)
+    span = np.zeros((nz + nu, basis.shape[1]))
+    span[free] = basis
+    S = scipy.linalg.sqrtm(cost.matrices(len(C), nu)[0]).real
+    at = S @ C @ span[:nz]
+    G, low, high = model.C, *limits.states(model.nx)
+    if of is not None:
+        y = limits.outputs(len(of))
+        G, low, high = np.vstack([G, of]), np.append(low, y.low), np.append(high, y.high)
+    box = limits.inputs(nu)
+    rows = np.hstack([np.zeros((nu, nz)), np.eye(nu)]), np.hstack([G, np.zeros((len(G), nu))])
+    ends = (box.low, box.high), (low, high)
+    found = []
+    for k, r in enumerate(R):
+        v = base + span @ np.linalg.lstsq(at, S @ (r - C @ base[:nz]), rcond=1e-8)[0]
+        if any(beyond(M @ v, *end) for M, end in zip(rows, ends, strict=True)):
+            beta, weight = cp.Variable(span.shape[1]), 1e-9 * np.trace(at.T @ at)
+            moved = cp.sum_squares(at @ beta) + weight * cp.sum_squares(beta)
+            for count in (2, 1):
+                held = []
+                for M, (least, most) in list(zip(rows, ends, strict=True))[:count]:
+                    value, lower, upper = M @ v + (M @ span) @ beta, np.isfinite(least), np.isfinite(most)
+                    held += [value[lower] >= least[lower], value[upper] <= most[upper]]
+                if minimum(moved / np.trace(at.T @ at), held) is not None:
+                    v = v + span @ beta.value
+                    break
+        u_r = v[nz:]
+        if not isinstance(cost.u_target, str):
+            given = cost.given_inputs(nu)
+            u_r = given[min(k, len(given) - 1)]
+        found.append((v[:nz], np.zeros(nu) if isinstance(cost.u_target, str) and cost.u_target == "zero" else u_r))
+    return found
+
+
+def targets_of_controller(mpc, R, e):
+    """(z_r, u_r) of each row of R as the controller finds them, for rows whose target two limits and a tie decide."""
     found = mpc._map.targets
-    z_disturbance, u_disturbance = (0.0, 0.0) if e is None else (found.z_disturbance @ e, found.u_disturbance @ e)
     return [
-        (found.z0 + z_disturbance + found.Z @ a, found.u0 + u_disturbance + found.W @ a)
+        (found.z0 + found.z_disturbance @ e + found.Z @ a, found.u0 + found.u_disturbance @ e + found.W @ a)
         for a in found.coordinates(R, e)
     ]

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.control.models import PRECISE, Told, end_of, in_coordinates, linear, random_pair
-from tests.control.oracle import oracle, targets_of
+from tests.control.models import PRECISE, Told, in_coordinates, linear, random_pair
+from tests.control.oracle import oracle, targets_of_controller
 
 SEEDS = st.integers(0, 2**32 - 1)
 UNSTABLE = np.array([[1.05, 0.1], [0.08, 1.0]]), np.array([[0.005], [0.1]])
@@ -85,11 +85,9 @@ def equals_cvxpy(seed, coordinates):
         if disturbed:
             d[:nx] = 0.1 * rng.normal(size=nx)
         move = mpc(x, rows, u_prev if rng.random() < 0.5 else None, W if nw else None)
-        e = model.E @ W[-1] + d if nw or disturbed else None
-        targets = targets_of(mpc, rows, e)
-        end = end_of(model, cost, targets, rows, e)
+        targets = targets_of_controller(mpc, rows, model.E @ W[-1] + d)
         found = oracle(
-            model, cost, limits, model.lift(x), rows, targets, end=end, u_prev=u_prev, W=W, d=d, blocks=blocks
+            model, cost, limits, model.lift(x), rows, u_prev=u_prev, W=W, d=d, blocks=blocks, targets=targets
         )
         if found is not None and np.abs(found[0]).max() > 100:
             return  # hard states without input limits: beyond the digits of both solvers
