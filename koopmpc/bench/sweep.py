@@ -27,7 +27,7 @@ from koopmpc.loop.faults import (
 )
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import StepObserver, simulate
+from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
 from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 from koopmpc.recording.viewer import find_viewer, why_none
@@ -209,7 +209,7 @@ def _run(parts: Prepared, task: _Task, live: bool) -> Run:
     if not live:
         return closed_loop()
     names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
-    with Recorder(live=True, **names, **about, scene=scene, model=getattr(controller, "predictor", None)) as viewer:
+    with Recorder(live=True, **names, **about, scene=scene, model=predictor_of(controller)) as viewer:
         return closed_loop(viewer)
 
 

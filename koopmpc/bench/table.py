@@ -11,7 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from koopmpc.bench.results import ORACLE, RunRow
+from koopmpc.control.move import Status
 from koopmpc.loop.metrics import Metrics, duration
+from koopmpc.recording.description import STATUS_WORDS
 
 FAULT_LEGEND = (
     "Under faults: a controller's cost as a multiple of its own without the fault; lost, where only the fault "
@@ -57,18 +59,6 @@ def _cell(row: RunRow, whole: RunRow) -> str:
     fell_back = sum(count for name, count in row.metrics.fallback.items() if name != "NONE")
     return f"{word} ({fell_back})" if fell_back else word
 
-
-_STATUS = {
-    "UNCONSTRAINED": "free",
-    "OPTIMAL": "optimal",
-    "SOFTENED": "softened",
-    "SATURATED": "clipped",
-    "MAX_ITERATIONS": "unfinished",
-    "TIME_LIMIT": "out of time",
-    "INFEASIBLE": "infeasible",
-    "BAD_MEASUREMENT": "bad y",
-    "FAILED": "failed",
-}
 
 LEGEND = (
     "cost: Σ‖x−r‖²_Q + ‖u−u_r‖²_R over the run, u_r the input that holds r, and its ratio to nonlinear-mpc. That plans "
@@ -140,4 +130,4 @@ def _cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iter
 
 
 def _counts(status: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {_STATUS[name]}" for name, count in status.items())
+    return ", ".join(f"{count} {STATUS_WORDS[Status[name]]}" for name, count in status.items())

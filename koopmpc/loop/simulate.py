@@ -19,6 +19,7 @@ from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.run import Plans, Run, Step, StepRows
 from koopmpc.plants.dynamics import Plant, require_plant
 from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.predict.base import Predictor
 
 Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
 StepObserver = Callable[[Step], None]
@@ -134,7 +135,7 @@ def simulate(
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
     noisy = _noise(noise, steps, ny)
     held = _held(u_reference, cost, steps, nu)
-    metadata = dict(metadata or {})
+    metadata = {"controller": type(controller).__name__, **(metadata or {})}
     W = None
     if measured is not None:
         W = _rows_ahead(measured, "measured", "nw", steps, N, "steps")
@@ -206,8 +207,14 @@ def simulate(
         angles=tuple(angles),
         metadata=metadata,
         scene=scene,
-        model=getattr(controller, "predictor", None),
+        model=predictor_of(controller),
     )
+
+
+def predictor_of(controller: object) -> Predictor | None:
+    """Return the predictor that a controller holds, None where it has none."""
+    held = (getattr(controller, name, None) for name in ("predictor", "model"))
+    return next((each for each in held if isinstance(each, Predictor)), None)
 
 
 def _rows_ahead(

@@ -13,6 +13,7 @@ import numpy as np
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
+from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
@@ -25,13 +26,37 @@ _FORMAT = "koopmpc-log-1"
 
 def application_of(about: About) -> str:
     """Return the Rerun application of the problem; Rerun stores the layouts of its users by application."""
-    return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]", "_", str(about.metadata.get("problem", "run")))
+    own = "run-" + "-".join((*about.states, *about.inputs))  # scripts of one plant share a layout
+    return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]+", "_", str(about.metadata.get("problem", own)))
 
 
 def title_of(about: About) -> str:
     """Return problem, case, controller and fault in one line, without those that are unknown."""
     parts = [about.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
-    return " · ".join(str(p) for p in parts if p is not None) or "run"
+    known = [str(p) for p in parts if p is not None]
+    if "problem" not in about.metadata:  # a user's own script: the plant's names tell what was driven
+        known.insert(0, ", ".join(re.sub(r"\s*\[.*?\]", "", name) for name in about.states[:4]))
+    return " · ".join(known)
+
+
+STATUS_WORDS = {
+    Status.UNCONSTRAINED: "free",
+    Status.OPTIMAL: "optimal",
+    Status.SOFTENED: "softened",
+    Status.SATURATED: "clipped",
+    Status.MAX_ITERATIONS: "unfinished",
+    Status.TIME_LIMIT: "out of time",
+    Status.INFEASIBLE: "infeasible",
+    Status.BAD_MEASUREMENT: "bad y",
+    Status.FAILED: "failed",
+}
+"""Status → its word in tables and pictures; `koopmpc explain WORD` says what it means."""
+
+
+def status_words(status: Status, fallback: Fallback) -> str:
+    """Return how a step ended in words: ``"free"``, ``"unfinished, then shifted plan"``."""
+    word = STATUS_WORDS.get(status, status.name.lower().replace("_", " "))
+    return word if fallback is Fallback.NONE else f"{word}, then {fallback.name.lower().replace('_', ' ')}"
 
 
 def to_json(about: About, steps: int | None) -> str:
@@ -76,9 +101,23 @@ def to_markdown(about: About) -> str:
     return "\n".join(lines)
 
 
-def metrics_to_markdown(metrics: Metrics, tracked: tuple[str, ...]) -> str:
-    """Return the metrics as a table."""
-    return _table("metric", metrics.figures(tracked))
+def metrics_to_markdown(metrics: Metrics, about: About, nr: int) -> str:
+    """Return the metrics as a table, with the unit of the effort and the statuses in words."""
+    figures = metrics.figures(about.tracked(nr))
+    statuses = [f"{n} {STATUS_WORDS.get(Status[name], name)}" for name, n in metrics.status.items()]
+    fallbacks = [f"{n} {name.lower().replace('_', ' ')}" for name, n in metrics.fallback.items() if name != "NONE"]
+    figures |= {"status": ", ".join(statuses), "fallback": ", ".join(fallbacks) or "none"}
+    return _table("metric", {_with_unit(name, about): value for name, value in figures.items()})
+
+
+def _with_unit(name: str, about: About) -> str:
+    """Return the name of a figure; the effort, Σ ‖u‖² dt, with the unit that its inputs share."""
+    units = {
+        f"({found[-1]})" if " " in found[-1] or "/" in found[-1] else found[-1]
+        for found in (re.findall(r"\[(.*?)\]", each) for each in about.inputs)
+        if found
+    }
+    return f"effort [{units.pop()}² s]" if name == "effort" and len(units) == 1 else name
 
 
 def _table(heading: str, values: Mapping[str, Any]) -> str:

@@ -12,8 +12,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.loop.run import StepRows
-from koopmpc.recording.format.rrd import block_of_run, blocks
+from koopmpc.loop.run import About, StepRows
+from koopmpc.recording.format.rrd import block_of_run, blocks, read_columns
+from koopmpc.recording.views.scenes import ReferenceScenes
 from tests.recording.runs import make_run, options
 
 
@@ -126,3 +127,36 @@ def test_metadata_that_is_no_data_is_refused_before_a_file_is_made(tmp_path: Pat
     with pytest.raises(km.errors.DataError, match="a function cannot be saved as data; use numbers, names and arrays"):
         km.record(make_run(metadata={"controller": make_run}), tmp_path / "run.rrd")
     assert not (tmp_path / "run.rrd").exists()
+
+
+def test_a_log_draws_the_plants_scene_the_controllers_eigenvalues_and_the_reference_unasked(tmp_path: Path) -> None:
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, 0.05)
+    model = km.LinearPredictor.local(plant, [0, 0], [0])
+    mpc = km.KoopmanMPC(model, problem.cost, problem.limits, 10)
+    run = km.simulate(plant, mpc, x0=[0.4, 0], reference=[0.2, 0], steps=12, cost=problem.cost, plans=True)
+    km.record(run, tmp_path / "run.rrd")
+    log = read_columns(tmp_path / "run.rrd", ("/world/**", "/model/**", "/plots/**", "/title"))
+    drawn = {entity for entity, _ in log._parts}
+    assert {"/world/bob", "/world/reference/bob", "/world/prediction/bob", "/model/eigenvalues", "/title"} <= drawn
+    bob = np.array(log.rows("/world/reference/bob", "strips")[2].flatten().to_pylist(), dtype=float)
+    assert bob.reshape(-1, 2).mean(axis=0) == pytest.approx([2 * np.sin(0.2), -2 * np.cos(0.2)], abs=1e-3)
+    assert "LQR" not in (title := log.static("/title", "text"))
+    assert title == "**theta, omega · KoopmanMPC**"
+    for j in (1, 10):  # at the cursor, the dots j steps ahead are the current plan's
+        at, theta = log.matrix(f"/plots/0/ahead/{j}")
+        assert run.plans is not None
+        assert theta[:, 0] == pytest.approx(run.plans.X[at - j, j, 0])
+        assert at[-1] == run.steps
+    assert km.load_run(tmp_path / "run.rrd") == run
+
+
+def test_an_angle_that_is_tracked_by_its_sine_and_cosine_is_drawn_where_it_is(tmp_path: Path) -> None:
+    cost = km.Cost(Q=[1, 1], R=1, of=km.Fourier(1, states="theta"))
+    about = About(cost=cost, limits=None, dt=0.1, states=("theta", "omega"), inputs=("u",), outputs=("theta", "omega"))
+    aims = ReferenceScenes(about)
+    for angle in np.linspace(-3, 3, 13):
+        x = aims._state(np.array([np.sin(angle), np.cos(angle)]))
+        assert x is not None
+        assert np.angle(np.exp(1j * (x[0] - angle))) == pytest.approx(0, abs=1e-4)
+    assert aims._state(np.array([2.0, 0.0])) is None  # no angle has such a sine

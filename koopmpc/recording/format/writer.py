@@ -20,6 +20,7 @@ from koopmpc.recording.description import (
     application_of,
     drawable,
     metrics_to_markdown,
+    status_words,
     title_of,
     to_json,
     to_markdown,
@@ -27,9 +28,18 @@ from koopmpc.recording.description import (
 from koopmpc.recording.format.columns import Entity
 from koopmpc.recording.format.logfile import CHECK, LogFile
 from koopmpc.recording.format.rrd import LogBlock, blocks
-from koopmpc.recording.views.blueprint import blueprint, input_limits, styles
+from koopmpc.recording.views.blueprint import ahead, blueprint, input_limits, panels, state_limits, status_value, styles
 from koopmpc.recording.views.eigenvalues import draw_eigenvalues
-from koopmpc.recording.views.scenes import Drawing, Extent, Names, draw, draw_ahead, stages
+from koopmpc.recording.views.scenes import (
+    Drawing,
+    Extent,
+    Names,
+    ReferenceScenes,
+    draw,
+    draw_ahead,
+    draw_reference,
+    stages,
+)
 from koopmpc.scene import Scene
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
@@ -95,20 +105,27 @@ class Writer:
 
         self._about, self._scene, self._model = about, scene, model
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
-        self._viewer = viewer
+        self._viewer, self._steps = viewer, steps
         self._rec = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
         self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
+        self._spans: dict[str, list[float]] = {}
+        self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
         self._extent, self._shown = Extent(), Extent().ranges()
         self._status: tuple[Status, Fallback] | None = None
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
         self._places: dict[str, int] = {}  # a checksum of the steps of its rows
         self._u: np.ndarray | None = None
-        self._names = Names()
+        self._names, self._reference = Names(), ReferenceScenes(about)
+        self._plans: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # plans that look beyond what is written
         self._file = None if path is None else LogFile(path, growing=growing)
 
     def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""
+        self._nr = rows.reference.shape[1]
+        if not self._opened:
+            self._spans = self._found_spans(rows)
+        self._horizon = max(self._horizon, rows.plan_U.shape[1] if len(rows.planned) else 0)
         parts = blocks(rows)
         drawings = [self._drawings(part) for part in parts]  # all, because the layout is as wide as the widest
         if not self._opened:
@@ -130,6 +147,7 @@ class Writer:
         if len(rows.planned):
             self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
             self._vectors(Entity.PLAN_INPUTS, rows.planned, rows.plan_U)
+        self._plots(rows, k)
         measured = _differ(rows.X, rows.Y)
         self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured])
         self._vectors(Entity.REFERENCE, k, rows.reference)
@@ -140,9 +158,12 @@ class Writer:
             gave = np.flatnonzero(rows.slack)
             self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
             ends = np.unique(k[[0, m - 1]])
-            limits = [value for _, value in input_limits(self._about)]
+            limits = [value for *_, value in input_limits(self._about)]
             self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
             self._vectors(Entity.DEADLINE, ends, np.full((len(ends), 1), 1e3 * self._about.dt))
+            self._vectors("solver/log_deadline", ends, np.full((len(ends), 1), np.log10(self._about.dt)))
+            timed = rows.solve_time > 0
+            self._vectors("solver/log_time", k[:m][timed], np.log10(rows.solve_time[timed])[:, None])
             exact = rr.DynamicArchetype.columns(
                 "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
             )
@@ -171,7 +192,7 @@ class Writer:
             try:
                 with np.errstate(all="ignore"):
                     found = metrics(run)
-                text = metrics_to_markdown(found, self._about.tracked(run.reference.shape[1]))
+                text = metrics_to_markdown(found, self._about, run.reference.shape[1])
                 numbers |= {"cost": found.cost, "effort": found.effort, "violation": found.violation}
             except (KoopmpcError, ValueError) as error:
                 text = f"The metrics cannot be computed: {error}"
@@ -207,6 +228,8 @@ class Writer:
         self._sum(f"/{Entity.DESCRIPTION}:json", self._json.encode())
         text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
         self._rec.log(Entity.DESCRIPTION, text, rr.AnyValues(json=self._json), static=True)
+        heading = rr.TextDocument(drawable(f"**{title_of(self._about)}**"), media_type=rr.MediaType.MARKDOWN)
+        self._rec.log("title", heading, static=True)
         self.flush()  # a log that is cut says what it was
         self._rec.send_blueprint(self._blueprint(), make_active=False)
         if self._model is not None:
@@ -216,7 +239,9 @@ class Writer:
     def _blueprint(self) -> Any:
         self._shown = self._extent.ranges()
         extent = self._extent if self._scene is not None else None
-        return blueprint(self._about, extent=extent, model=self._model)
+        return blueprint(
+            self._about, self._nr, extent=extent, model=self._model, horizon=self._horizon, spans=self._spans
+        )
 
     def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray) -> None:
         """Write one vector a row; higher dimensions go flat, their last width kept beside them."""
@@ -232,6 +257,48 @@ class Writer:
                 self._sum(f"/{entity}:last_width", np.array([values.shape[-1]], dtype=np.int64).data)
             self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
         self._rec.send_columns(entity, times(k, self._about.dt), columns)
+
+    def _found_spans(self, rows: LogBlock) -> dict[str, list[float]]:
+        """Return the least and the largest value of each plot of states; of a running loop nothing is known yet."""
+        if self._steps is None:
+            return {}
+        limits, found = state_limits(self._about), dict[str, list[float]]()
+        for panel in panels(self._about, rows.reference.shape[1]):
+            own = [self._about.states[i] for i in panel.states]
+            parts = [rows.X[:, panel.states], rows.Y[:, panel.measured], rows.reference[:, panel.references]]
+            values = np.concatenate([*map(np.ravel, parts), [value for name, _, value in limits if name in own]])
+            values = values[np.isfinite(values)]
+            found[panel.entity] = [float(values.min()), float(values.max())] if len(values) else []
+        return found
+
+    def _plots(self, rows: LogBlock, k: np.ndarray) -> None:
+        """Write what the plots of states show, and what the plans of j steps before said of the steps in `rows`.
+
+        The plots show the latter j dt after the cursor. Nothing is written beyond the last row, so that the timeline
+        ends with the run.
+        """
+        plans = zip(rows.planned.tolist(), rows.plan_X, rows.plan_U, strict=True)
+        self._plans |= {step: (X, U) for step, X, U in plans if np.isfinite(X).any()}
+        N = len(next(iter(self._plans.values()))[1]) if self._plans else 0
+        measured, bounds, ends = _differ(rows.X, rows.Y), state_limits(self._about), np.unique(k[[0, -1]])
+        for panel in panels(self._about, rows.reference.shape[1]):
+            own = [self._about.states[i] for i in panel.states]
+            limits = [value for name, _, value in bounds if name in own]
+            self._vectors(f"{panel.entity}/state", k, rows.X[:, panel.states])
+            self._vectors(f"{panel.entity}/reference", k, rows.reference[:, panel.references])
+            self._vectors(f"{panel.entity}/measured", k[measured], rows.Y[measured][:, panel.measured])
+            self._vectors(f"{panel.entity}/limits", ends, np.tile(limits, (len(ends), 1)))
+        for j in ahead(N):
+            of = [step for step in self._plans if k[0] <= step + j <= k[-1]]
+            if not of:
+                continue
+            at = np.array(of, dtype=np.int64) + j
+            X = np.array([self._plans[step][0][j] for step in of]).reshape(len(of), -1)
+            U = [self._plans[step][1][min(j, N - 1)] for step in of]
+            for panel in panels(self._about, rows.reference.shape[1]):
+                self._vectors(f"{panel.entity}/ahead/{j}", at, X[:, panel.states])
+            self._vectors(f"plots/u/ahead/{j}", at, np.array(U))
+        self._plans = {step: plan for step, plan in self._plans.items() if step + N > k[-1]}
 
     def _sum(self, column: str, data: Any, k: np.ndarray | None = None) -> None:
         """Take data of a column, and the steps k of its rows, into their checksums."""
@@ -254,13 +321,13 @@ class Writer:
         changed = [i for i, pair in enumerate(pairs) if pair != (pairs[i - 1] if i else self._status)]
         self._status = pairs[-1]
         if changed:
-            words = [_word(*pairs[i]) for i in changed]
+            words = [status_value(*pairs[i]) for i in changed]
             self._sum(f"/{Entity.STATUS}:state", "".join(words).encode(), rows.k + np.array(changed))
             at = times(rows.k + np.array(changed), self._about.dt)
             self._rec.send_columns(Entity.STATUS, at, rr.StateChange.columns(state=words))
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
         if fallen:
-            texts = [f"step {rows.k + i}: {_word(*pairs[i])}" for i in fallen]
+            texts = [f"step {rows.k + i}: {status_words(*pairs[i])}" for i in fallen]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
             self._rec.send_columns(Entity.FALLBACKS, times(rows.k + np.array(fallen), self._about.dt), columns)
 
@@ -288,6 +355,12 @@ class Writer:
             futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
             drawn = draw_ahead(self._names, now, futures, self._extent)
             found |= {f"world/prediction/{name}": drawing for name, drawing in drawn.items()}
+        aims = self._reference.of(rows, scene)
+        if any(aims):
+            for aim in aims:
+                self._names.checked(aim, rows.k) if aim else None
+            drawn = draw_reference(self._names, aims, self._extent)
+            found |= {f"world/reference/{name}": drawing for name, drawing in drawn.items()}
         return found
 
 
@@ -298,8 +371,3 @@ def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
     return np.flatnonzero(
         (np.ascontiguousarray(X).view(np.int64) != np.ascontiguousarray(Y).view(np.int64)).any(axis=1)
     )
-
-
-def _word(status: Status, fallback: Fallback) -> str:
-    """Return "STATUS" or "STATUS → FALLBACK"."""
-    return status.name if fallback is Fallback.NONE else f"{status.name} → {fallback.name}"

@@ -1,14 +1,17 @@
 # pyright: basic
-"""The default blueprint: plots on the left; animation, eigenvalues and text on the right."""
+"""The default blueprint: plots on the left; animation, eigenvalues and text on the right; a title above."""
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
+from koopmpc.control.move import Fallback, Status
 from koopmpc.loop.run import About
 from koopmpc.predict.base import Predictor
-from koopmpc.recording.description import drawable
+from koopmpc.recording.description import drawable, status_words
 from koopmpc.recording.format.rrd import LogBlock
 from koopmpc.recording.views.eigenvalues import eigenvalue_views
 from koopmpc.recording.views.scenes import BACKGROUND, Extent
@@ -25,42 +28,141 @@ PALETTE: tuple[Color, ...] = (
     (190, 190, 190),
 )
 _LIMIT: Color = (232, 84, 84)
-_QUIET: Color = (140, 148, 160)
+_REFERENCE: Color = (165, 170, 180)
+_PREDICTION: Color = (250, 250, 250)
+_MEASURED: Color = (120, 126, 138)
+_STEP_TIME = "Time of a step, 10^y s: -6 is 1 µs, -3 is 1 ms"
+_FASTEST = -6.2
+_TICKS = 5.0, 8.0  # as many as have numbers, in a low plot and in a high one
+_ENDLESS = 1e100  # a span that no axis shows
+_CROWDED = 3  # plots of states from which on their titles are left out
+_AHEAD = 16  # at most so many stages of a plan are drawn into the plots
+_SEPARATE = 4  # up to so many states have a plot each
+
+_STATUS_COLORS: dict[Status, Color] = {
+    Status.UNCONSTRAINED: (46, 160, 120),
+    Status.OPTIMAL: (70, 125, 200),
+    Status.SATURATED: (150, 120, 200),
+    Status.SOFTENED: (215, 165, 60),
+}
+
+
+def ahead(horizon: int) -> list[int]:
+    """Return the stages of a plan that the plots show, at most 16 at equal steps, the last one among them."""
+    return sorted({round(i * horizon / min(horizon, _AHEAD)) for i in range(1, min(horizon, _AHEAD) + 1)})
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot of states: its entity, its title, and which states, references and measurements it shows, by index."""
+
+    entity: str
+    title: str
+    states: list[int]
+    references: list[int]
+    measured: list[int]
+
+
+def panels(about: About, nr: int) -> list[Panel]:
+    """Return a plot a state, which has entities of its own for a short legend, or one plot for all of many states."""
+    tracked, places = about.tracked(nr), range(len(about.states))
+    if len(about.states) > _SEPARATE:
+        return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))])]
+    return [
+        Panel(
+            f"plots/{i}",
+            name,
+            [i],
+            [j for j, other in enumerate(tracked) if other == name],
+            [j for j, other in enumerate(about.outputs) if other == name],
+        )
+        for i, name in enumerate(about.states)
+    ]
 
 
 def styles(about: About, rows: LogBlock) -> dict[str, Any]:
     """Return the static archetypes by entity that name and colour what `rows` hold."""
     import rerun as rr
 
-    tracked = about.tracked(rows.reference.shape[1])
+    nr = rows.reference.shape[1]
+    tracked, bounds = about.tracked(nr), state_limits(about)
+    stages = ahead(rows.plan_U.shape[1]) if len(rows.planned) else []
+
+    def points(names: Sequence[str], shade: Color, size: float) -> Any:
+        drawn = [drawable(name) for name in names]
+        return rr.SeriesPoints(names=drawn, colors=[shade] * len(drawn), marker_sizes=[size] * len(drawn))
+
     found = {
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
-        "reference": _lines([f"{n} reference" for n in tracked], [_matching(n, about) for n in tracked], 1.0),
-        "measurement": rr.SeriesPoints(
-            names=[drawable(f"{n} measured") for n in about.outputs],
-            colors=[_matching(n, about) for n in about.outputs],
-            marker_sizes=[1.5] * len(about.outputs),
-        ),
-        "control/u": _lines(
-            about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, interpolation_mode="StepAfter"
-        ),
-        "solver/time_ms": _lines(["solve time [ms]"], [color(2)], 1.5),
-        "solver/deadline_ms": _lines(["deadline [ms]"], [_LIMIT], 1.0),
+        "reference": _lines([f"{name}, reference" for name in tracked], _REFERENCE, 1.5),
+        "control/u": _lines(about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, **_HELD),
+        "control/limits": _lines(["limits"] * len(input_limits(about)), _LIMIT, 1.0),
+        "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
+        "solver/deadline_ms": _lines(["deadline [ms]"], _LIMIT, 1.0),
+        "solver/log_time": _lines(["time of a step [10^y s]"], color(2), 1.5),
+        "solver/log_deadline": _lines(["sample time, its deadline"], _LIMIT, 1.0),
+        "solver/status": _statuses(),
     }
-    limits = [name for name, _ in input_limits(about)]
-    if limits:
-        found["control/limits"] = _lines(limits, [_LIMIT] * len(limits), 1.0)
+    found |= {f"plots/u/ahead/{j}": points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
+    for panel in panels(about, nr):
+        alone = len(panel.states) == 1
+
+        def called(what: str, names: Sequence[str], alone: bool = alone) -> list[str]:
+            return [what if alone else f"{name}, {what}" for name in names]
+
+        own = [about.states[i] for i in panel.states]
+        limits = called("limits", [name for name, *_ in bounds if name in own])
+        aims = [tracked[j] for j in panel.references]
+        seen = [about.outputs[j] for j in panel.measured]
+        found |= {
+            f"{panel.entity}/state": _lines(own, [color(i) for i in panel.states], 2.0),
+            f"{panel.entity}/reference": _lines(called("reference", aims), _REFERENCE, 1.5),
+            f"{panel.entity}/measured": points(called("measured", seen), _MEASURED, 1.5),
+            f"{panel.entity}/limits": _lines(limits, _LIMIT, 1.0),
+        }
+        one = points(called("prediction", own), _PREDICTION, 1.6)
+        found |= {f"{panel.entity}/ahead/{j}": one for j in stages}
     return found
 
 
-def input_limits(about: About) -> list[tuple[str, float]]:
-    """Return the finite input limits with their names."""
-    if about.limits is None:
-        return []
-    low, high = about.limits.inputs(len(about.inputs))
-    pairs = [(f"{n} min", v) for n, v in zip(about.inputs, low, strict=True)]
-    pairs += [(f"{n} max", v) for n, v in zip(about.inputs, high, strict=True)]
-    return [(n, float(v)) for n, v in pairs if np.isfinite(v)]
+_HELD: dict[str, Any] = {"interpolation_mode": "StepAfter"}
+_Limit = tuple[str, str, float]  # name, "lower" or "upper", value
+
+
+def input_limits(about: About) -> list[_Limit]:
+    """Return the finite input limits: name, end and value of each."""
+    return [] if about.limits is None else _finite(about.inputs, about.limits.inputs(len(about.inputs)))
+
+
+def state_limits(about: About) -> list[_Limit]:
+    """Return the finite limits of states: name, end and value of each."""
+    return [] if about.limits is None else _finite(about.states, about.limits.states(len(about.states)))
+
+
+def _finite(names: Sequence[str], ends: Any) -> list[_Limit]:
+    pairs = [
+        (n, end, float(v))
+        for end, row in zip(("lower", "upper"), ends, strict=True)
+        for n, v in zip(names, row, strict=True)
+    ]
+    return [(name, end, value) for name, end, value in pairs if np.isfinite(value)]
+
+
+def _statuses() -> Any:
+    """Return how the viewer words and colours each way in which a step can end; red where a fallback took over."""
+    import rerun as rr
+
+    pairs = [(status, fallback) for status in Status for fallback in Fallback]
+    return rr.StateConfiguration(
+        values=[status_value(*pair) for pair in pairs],
+        labels=[status_words(*pair) for pair in pairs],
+        colors=[_STATUS_COLORS.get(s, _LIMIT) if f is Fallback.NONE else _LIMIT for s, f in pairs],
+    )
+
+
+def status_value(status: Status, fallback: Fallback) -> str:
+    """Return "STATUS" or "STATUS → FALLBACK", as the log holds it."""
+    return status.name if fallback is Fallback.NONE else f"{status.name} → {fallback.name}"
 
 
 def color(i: int) -> Color:
@@ -68,56 +170,64 @@ def color(i: int) -> Color:
     return PALETTE[i % len(PALETTE)]
 
 
-def _matching(name: str, about: About) -> Color:
-    """Return a quieter shade of the state's colour, grey for what is no state."""
-    if name not in about.states:
-        return _QUIET
-    r, g, b = (round(0.6 * c + 0.4 * 128) for c in color(about.states.index(name)))
-    return r, g, b
-
-
-def _lines(names: Sequence[str], colors: Sequence[Color], width: float, **more: Any) -> Any:
+def _lines(names: Sequence[str], colors: Color | Sequence[Color], width: float, **more: Any) -> Any:
+    """Return lines of one colour, or of a colour each."""
     import rerun as rr
 
-    return rr.SeriesLines(
-        names=[drawable(name) for name in names], colors=list(colors), widths=[width] * len(names), **more
-    )
+    each = [colors] * len(names) if isinstance(colors, tuple) and isinstance(colors[0], int) else list(colors)
+    return rr.SeriesLines(names=[drawable(name) for name in names], colors=each, widths=[width] * len(names), **more)
 
 
-_SEPARATE = 4  # up to so many states have a plot each
+def blueprint(
+    about: About,
+    nr: int,
+    *,
+    extent: Extent | None,
+    model: Predictor | None,
+    horizon: int,
+    spans: Mapping[str, Sequence[float]],
+) -> Any:
+    """Return the layout of one run with `nr` references; there is no view without data.
 
-
-def blueprint(about: About, *, extent: Extent | None, model: Predictor | None) -> Any:
-    """Return the layout of one run; there is no view without data.
-
-    `extent` is what the animation shows, None where there is no scene.
+    `extent` is what the animation shows, None where there is no scene; `horizon` the length of the plans, 0 if none;
+    `spans` the values, by the entity of a `Panel`, that its axis has to hold, as far as they are known.
     """
     import rerun.blueprint as rrb
 
-    status = rrb.StateTimelineView(origin="solver/status", name="Solver status")
-    time = rrb.TimeSeriesView(
-        contents=["/solver/time_ms", "/solver/deadline_ms"],
-        name="Solve time and deadline [ms]",
-        plot_legend=_legend(visible=False),
-    )
-    inputs = rrb.TimeSeriesView(
-        contents=["/control/u", "/control/limits"],
-        name=drawable(_title("Input", about.inputs)),
-        axis_y=_padded([v for _, v in input_limits(about)]),
-        plot_legend=_legend(visible=len(about.inputs) > 1),
-    )
-    states = _states(about)
-    pairs = [states[i : i + 2] for i in range(0, len(states), 2)] if len(states) > 2 else [[s] for s in states]
-    plots = [pair[0] if len(pair) == 1 else rrb.Horizontal(*pair) for pair in pairs]
-    left = rrb.Vertical(*plots, inputs, time, status, row_shares=[3.0] * len(plots) + [3.0, 2.0, 1.4])
+    def plot(entity: str, name: str, contents: Sequence[str] = (), axis_y: Any = None, titled: bool = True) -> Any:
+        return rrb.TimeSeriesView(
+            titlebar=titled,
+            contents=[f"/{entity}/**", *contents],
+            name=drawable(name),
+            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+            axis_y=axis_y,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
+            overrides=cast("Any", _now(entity, horizon, about.dt)),
+        )
+
+    rows = panels(about, nr)
+    roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
+    axes = [_readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
+    shown = [plot(row.entity, row.title, axis_y=axis, titled=roomy) for row, axis in zip(rows, axes, strict=True)]
+    bounds = _readable([v for *_, v in input_limits(about)], _TICKS[roomy])
+    shown.append(plot("plots/u", _title("Input", about.inputs), ["/control/u", "/control/limits"], bounds, roomy))
+    slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
+    shown.append(plot("solver/log", _STEP_TIME, ["/solver/log_time", "/solver/log_deadline"], slowest, roomy))
+    status = rrb.StateTimelineView(origin="solver/status", name="How each step ended")
+    left = rrb.Vertical(*shown, status, row_shares=[1.0] * len(shown) + [max(0.5, 0.12 * len(shown))])
     texts = rrb.Tabs(
         rrb.TextDocumentView(origin="metrics", name="Metrics"),
         rrb.TextDocumentView(origin="description", name="Description"),
         rrb.TextLogView(origin="log", name="Log"),
     )
     lower = texts if model is None else rrb.Horizontal(eigenvalue_views(model)[0], texts)
-    right = lower if extent is None else rrb.Vertical(_animation(extent), lower, row_shares=[3.0, 2.0])
-    return framed(rrb.Horizontal(left, right, column_shares=[1.0, 1.0]))
+    if extent is not None:
+        right, shares = rrb.Vertical(_animation(extent), lower, row_shares=[3.0, 2.0]), [1.0, 1.0]
+    else:  # without an animation the plots get the room
+        right = texts if model is None else rrb.Vertical(eigenvalue_views(model)[0], texts)
+        shares = [2.6, 1.0]
+    title = rrb.TextDocumentView(origin="title", name="Run", titlebar=False)
+    return framed(rrb.Vertical(title, rrb.Horizontal(left, right, column_shares=shares), row_shares=[1.0, 18.0]))
 
 
 def framed(views: Any) -> Any:
@@ -126,36 +236,24 @@ def framed(views: Any) -> Any:
 
     return rrb.Blueprint(
         views,
-        rrb.TimePanel(timeline="sim_time", state="collapsed"),
+        rrb.TimePanel(timeline="sim_time", state="collapsed", play_state="paused"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
     )
 
 
-def _states(about: About) -> list[Any]:
-    """Return one plot a state with its reference, or one plot for all of many states."""
+def _now(entity: str, horizon: int, dt: float) -> dict[str, Any]:
+    """Return for each stage j what shows of it: the one point at j dt after the cursor, which is the current plan's."""
     import rerun as rr
     import rerun.blueprint as rrb
 
-    contents = ["/state", "/reference", "/measurement"]
-    nx = len(about.states)
-    if nx > _SEPARATE:
-        return [rrb.TimeSeriesView(contents=contents, name="States", plot_legend=_legend(visible=nx <= 8))]
-    tracked = about.states if about.cost is None else about.cost.of.bind(about.states).names
-    return [
-        rrb.TimeSeriesView(
-            contents=contents,
-            name=drawable(name),
-            plot_legend=_legend(visible=False),
-            overrides={
-                "/state": rr.SeriesLines.from_fields(visible_series=[s == name for s in about.states]),
-                "/reference": rr.SeriesLines.from_fields(visible_series=[s == name for s in tracked]),
-                "/measurement": rr.SeriesPoints.from_fields(visible_series=[s == name for s in about.outputs]),
-            },
-        )
-        for name in about.states
-    ]
+    found: dict[str, Any] = {}
+    for j in ahead(horizon):
+        begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=(j + d) * dt) for d in (-0.5, 0.49))
+        ranges = rrb.VisibleTimeRanges([rrb.VisibleTimeRange("sim_time", start=begin, end=end)])
+        found[f"/{entity}/ahead/{j}"] = [rr.SeriesPoints.from_fields(), ranges]
+    return found
 
 
 def _animation(extent: Extent) -> Any:
@@ -165,27 +263,37 @@ def _animation(extent: Extent) -> Any:
     fixed = None if ranges is None else rrb.VisualBounds2D(x_range=ranges[0], y_range=ranges[1])
     return rrb.Spatial2DView(
         origin="world",
-        name="Animation, with the predicted horizon",
+        name="Animation; fainter: the plan, grey: the reference",
         background=list(BACKGROUND),
         visual_bounds=fixed,
     )
 
 
-def _padded(values: list[float]) -> Any:
-    """Return an axis a little wider than `values`, None where they do not span one."""
+def _readable(values: Sequence[float], ticks: float) -> Any:
+    """Return an axis a little wider than `values` that holds two ticks with numbers; None where they span nothing.
+
+    The viewer numbers multiples of 1, 10, 100, … and leaves them out where more than `ticks` would stand close.
+    """
     import rerun.blueprint as rrb
 
-    if not values or max(values) <= min(values):
+    low, high = min(values, default=0.0), max(values, default=0.0)
+    if not 1e-9 * max(abs(low), abs(high), 1e-9) < high - low < _ENDLESS:
         return None
-    margin = 0.08 * (max(values) - min(values))
-    return rrb.ScalarAxis(range=[min(values) - margin, max(values) + margin])
+    tick = 10.0 ** math.floor(math.log10(high - low))
+    if high - low > ticks * tick:
+        below, above = 10 * tick * math.floor(low / (10 * tick)), 10 * tick * math.ceil(high / (10 * tick))
+        if above - below < 15 * tick:
+            low, high = below, above
+        elif low - below < above - high:
+            low = below
+        else:
+            high = above
+    elif math.floor(high / tick) - math.ceil(low / tick) < 1:  # one tick: the nearer of its neighbours comes in
+        below, above = tick * math.floor(low / tick), tick * math.ceil(high / tick)
+        low, high = (below, high) if low - below < above - high else (low, above)
+    margin = 0.08 * (high - low)
+    return rrb.ScalarAxis(range=[low - margin, high + margin])
 
 
 def _title(what: str, names: tuple[str, ...]) -> str:
     return f"{what}: {names[0]}" if len(names) == 1 else f"{what}s"
-
-
-def _legend(visible: bool) -> Any:
-    import rerun.blueprint as rrb
-
-    return rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=visible)

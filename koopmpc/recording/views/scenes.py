@@ -9,10 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.errors import DataError
-from koopmpc.scene import Box, Color, Disk, Line, Shape
+from koopmpc.loop.run import About, StepRows
+from koopmpc.scene import Box, Color, Disk, Line, Scene, Shape
 
 BACKGROUND: Color = (247, 248, 250)
 _FAR = 0.25  # margin for predictions, which may diverge, as a share of the size of the drawn shapes
+_AIM: Color = (188, 193, 201)  # of the reference
+_DRAWN = 1e30  # the viewer draws in float32
+_AIMS = 2000  # states of so many different references are looked for
 _STAGES = 4  # how many future stages of a plan are drawn
 _STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
 
@@ -115,6 +119,52 @@ def draw_ahead(
             rows.append([(s, _faded(s.color, (i + 1) / (len(futures) + 1))) for i, s in reversed(later)])
         drawings[name] = _drawing(rows, 10.0)
     return drawings
+
+
+def draw_reference(names: Iterable[str], scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
+    """Return a drawing by name, in grey below all others, for the scene of the reference of each row."""
+    for shape in (shape for scene in scenes for shape in scene):
+        extent.drawn.include(shape)
+    return {name: _drawing([[(s, _AIM) for s in scene if s.name == name] for scene in scenes], 2.0) for name in names}
+
+
+class ReferenceScenes:
+    """The scene at the state that a reference names; no shapes where it names none."""
+
+    def __init__(self, about: About) -> None:
+        self._about = about
+        self._known: dict[bytes, Float[np.ndarray, " nx"] | None] = {}
+
+    def of(self, rows: StepRows, scene: Scene) -> list[list[Shape]]:
+        """Return the shapes of each row's reference."""
+        if self._about.cost is None or not len(rows.U):
+            return [[] for _ in rows.X]
+        moves = [rows.u_reference[min(i, len(rows.U) - 1)] for i in range(len(rows.X))]
+        states = [self._state(r) for r in rows.reference]
+        return [[] if x is None else list(scene(x, u)) for x, u in zip(states, moves, strict=True)]
+
+    def _state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
+        """Return x with of(x) = r, of least size; None where r is not finite, or there is no such x."""
+        key = reference.tobytes()
+        if key not in self._known:
+            self._known[key] = self._found(reference) if len(self._known) < _AIMS else None
+        return self._known[key]
+
+    def _found(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
+        assert self._about.cost is not None
+        of = self._about.cost.of.bind(self._about.states)
+        if not (np.abs(reference) < _DRAWN).all():
+            return None
+        if of.names == self._about.states:
+            return reference.copy()
+        from scipy.optimize import least_squares
+
+        least = None
+        for first in (0.01, 2.0, -2.0):  # an angle from its sine and cosine has flat places between
+            fit = least_squares(lambda x: of(x) - reference, np.full(len(self._about.states), first))
+            if fit.cost < 1e-10 and (least is None or np.abs(fit.x).sum() < np.abs(least).sum()):
+                least = fit.x
+        return least
 
 
 def stages(horizon: int) -> list[int]:
