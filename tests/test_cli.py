@@ -217,3 +217,44 @@ def test_python_m_is_the_same_program(tmp_path):
     )
     assert done.returncode == 2
     assert "did you mean 'pendulum'?" in done.stderr
+
+
+def test_new_writes_a_problem_that_runs_as_it_stands(call, tmp_path):
+    made = call("new", "mine")
+    assert made.exit_code == 0, made.output
+    ran = call("run", "mine.py:push", "-c", "koopman-mpc")
+    assert ran.exit_code == 0, ran.output
+    again = call("new", "mine")
+    assert again.exit_code == 2
+    assert "mine.py exists already and is kept as it is" in again.stderr
+
+
+def test_a_word_of_the_tables_is_explained_and_a_wrong_one_finds_its_neighbour(call):
+    from koopmpc.bench.controllers import CONTROLLERS
+    from koopmpc.recording.description import STATUS_WORDS
+
+    for word in [*STATUS_WORDS.values(), *CONTROLLERS, "cost", "ratio", "settles", "off", "over", "p50", "p99", "lost"]:
+        assert call("explain", *word.split()).exit_code == 0, word
+    assert "no optimisation was needed" in call("explain", "free").stdout
+    missed = call("explain", "ratoi")
+    assert missed.exit_code == 2
+    assert "did you mean 'ratio'" in missed.stderr
+    assert "offset-free: " in call("explain").stdout
+
+
+def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call, tmp_path):
+    from urllib.request import urlopen
+
+    from koopmpc.recording.viewer import free_port, is_up, served
+
+    call("run", f"{write(tmp_path)}:far", "-c", "lqr", "--logs", "l")
+    (log,) = (tmp_path / "l").glob("*/*.rrd")
+    port = free_port()
+    with served(log, port) as (address, data):
+        assert address.startswith(f"http://127.0.0.1:{port}?url=")
+        assert is_up(data)
+        assert b"<html" in urlopen(f"http://127.0.0.1:{port}", timeout=10).read().lower()
+        listening = subprocess.run(["ss", "-ltn"], capture_output=True, text=True, check=False).stdout
+        ours = [line.split()[3] for line in listening.splitlines() if f":{port} " in line or f":{data} " in line]
+        assert all(place.startswith("127.0.0.1:") for place in ours)
+    assert not is_up(port)

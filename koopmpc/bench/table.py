@@ -15,13 +15,6 @@ from koopmpc.control.move import Status
 from koopmpc.loop.metrics import Metrics, duration
 from koopmpc.recording.description import STATUS_WORDS
 
-FAULT_LEGEND = (
-    "Under faults: a controller's cost as a multiple of its own without the fault; lost, where only the fault "
-    "keeps it from the reference; –, where it does not reach without the fault either. In brackets, the steps "
-    "whose input came from a fallback. LQR has no solver to fail, and a Koopman or linear MPC solves nothing "
-    "where no limit is active."
-)
-
 
 def plain_table(title: str, **settings: Any) -> Table:
     """Return an empty table with its title at the left and one rule below the headings."""
@@ -60,17 +53,9 @@ def _cell(row: RunRow, whole: RunRow) -> str:
     return f"{word} ({fell_back})" if fell_back else word
 
 
-LEGEND = (
-    "cost: Σ‖x−r‖²_Q + ‖u−u_r‖²_R over the run, u_r the input that holds r, and its ratio to nonlinear-mpc. That plans "
-    "with the equations: where the plant carries a load that they do not know it is no oracle, and a ratio can be "
-    "below 1. "
-    "settles: time until the weighted error stays below 2 % of its first value; within 5 %, only 5 % is kept "
-    "over the last tenth of the run; does not reach, not even that. off: largest entry of x−r at the end. "
-    "over: largest violation of a state or output limit. p50, p99: time of a step. Steps: free, the unconstrained "
-    "optimum met all limits; "
-    "optimal, a QP or NLP was solved; unfinished, it was not, and a fallback took over; clipped, the feedback was "
-    "cut to the input limits."
-)
+LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
+TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."
+UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell back). See `koopmpc explain WORD`."
 
 
 def results_table(rows: Sequence[RunRow]) -> RenderableType:
@@ -85,9 +70,8 @@ def results_table(rows: Sequence[RunRow]) -> RenderableType:
         if row.failure is not None:
             what = " ".join(filter(None, (f"{row.problem}:{row.case}", row.controller, row.fault)))
             parts.append(Text(f"{what}: {row.failure}", style="red"))
-    parts.append(Text(LEGEND, style="dim"))
-    if any(row.fault is not None for row in rows):
-        parts.append(Text(FAULT_LEGEND, style="dim"))
+    broken = any(row.fault is not None for row in rows)
+    parts.append(Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
     return Group(*parts)
 
 

@@ -6,9 +6,10 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -225,12 +226,74 @@ def inspect(logs: LogFiles) -> None:
 
 
 @app.command()
-def view(logs: LogFiles) -> None:
-    """Open logs in one Rerun viewer."""
+def view(
+    logs: LogFiles,
+    compare: Annotated[bool, typer.Option("--compare", help="Draw all runs in one set of plots.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve to a browser on 127.0.0.1 until Ctrl-C.")] = False,
+    port: Annotated[int, typer.Option("--port", help="Port of the page that --web serves.")] = 9090,
+) -> None:
+    """Open logs in one Rerun viewer, one beside the other or, with --compare, in the same plots."""
+    import tempfile
+
+    from koopmpc.recording.viewer import served
     from koopmpc.recording.viewer import view as open_viewer
+    from koopmpc.recording.views.comparison import record_comparison
+
+    out = _console()
+    with _friendly():
+        shown = list(logs)
+        if compare:
+            shown = [Path(tempfile.mkdtemp(prefix="koopmpc-")) / "comparison.rrd"]
+            record_comparison(logs, shown[0])
+        if web:
+            with served(shown, port) as (address, data):
+                out.print(Text(f"open {address}", style="bold"), soft_wrap=True)
+                tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data}:127.0.0.1:{data} HOST"
+                out.print(Text(f"from another machine first: {tunnel}\nCtrl-C ends it"), soft_wrap=True)
+                with suppress(KeyboardInterrupt):
+                    Event().wait()
+            return
+        open_viewer(shown)
+        if len(shown) > 1:
+            out.print(
+                Text("the panel at the left of the window lists the logs; --compare draws them in one set of plots")
+            )
+
+
+@app.command("export-video")
+def export_video(
+    log: Annotated[Path, typer.Argument(help="A log whose plant has a scene.")],
+    video: Annotated[Path, typer.Argument(help="The .gif or .mp4 to write.")],
+    fps: Annotated[int, typer.Option("--fps", help="Pictures a second.")] = 20,
+    width: Annotated[int, typer.Option("--width", help="Width of the picture in pixels.")] = 640,
+    speed: Annotated[float, typer.Option("--speed", help="Seconds of the run in a second of the video.")] = 1.0,
+    until: Annotated[float | None, typer.Option("--until", help="Time in s at which the video ends.")] = None,
+) -> None:
+    """Write the animation of a log as a .gif or .mp4; no screen is needed."""
+    from koopmpc.recording.video import export_video as export
 
     with _friendly():
-        open_viewer(logs)
+        export(log, video, fps=fps, width=width, speed=speed, until=until)
+    _console().print(Text(f"{video}, {video.stat().st_size / 1000:.0f} kB"), soft_wrap=True)
+
+
+@app.command()
+def explain(
+    term: Annotated[
+        list[str] | None, typer.Argument(help="A word of a table, a report or a picture; all if left out.")
+    ] = None,
+) -> None:
+    """Explain a word that stands in a table, a report or a picture."""
+    from koopmpc.cli.terms import TERMS
+    from koopmpc.cli.terms import explain as explained
+
+    out = _console()
+    with _friendly():
+        if term:
+            out.print(Text(explained(" ".join(term))))
+            return
+    for name, text in TERMS.items():
+        out.print(Text.assemble((name, "bold"), f": {text}"))
 
 
 @app.command()

@@ -152,6 +152,20 @@ def metrics(run: Run) -> Metrics:
     )
 
 
+@np.errstate(invalid="ignore", over="ignore")
+def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
+    """Return the cost so far at every state, from 0 to the cost that `metrics` gives; NaN where there is no Cost."""
+    if run.cost is None:
+        return np.full(len(run.X), np.nan)
+    error, moved, changed = tracking_error(run), run.U - run.u_reference, np.diff(run.U, axis=0)
+    Q, R = run.cost.matrices(error.shape[1], run.U.shape[1])
+    R_delta = run.cost.rate(run.U.shape[1])
+    steps = np.einsum("ki,ij,kj->k", error[1:], Q, error[1:]) + np.einsum("ki,ij,kj->k", moved, R, moved)
+    if R_delta is not None:
+        steps[1:] += np.einsum("ki,ij,kj->k", changed, R_delta, changed)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
     """Return of(x_k) − r_k, the angles among tracked states wrapped to (−π, π]."""
     X = _states(run)

@@ -102,12 +102,17 @@ def to_markdown(about: About) -> str:
 
 
 def metrics_to_markdown(metrics: Metrics, about: About, nr: int) -> str:
-    """Return the metrics as a table, with the unit of the effort and the statuses in words."""
+    """Return the metrics as a table."""
+    return _table("metric", table_figures(metrics, about, nr))
+
+
+def table_figures(metrics: Metrics, about: About, nr: int) -> dict[str, str]:
+    """Return the metrics in words by their names, with the unit of the effort and the statuses in words."""
     figures = metrics.figures(about.tracked(nr))
     statuses = [f"{n} {STATUS_WORDS.get(Status[name], name)}" for name, n in metrics.status.items()]
     fallbacks = [f"{n} {name.lower().replace('_', ' ')}" for name, n in metrics.fallback.items() if name != "NONE"]
     figures |= {"status": ", ".join(statuses), "fallback": ", ".join(fallbacks) or "none"}
-    return _table("metric", {_with_unit(name, about): value for name, value in figures.items()})
+    return {_with_unit(name, about): value for name, value in figures.items()}
 
 
 def _with_unit(name: str, about: About) -> str:

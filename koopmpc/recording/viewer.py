@@ -2,17 +2,19 @@
 """view opens logs in one Rerun viewer; a running loop finds the viewer that is up, or opens one."""
 
 import os
+import shlex
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from koopmpc.errors import LogError
 from koopmpc.recording.format.rrd import check_log
 
-PORT = 9876
+PORT, WEB_PORT = 9876, 9090
 _START = 15.0  # longest wait for a viewer that was opened [s]
 
 
@@ -98,11 +100,36 @@ def view(logs: str | Path | Sequence[str | Path]) -> None:
     paths = _existing(logs)
     if not has_display():
         raise LogError(
-            f"there is no display to open {paths[0]} on; copy it to a machine with a screen and run "
-            f"`koopmpc view {Path(paths[0]).name}` there"
+            f"there is no display to open {paths[0]} on; `koopmpc view --web {shlex.join(paths)}` serves it to a "
+            f"browser, or copy it to a machine with a screen and run `koopmpc view {Path(paths[0]).name}` there"
         )
     if not open_viewer(paths, free_port()):
         raise LogError(f"the viewer did not start; run `{program()} {paths[0]}` to see what it says")
+
+
+@contextmanager
+def served(logs: str | Path | Sequence[str | Path], port: int = WEB_PORT) -> Generator[tuple[str, int]]:
+    """Serve logs to a browser on this machine; yield the address, and the port of the data beside that of the page.
+
+    Both listen at 127.0.0.1 alone: from another machine they are reached through ssh.
+
+    Raises
+    ------
+    LogError
+        A log does not exist or is no .rrd file; the port is taken, or the server does not start.
+    """
+    paths = _existing(logs)
+    if is_up(port):
+        raise LogError(f"a program listens at 127.0.0.1:{port} already; end it, or choose another with --port")
+    data = free_port()
+    server = start_viewer("--serve-web", "--web-viewer-port", str(port), *paths, port=data)
+    if server is None:
+        raise LogError(f"the server did not start; run `{program()} --serve-web {paths[0]}` to see what it says")
+    try:
+        yield f"http://127.0.0.1:{port}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy", data
+    finally:
+        server.terminate()
+        server.wait(5.0)
 
 
 def _existing(logs: str | Path | Sequence[str | Path]) -> list[str]:

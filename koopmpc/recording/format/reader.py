@@ -35,7 +35,7 @@ def load_run(path: str | Path) -> Run:
 
 
 def _run(log: LogColumns, path: Path) -> Run:
-    about, planned_steps = _about(log, path)
+    about, planned_steps = about_of(log, path)
     X, reference = log.vectors(Entity.STATE), log.vectors(Entity.REFERENCE)
     U = log.vectors(Entity.INPUT)
     seconds = log.column(Entity.SOLVER, "seconds")
@@ -77,7 +77,8 @@ def _run(log: LogColumns, path: Path) -> Run:
     )
 
 
-def _about(log: LogColumns, path: Path) -> tuple[About, int | None]:
+def about_of(log: LogColumns, path: Path) -> tuple[About, int | None]:
+    """Return what does not change in a run, and its number of steps where it was known beforehand."""
     text = log.static(Entity.DESCRIPTION, "json")
     if text is None:
         raise LogError(

@@ -43,6 +43,17 @@ class LogColumns:
         parts = self._parts.get(_key(entity, component))
         return None if parts is None else parts[-1][1].to_pylist()[-1][0]
 
+    def entities(self) -> list[str]:
+        """Return the entities that have data."""
+        return list(dict.fromkeys(entity for entity, _ in self._parts))
+
+    def lists(self, entity: str, component: str) -> tuple[np.ndarray, list[Any]]:
+        """Return the steps and the list of values of each row, in order of the steps."""
+        parts = [(k, column) for k, column in self._parts.get((entity, component), []) if k is not None]
+        pairs = [pair for k, column in parts for pair in zip(k.tolist(), column.to_pylist(), strict=True)]
+        pairs.sort(key=lambda pair: pair[0])
+        return np.array([k for k, _ in pairs], dtype=np.int64), [values for _, values in pairs]
+
     def rows(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray, Any]:
         """Return the steps, the width, and the flat values of a component, in order of the steps."""
         import pyarrow as pa

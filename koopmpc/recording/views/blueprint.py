@@ -27,8 +27,8 @@ PALETTE: tuple[Color, ...] = (
     (110, 205, 220),
     (190, 190, 190),
 )
-_LIMIT: Color = (232, 84, 84)
-_REFERENCE: Color = (165, 170, 180)
+LIMIT: Color = (232, 84, 84)
+REFERENCE: Color = (165, 170, 180)
 _PREDICTION: Color = (250, 250, 250)
 _MEASURED: Color = (120, 126, 138)
 _STEP_TIME = "Time of a step, 10^y s: -6 is 1 µs, -3 is 1 ms"
@@ -94,13 +94,13 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
 
     found = {
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
-        "reference": _lines([f"{name}, reference" for name in tracked], _REFERENCE, 1.5),
+        "reference": _lines([f"{name}, reference" for name in tracked], REFERENCE, 1.5),
         "control/u": _lines(about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, **_HELD),
-        "control/limits": _lines(["limits"] * len(input_limits(about)), _LIMIT, 1.0),
+        "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0),
         "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
-        "solver/deadline_ms": _lines(["deadline [ms]"], _LIMIT, 1.0),
+        "solver/deadline_ms": _lines(["deadline [ms]"], LIMIT, 1.0),
         "solver/log_time": _lines(["time of a step [10^y s]"], color(2), 1.5),
-        "solver/log_deadline": _lines(["sample time, its deadline"], _LIMIT, 1.0),
+        "solver/log_deadline": _lines(["sample time, its deadline"], LIMIT, 1.0),
         "solver/status": _statuses(),
     }
     found |= {f"plots/u/ahead/{j}": points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
@@ -116,9 +116,9 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
         seen = [about.outputs[j] for j in panel.measured]
         found |= {
             f"{panel.entity}/state": _lines(own, [color(i) for i in panel.states], 2.0),
-            f"{panel.entity}/reference": _lines(called("reference", aims), _REFERENCE, 1.5),
+            f"{panel.entity}/reference": _lines(called("reference", aims), REFERENCE, 1.5),
             f"{panel.entity}/measured": points(called("measured", seen), _MEASURED, 1.5),
-            f"{panel.entity}/limits": _lines(limits, _LIMIT, 1.0),
+            f"{panel.entity}/limits": _lines(limits, LIMIT, 1.0),
         }
         one = points(called("prediction", own), _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": one for j in stages}
@@ -156,7 +156,7 @@ def _statuses() -> Any:
     return rr.StateConfiguration(
         values=[status_value(*pair) for pair in pairs],
         labels=[status_words(*pair) for pair in pairs],
-        colors=[_STATUS_COLORS.get(s, _LIMIT) if f is Fallback.NONE else _LIMIT for s, f in pairs],
+        colors=[_STATUS_COLORS.get(s, LIMIT) if f is Fallback.NONE else LIMIT for s, f in pairs],
     )
 
 
@@ -207,9 +207,9 @@ def blueprint(
 
     rows = panels(about, nr)
     roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
-    axes = [_readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
+    axes = [readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
     shown = [plot(row.entity, row.title, axis_y=axis, titled=roomy) for row, axis in zip(rows, axes, strict=True)]
-    bounds = _readable([v for *_, v in input_limits(about)], _TICKS[roomy])
+    bounds = readable([v for *_, v in input_limits(about)], _TICKS[roomy])
     shown.append(plot("plots/u", _title("Input", about.inputs), ["/control/u", "/control/limits"], bounds, roomy))
     slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
     shown.append(plot("solver/log", _STEP_TIME, ["/solver/log_time", "/solver/log_deadline"], slowest, roomy))
@@ -269,7 +269,7 @@ def _animation(extent: Extent) -> Any:
     )
 
 
-def _readable(values: Sequence[float], ticks: float) -> Any:
+def readable(values: Sequence[float], ticks: float) -> Any:
     """Return an axis a little wider than `values` that holds two ticks with numbers; None where they span nothing.
 
     The viewer numbers multiples of 1, 10, 100, … and leaves them out where more than `ticks` would stand close.

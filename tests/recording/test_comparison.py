@@ -1,0 +1,84 @@
+"""Several runs in one set of plots, and the animation of a log as a video."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.loop.metrics import running_cost
+from koopmpc.recording.format.rrd import read_columns
+from koopmpc.recording.video import export_video
+from koopmpc.recording.views.comparison import record_comparison
+from tests.recording.runs import make_run
+
+
+def pendulum_run(**named: str) -> km.Run:
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, 0.05)
+    model = km.LinearPredictor.local(plant, [0, 0], [0])
+    mpc = km.KoopmanMPC(model, problem.cost, problem.limits, 10)
+    loop = {"reference": [0.2, 0], "steps": 20, "cost": problem.cost, "limits": problem.limits, "metadata": named}
+    return km.simulate(plant, mpc, x0=[0.4, 0], plans=True, **loop)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("logs")
+    for name in ("one", "two"):
+        km.record(pendulum_run(problem="p", case="c", controller=name), folder / f"{name}.rrd")
+    return [folder / "one.rrd", folder / "two.rrd"]
+
+
+def test_the_cost_so_far_ends_at_the_cost_of_the_run() -> None:
+    for run in (pendulum_run(), make_run(), replace(make_run(), cost=km.Cost(1, 1, R_delta=0.5))):
+        so_far = running_cost(run)
+        assert so_far[0] == 0
+        assert len(so_far) == len(run.X)
+        assert so_far[-1] == pytest.approx(km.metrics(run).cost)
+
+
+def test_each_run_is_a_curve_of_every_plot_and_a_column_of_the_table(logs: list[Path], tmp_path: Path) -> None:
+    record_comparison(logs, tmp_path / "both.rrd")
+    drawn = read_columns(tmp_path / "both.rrd", ("/**",))
+    runs = [km.load_run(log) for log in logs]
+    for r, run in enumerate(runs, 1):
+        assert drawn.matrix(f"/state/0/{r}")[1][:, 0] == pytest.approx(run.X[:, 0])
+        assert drawn.matrix(f"/input/0/{r}")[1][:, 0] == pytest.approx(run.U[:, 0])
+        assert drawn.matrix(f"/cost/{r}")[1][-1, 0] == pytest.approx(km.metrics(run).cost)
+        assert drawn.static(f"/state/0/{r}", "names") == ("one", "two")[r - 1]
+    assert drawn.static("/state/0/mark/0", "names") == "reference"
+    assert "| metric | one | two |" in drawn.static("/metrics", "text")
+
+
+def test_logs_that_cannot_be_compared_say_why(logs: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(km.errors.LogError, match="a comparison needs two logs or more"):
+        record_comparison(logs[:1], tmp_path / "both.rrd")
+    km.record(replace(make_run(), states=("a", "b"), inputs=("c",), cost=None), tmp_path / "other.rrd")
+    with pytest.raises(km.errors.LogError, match="no state and no input in common"):
+        record_comparison([logs[0], tmp_path / "other.rrd"], tmp_path / "both.rrd")
+
+
+def test_a_video_has_a_picture_a_moment_and_moves(logs: list[Path], tmp_path: Path) -> None:
+    from PIL import Image
+
+    export_video(logs[0], tmp_path / "out.gif", fps=10, width=200)
+    with Image.open(tmp_path / "out.gif") as film:
+        assert film.n_frames == 11  # 1 s at 10 pictures a second, and the first
+        assert film.size[0] == 200
+        first = np.asarray(film.convert("L"), dtype=float)
+        film.seek(10)
+        last = np.asarray(film.convert("L"), dtype=float)
+    assert np.abs(first - last).max() > 50
+    pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
+    export_video(logs[0], tmp_path / "out.mp4", fps=10, width=200, until=0.5)
+    assert (tmp_path / "out.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_what_no_video_can_be_made_of_says_why(logs: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(km.KoopmpcError, match=r"ends in \.avi; a video is a \.gif or an \.mp4"):
+        export_video(logs[0], tmp_path / "out.avi", until=0.1)
+    km.record(make_run(), tmp_path / "plain.rrd")
+    with pytest.raises(km.errors.LogError, match="has no scene to draw"):
+        export_video(tmp_path / "plain.rrd", tmp_path / "out.gif")
