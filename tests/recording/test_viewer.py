@@ -43,7 +43,7 @@ def test_several_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPa
 
 def test_without_a_display_the_command_for_another_machine_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "has_display", lambda: False)
-    told = r"there is no display to open .*run\.rrd on; copy it to a machine with .* run `koopmpc view run\.rrd`"
+    told = r"there is no display to open .*run\.rrd on; `koopmpc view --web .*`.*, or copy it to a machine with .* run `koopmpc view run\.rrd`"
     with pytest.raises(km.errors.LogError, match=told):
         km.view(log)
 

@@ -7,7 +7,7 @@ class Entity(StrEnum):
     """Where the columns of a log stand.
 
     An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
-    What only the viewer draws is in views/: `world`, `model`, `plots`, `title`, `solver/log_time`, `solver/log_deadline`.
+    What only the viewer draws is in views/: `world`, `model`, `plots`, `title`, `solver/log_time` and `…_deadline`.
     """
 
     DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
