@@ -174,9 +174,8 @@ class KoopmanMPC(MPCBase):
             The predictor has another lifting, dt, other states, inputs or disturbances than the last one.
         """
         checks.kind(predictor, "predictor", LinearPredictor, "it replaces another LinearPredictor")
-        old = self.predictor
         for name in ("lifting", "dt", "states", "inputs", "disturbances"):
-            if getattr(predictor, name) != getattr(old, name):
+            if getattr(predictor, name) != getattr(self.predictor, name):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
@@ -241,11 +240,8 @@ class KoopmanMPC(MPCBase):
         if not self._planned:
             return None
         A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
-        moves = self._plan[: len(self._blocks) * self.nu].reshape(-1, self.nu)
-        U = moves[self._move_of]
-        push = self._initial.W @ E.T
-        if self._disturbed:
-            push = push + self._initial.d
+        U = self._plan[: len(self._blocks) * self.nu].reshape(-1, self.nu)[self._move_of]
+        push = self._initial.W @ E.T + (self._initial.d if self._disturbed else 0.0)
         Z = np.empty((self._N + 1, self.predictor.nz))
         Z[0] = self._initial.z
         for k in range(self._N):
@@ -282,8 +278,7 @@ class KoopmanMPC(MPCBase):
 
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Go on where the plan breaks a limit, its target does, or something is not finite."""
-        plan, origin = self._map, self._initial
-        u_prev = origin.u_prev
+        plan, origin, u_prev = self._map, self._initial, self._initial.u_prev
         changed = self._with_rates and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
         if changed:
             u_prev[:] = self._given
@@ -291,8 +286,7 @@ class KoopmanMPC(MPCBase):
         if not t.dot(t) < HUGE * HUGE:
             self._qps.cool()
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
-        n = plan.planned
-        v = t[:n]
+        n, v = plan.planned, t[: plan.planned]
         if n < len(t) and not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
             e = plan.disturbance @ origin.drive  # a limit moves a target
             moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
