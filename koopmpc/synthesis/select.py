@@ -18,11 +18,12 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import StageProgress, map_tasks
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.candidates import Candidate, expanded, jumps, still, usual
-from koopmpc.synthesis.cross_validation import LEAST, Trial, ridges_of, tried
+from koopmpc.synthesis.cross_validation import EXACT, LEAST, Trial, ridges_of, tried
 from koopmpc.synthesis.folds import folded, sampled, usual_horizon
 from koopmpc.synthesis.selection import LeaderboardRow, Selection, choice, row_of
 from koopmpc.validate.scoring import AnyPredictor
 
+ENOUGH = 1e-2  # error of a forecast, of the states' spread, that a controller has no use to improve on
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 
 
@@ -78,7 +79,9 @@ def select(
         Try z⁺ = A z + B u + Σ uᵢ Nᵢ z too, where there are inputs and no measured disturbances.
     relift
         Judge a bilinear model by forecasts that lift afresh at each step, as BilinearMPC plans, `step_map()` simulates
-        and `score(relift=True)` measures. False: by forecasts in z, as `rollout` predicts and a linear model is judged.
+        and `score(relift=True)` measures; then errors below 1 % of the spread are all alike, for a controller corrects
+        them at the next step, and small models go wrong less where there are few data. False: by forecasts in z, as
+        `rollout` predicts and a linear model is judged, and as exactly as the data allow.
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
@@ -136,8 +139,9 @@ def select(
     # on a grid of decades the one nearest to ε² is the first
     floor = LEAST if ridges is not None else min(result.misfit for result in results) / np.sqrt(10)
     rows = tuple(sorted((row_of(result, floor) for result in results), key=lambda row: (row.worst, row.size)))
-    chosen = choice(rows)
-    linear = choice(rows, "linear") if any(row.kind == "linear" for row in rows) else chosen
+    alike = ENOUGH if relift else EXACT
+    chosen = choice(rows, alike=alike)
+    linear = choice(rows, "linear", alike) if any(row.kind == "linear" for row in rows) else chosen
     for place, which in ((chosen, f"all {len(rows)} candidates"), (linear, "all linear candidates")):
         if not np.isfinite(rows[place].worst):
             warnings.warn(

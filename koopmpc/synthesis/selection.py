@@ -186,13 +186,13 @@ def row_of(trial: Tried, floor: float) -> LeaderboardRow:
     )
 
 
-def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None) -> int:
+def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None, alike: float = EXACT) -> int:
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
-    Errors below 1e-6 are rounding and the least ridge, and all alike. Where every
-    forecast ran away it is the smallest of all.
+    Errors below `alike` are all alike, by default those of rounding and the least ridge. Where every forecast ran away
+    it is the smallest of all.
     """
     places = [i for i, row in enumerate(rows) if kind is None or row.kind == kind]
     best = min((rows[i] for i in places), key=lambda row: row.worst)
-    near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, EXACT)]
+    near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, alike)]
     return min(near, key=lambda i: (rows[i].size, rows[i].worst))

@@ -89,6 +89,22 @@ def test_a_bilinear_model_is_judged_by_forecasts_that_lift_afresh_as_its_control
     assert km.score(found.predictor, data, 15).total > 1e-3
 
 
+def test_errors_below_a_hundredth_are_alike_for_a_controller_and_not_for_a_forecast():
+    """A plant with a cubic term that is worth less than 1 % of the spread over the horizon."""
+
+    def nearly(x, u):
+        return A @ x + B @ u + np.array([0.0, 2e-3 * x[0] ** 3])
+
+    data, candidates = episodes_of(nearly), [PLAIN, PLAIN + km.Monomials(3)]
+    control, forecast = (
+        km.select(data, candidates=candidates, horizon=10, delays=[0], relift=relift) for relift in (True, False)
+    )
+    assert (control.best.name[0], control.best.bilinear) == ("0", False)
+    assert 1e-6 < control.best.worst < 1e-2
+    assert forecast.best.name.startswith("1")
+    assert forecast.best.worst < 0.5 * control.best.worst
+
+
 def test_what_is_not_measured_is_found_in_the_past():
     """Of two linear states one is measured: one delay closes the model."""
     found = km.select(episodes_of(linear, keep=1), candidates=[km.State()], horizon=8)
