@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
 from tests.bare import shown
 from tests.validate.logs.corpus import BEDS, FAULTS, Draw, clean, episodes, faulty, simulated
 
@@ -115,7 +114,7 @@ def test_time_stamps_show_jitter_resets_gaps_and_another_rate():
 def test_what_is_no_log_is_refused_in_words():
     assert shown("show(lambda: km.validate.audit(np.zeros((3, 2))))")[0].startswith("DataError episodes is a ndarray")
     data = episodes(STEADY, *simulated(STEADY, np.random.default_rng(7)))
-    with pytest.raises(DataError, match="times are given for 1 episodes, the data have 20"):
+    with pytest.raises(km.errors.DataError, match="times are given for 1 episodes, the data have 20"):
         km.validate.audit(data, times=_clock(data)[:1])
 
 
