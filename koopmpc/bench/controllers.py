@@ -1,6 +1,7 @@
-"""The eight controllers of the bench, and what they share of one problem: step map, plant, data and models."""
+"""The nine controllers of the bench, and what they share of one problem: step map, plant, data and models."""
 
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from functools import cached_property
 
@@ -21,13 +22,14 @@ from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import ProblemError
+from koopmpc.errors import FitWarning, ProblemError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.plants.dynamics import Dynamics, Plant
 from koopmpc.plants.step_map import SimulatedPlant, StepMap, discretize
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.synthesis.design import design
 
 
 class Prepared:
@@ -159,6 +161,23 @@ def _bilinear_offset(parts: Prepared, limits: Limits) -> Controller:
     return BilinearMPC(parts.bilinear, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
 
 
+def _designed(parts: Prepared, limits: Limits) -> Controller:
+    """What `design` makes of the data, for the first case's reference and the starts of all cases."""
+    problem = parts.problem
+    cases = list(problem.cases.values())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)  # of cases that ask for what the data do not hold
+        return design(
+            parts.data,
+            problem.cost,
+            limits,
+            horizon=problem.horizon,
+            reference=cases[0].reference,
+            starts=np.array([case.x0 for case in cases]),
+            angles=problem.angles,
+        ).controller
+
+
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
     """MPC on the model itself, the best of twelve initial guesses: the oracle where the model is the plant."""
     return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
@@ -173,20 +192,22 @@ CONTROLLERS: dict[str, Build] = {
     "bilinear-mpc": _bilinear_mpc,
     "bilinear-offset": _bilinear_offset,
     "nonlinear-mpc": _nonlinear_mpc,
+    "designed": _designed,
 }
+ASKED = ("designed",)  # a design takes up to a minute, so it runs where it is named
 
-LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset")
+LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset", "designed")
 
 
 def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the names as a tuple, by default all eight.
+    """Return the names as a tuple, by default all but "designed", which has to be named.
 
     Raises
     ------
     ProblemError
         There is no such controller; the message names the nearest.
     """
-    names = tuple(names or CONTROLLERS)
+    names = tuple(names or (name for name in CONTROLLERS if name not in ASKED))
     for name in names:
         if name not in CONTROLLERS:
             raise ProblemError(

@@ -4,7 +4,7 @@ import argparse
 import sys
 import time
 
-from tests.closed_loop.controllers import CONTROLLERS
+from tests.closed_loop.controllers import CONTROLLERS, DESIGNED
 from tests.closed_loop.judge import SEEDS, Table, measure
 from tests.closed_loop.table import FIRST, STORED, losses, saved, stored, text
 from tests.closed_loop.tasks import TASKS
@@ -13,7 +13,7 @@ from tests.closed_loop.tasks import TASKS
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.closed_loop", description=__doc__)
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--controllers", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
+    parser.add_argument("--controllers", nargs="+", choices=[*CONTROLLERS, *DESIGNED], default=list(CONTROLLERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--quick", action="store_true", help="one training seed")
     parser.add_argument("--u-target", choices=("equilibrium", "zero", "given"), help="for all tasks, not stored")

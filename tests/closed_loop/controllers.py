@@ -32,6 +32,13 @@ class Parts:
         """The models that cross-validation proposes for the task's horizon."""
         return km.select(self.data, horizon=self.task.horizon)
 
+    @cached_property
+    def design(self) -> Any:
+        """What km.design makes of the training data, the cost and the limits."""
+        rows = self.task.rows
+        reference = rows if (rows != rows[0]).any() else rows[0]
+        return km.design(self.data, self.cost(), self.task.limits, horizon=self.task.horizon, reference=reference)
+
     @property
     def linear(self) -> km.LinearPredictor:
         """The best linear model."""
@@ -118,6 +125,18 @@ def _bilinear_offset(p: Parts) -> Any:
     return km.BilinearMPC(p.bilinear, p.cost(), p.task.limits, p.task.horizon, estimator=km.LiftedDisturbance())
 
 
+def _designed(p: Parts) -> Any:
+    """km.design with no other option, one design for all starts of a task."""
+    return p.design.controller
+
+
+def _designed_linear(p: Parts) -> Any:
+    """The best KoopmanMPC of the same design."""
+    if p.design.linear is None:
+        raise NotApplicableError
+    return p.design.linear
+
+
 CONTROLLERS: dict[str, Callable[[Parts], Any]] = {
     "edmd": _edmd,
     "dmdc": _dmdc,
@@ -130,6 +149,8 @@ CONTROLLERS: dict[str, Callable[[Parts], Any]] = {
     "bilinear-mpc": _bilinear_mpc,
     "bilinear-offset": _bilinear_offset,
 }
+# a design takes up to a minute of one core, so these are measured where they are named, and are not in the stored table
+DESIGNED: dict[str, Callable[[Parts], Any]] = {"designed": _designed, "designed-linear": _designed_linear}
 YARDSTICKS = ("edmd", "dmdc")
 GIVEN = ("lqr", "linear-mpc", "nonlinear-mpc", "bilinear-exact")  # on equations: one seed is as good as three
 LEARNED = ("koopman-mpc", "koopman-offset", "bilinear-mpc", "bilinear-offset")  # from data alone

@@ -11,7 +11,7 @@ from multiprocessing import get_context
 import numpy as np
 
 import koopmpc as km
-from tests.closed_loop.controllers import CONTROLLERS, GIVEN, NotApplicableError, Parts
+from tests.closed_loop.controllers import CONTROLLERS, DESIGNED, GIVEN, NotApplicableError, Parts
 from tests.closed_loop.optimum import boxes, held, optimum, weights
 from tests.closed_loop.tasks import TASKS, Task, UTarget
 
@@ -94,7 +94,7 @@ def judged(parts: Parts, name: str, start: int, u_target: UTarget | None = None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            controller = CONTROLLERS[name](parts)
+            controller = (CONTROLLERS | DESIGNED)[name](parts)
             run = km.simulate(
                 task.plant,
                 controller,
