@@ -211,29 +211,25 @@ class KoopmanMPC(MPCBase):
         except IndexError:
             raise busy(self) from None
         try:
-            return self._step(y, reference, applied, w)
+            start = perf_counter()
+            target = numbers(reference, "reference")
+            key = target.tobytes()
+            if key != self._reference_key:
+                self._aim(target)
+                self._reference_key = key
+            origin = self._initial
+            origin.take(y, self._given, applied, w)
+            if self._rows_left:  # the next call has its own row of a given u_target
+                self._given_row, self._reference_key = self._given_row + 1, None
+            t = self._spare
+            self._map.matrix.dot(origin.known, t)
+            np.greater_equal(t, self._map.low, out=self._met_low)
+            np.less_equal(t, self._map.high, out=self._met_high)
+            if 0 not in self._met:  # every limit is met, and nothing is NaN
+                return self._unconstrained(t, start)
+            return self._limited(t, applied, start)
         finally:
             self._token.append(held)
-
-    def _step(self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None, w: ArrayLike | None) -> Move:
-        """Return the move of this step; no other thread is here."""
-        start = perf_counter()
-        target = numbers(reference, "reference")
-        key = target.tobytes()
-        if key != self._reference_key:
-            self._aim(target)
-            self._reference_key = key
-        origin = self._initial
-        origin.take(y, self._given, applied, w)
-        if self._rows_left:  # the next call has its own row of a given u_target
-            self._given_row, self._reference_key = self._given_row + 1, None
-        t = self._spare
-        self._map.matrix.dot(origin.known, t)
-        np.greater_equal(t, self._map.low, out=self._met_low)
-        np.less_equal(t, self._map.high, out=self._met_high)
-        if 0 not in self._met:  # every limit is met, and nothing is NaN
-            return self._unconstrained(t, start)
-        return self._limited(t, applied, start)
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""

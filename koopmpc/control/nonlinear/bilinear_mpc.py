@@ -26,6 +26,7 @@ FOLLOWED = 0.02  # a plan follows the model whose defects are below this share o
 SETTLED = (
     1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
 )
+FAR = 3.0  # sizes of a state: a plan that expected another state by more begins anew, for it, or y, was a glitch
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -162,7 +163,9 @@ class BilinearMPC(StagedMPC):
         if self._with_rates:
             iteration.low[0, : self.nu], iteration.high[0, : self.nu] = first
         status, iterations = Status.FAILED, 0
-        if self._warm:
+        nx = self._map.nx
+        jump = np.abs(s[:nx] - iteration.X[1, :nx]) / self._problem.sizes[:nx]  # from the state that was expected
+        if self._warm and jump.max() <= FAR:
             self._shift(u_prev)
             status, iterations = self._improve(s, u_prev, self._sqp_iterations, deadline)
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant

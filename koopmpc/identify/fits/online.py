@@ -11,7 +11,7 @@ from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.rows import row_columns
-from koopmpc.identify.moments.sliding import Forgetting, Window
+from koopmpc.identify.moments.sliding import Forgetting, Gate, Window
 from koopmpc.identify.regression import linear_predictor, regression_of, unreduced
 from koopmpc.identify.solve import Ridge, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting, buffered, lifting_of
@@ -26,6 +26,11 @@ class OnlineEDMD:
     It keeps the triangular factor of the rows [ψ(x) u w ψ(x⁺)], never a covariance: updates are orthogonal
     transformations, so errors do not grow with their number. With a window it is the fit of the last `window` pairs.
     With neither forgetting nor a window it is the batch fit.
+
+    With forgetting, a pair whose innovation, ψ(x⁺) less its forecast, is beyond 30 times the spread of innovations so
+    far is an outlier: it is not learned, and counted in `outliers`. One reading that is far off would else be
+    remembered for thousands of pairs. A plant that has changed is learned after a few pairs, for spreads grow with
+    outliers. A memory of less than four pairs a regressor knows no outliers.
 
     It takes no embedding, because it keeps no past steps. A model with delays learns from points ζ as states:
     ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.
@@ -95,7 +100,9 @@ class OnlineEDMD:
             self._memory = Window(width, checks.count(window, "window"), max(_BLOCK, width))
         self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
         self._waiting = 0
-        self.pairs = 0
+        long = factor < 1 and 1 / (1 - factor) > 4 * self._n  # else forecasts say nothing of outliers
+        self._gate = Gate(width, self._n) if long else None
+        self.pairs = self.outliers = 0
 
     @classmethod
     def start(
@@ -161,15 +168,21 @@ class OnlineEDMD:
             if not np.isfinite(Z).all():
                 bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
                 raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")
-        done = 0
+        done, before = 0, self.outliers
         while done < count:
             take = min(count - done, len(self._rows) - self._waiting)
             self._write(Z, forced.reshape(count, nu), pushed, done, take)
             done += take
+            if self._gate is not None:
+                learned = self._gate.keep(self._rows[self._waiting - take : self._waiting])
+                self._waiting -= take - learned
+                self.outliers += take - learned
             if self._waiting == len(self._rows):
                 self._memory.push(self._rows)
                 self._waiting = 0
-        self.pairs += count
+                if self._gate is not None and isinstance(self._memory, Forgetting):
+                    self._gate.learn(self._memory.R)
+        self.pairs = self.pairs + count - (self.outliers - before)
 
     def predictor(self) -> LinearPredictor:
         """Return the fit of all pairs that count now. Doubts stand in its report; no warning is raised.
@@ -187,6 +200,8 @@ class OnlineEDMD:
         sentences = doubts(rows, regression.lifting.names, regression.inputs, regular=self._ridge != 0)[0]
         solution = solve(rows, ridge=self._ridge)
         said = f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
+        if self.outliers:
+            said += f"{self.outliers} pairs were outliers and were not learned, "
         said += rule(rows, self._ridge, solution.ridge)
         result = unreduced(regression, solution.K, rule=said, ridge=solution.ridge, doubts=sentences)
         return linear_predictor(regression, result, warn=False)

@@ -3,6 +3,7 @@
 from collections import deque
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from koopmpc.identify.moments.moments import Table, Triangle, absorb, empty
 
@@ -40,6 +41,11 @@ class Forgetting:
             floor = np.sqrt(self._keep) * self._most
             low = np.flatnonzero((held < floor) & (held > 0))
             R[low] *= (floor[low] / held[low])[:, None]
+
+    @property
+    def R(self) -> Triangle:
+        """The factor of the rows that were pushed; it changes with the next ones."""
+        return self._R
 
     def factor(self, pending: Table) -> tuple[Triangle, float]:
         """Return R and the sum of weights of all rows, with those that wait."""
@@ -118,3 +124,55 @@ class Window:
                 absorb(R, rows)
                 self._front.appendleft((R.copy(order="F"), rows))
             self._back, self._R = [], empty(self._nd)
+
+
+BEYOND, LEAST, MEMORY = 30.0, 0.01, 0.01  # of a spread; of a column's size; share that a new row has in both
+FEW = 20  # innovations that say nothing of their spread yet
+
+
+class Gate:
+    """Which rows are no outliers: those whose innovation t − Kᵀr is within 30 spreads in every column.
+
+    The spread of a column is the root-mean-square of its innovations, over about 100 rows, and counts as at least 1 %
+    of the column's own. An innovation beyond the gate counts there as if it stood at the gate: the spread grows
+    tenfold with four of them in sequence, so that a plant that has changed is learned after a few rows.
+
+    Parameters
+    ----------
+    nd, n
+        Columns of a row, and how many of them are regressors r; the others are t.
+    """
+
+    def __init__(self, nd: int, n: int) -> None:
+        self._n, self._rows, self._seen = n, 0, 0  # _seen: innovations
+        self._K: Table | None = None
+        self._spread, self._size = np.zeros(nd - n), np.zeros(nd - n)
+
+    def learn(self, R: Triangle) -> None:
+        """Take over the regression R K = T of all rows so far."""
+        A, T = R[: self._n, : self._n], R[: self._n, self._n :]
+        diagonal = np.abs(A.diagonal())
+        if diagonal.min(initial=np.inf) > 1e-12 * diagonal.max(initial=0.0) and self._rows > 4 * self._n:
+            self._K = solve_triangular(A, T, check_finite=False)
+
+    def keep(self, rows: Table) -> int:
+        """Move the rows that are no outliers to the front, and return how many they are."""
+        n, kept = self._n, 0
+        for row in rows:
+            t = row[n:]
+            if self._K is None:
+                share, good = max(MEMORY, 1.0 / (self._rows + 1)), True
+            else:
+                share, e = MEMORY, np.abs(t - row[:n] @ self._K)
+                gate = BEYOND * np.maximum(np.sqrt(self._spread), LEAST * np.sqrt(self._size))
+                self._seen += 1
+                known = self._seen > FEW
+                good = not known or bool((e <= gate).all())
+                held = np.minimum(e, gate) if known else e
+                self._spread += max(MEMORY, 1.0 / self._seen) * (held**2 - self._spread)
+            if good:
+                self._size += share * (t**2 - self._size)
+                rows[kept] = row
+                kept += 1
+                self._rows += 1
+        return kept

@@ -1,0 +1,115 @@
+"""One bad sample has no echo: the next good one is answered, and learned from, as if it had not been."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+PENDULUM = km.load_problem("pendulum")
+PLANT = km.discretize(PENDULUM.dynamics, 0.05)
+LIFTING = km.State() + km.Fourier(1, states=[0]) + km.Constant()
+
+
+@pytest.fixture(scope="module")
+def bilinear():
+    data = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=60, steps=30)
+    return km.bilinear_edmd(data, LIFTING)
+
+
+@pytest.mark.parametrize("kind", ["learned", "given"])
+def test_the_step_after_a_glitch_is_that_of_a_controller_that_never_saw_it(bilinear, kind):
+    controller = km.BilinearMPC(
+        bilinear if kind == "learned" else PLANT, PENDULUM.cost, km.Limits(u_min=-10, u_max=10), 20
+    )
+    fresh = km.BilinearMPC(controller.model, PENDULUM.cost, controller.limits, 20)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        x = 0.2 * rng.standard_normal(2)
+        controller.reset(x)
+        for _ in range(5):
+            u = controller(x, [0.0, 0.0]).u
+            x = PLANT(x, u)
+        u = controller(x + 50 * rng.standard_normal(2), [0.0, 0.0]).u
+        x = PLANT(x, u)
+        fresh.reset(x, u)
+        assert np.allclose(controller(x, [0.0, 0.0]).u, fresh(x, [0.0, 0.0]).u, atol=0.1)
+
+
+def pairs(plant, count, seed=0):
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        x, u = rng.uniform(-1, 1, 2), rng.uniform(-3, 3, 1)
+        yield x, u, plant(x, u)
+
+
+def online():
+    return km.OnlineEDMD(LIFTING, dt=0.05, states=PLANT.states, inputs=PLANT.inputs, forgetting=0.99)
+
+
+def worst(model, plant):
+    return max(np.abs(model.step_map()(x, u) - x_next).max() for x, u, x_next in pairs(plant, 50, seed=1))
+
+
+@pytest.mark.parametrize("size", [50.0, 1e5])
+@pytest.mark.parametrize("where", ["x", "x_next", "both"])
+def test_an_outlier_is_not_learned_and_is_counted(size, where):
+    learner, twin = online(), online()
+    for k, (x, u, x_next) in enumerate(pairs(PLANT, 400)):
+        if k == 300:
+            learner.learn(x + size * (where != "x_next"), u, x_next + size * (where != "x"))
+        else:
+            learner.learn(x, u, x_next)
+            twin.learn(x, u, x_next)
+    assert (learner.outliers, twin.outliers) == (1, 0)
+    assert learner.pairs == twin.pairs == 399
+    assert "1 pairs were outliers" in learner.predictor().report.route
+    assert worst(learner.predictor(), PLANT) == pytest.approx(worst(twin.predictor(), PLANT), rel=0.2)
+
+
+def test_a_plant_that_has_changed_is_learned_all_the_same():
+    heavy = km.discretize(replace(PENDULUM.dynamics, m=8 * PENDULUM.dynamics.m), 0.05)
+    learner = online()
+    for plant in (PLANT, heavy):
+        for x, u, x_next in pairs(plant, 1200):
+            learner.learn(x, u, x_next)
+    assert worst(learner.predictor(), heavy) < 0.1 * worst(learner.predictor(), PLANT)
+    assert learner.outliers < 30
+
+
+def test_an_equilibrium_that_was_not_found_is_looked_for_again_after_a_reset(monkeypatch):
+    from koopmpc.control.nonlinear.equilibrium import Equilibria
+
+    controller = km.BilinearMPC(PLANT, PENDULUM.cost, km.Limits(u_min=-10, u_max=10), 10)
+    fresh = km.BilinearMPC(PLANT, PENDULUM.cost, km.Limits(u_min=-10, u_max=10), 10)
+    find, asked = Equilibria.find, []
+
+    def lost(self, *arguments, **options):
+        asked.append(arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Equilibria, "find", lost)
+        moves = [controller([0.3, 0.0], [0.0, 0.0]) for _ in range(3)]
+    assert len(asked) == 1  # it is not looked for at each step
+    assert all(np.isfinite(move.u).all() for move in moves)
+    assert Equilibria.find is find
+    controller.reset()
+    assert np.array_equal(controller([0.3, 0.0], [0.0, 0.0]).u, fresh([0.3, 0.0], [0.0, 0.0]).u)
+
+
+class Drift(km.Dynamics):
+    """Two integrators that no input within the limits brings to rest."""
+
+    states, inputs = ("x", "v"), ("u",)
+
+    def rhs(self, x, u):
+        return ca.vertcat(x[1], 5.0 + u[0])
+
+
+def test_a_plant_without_an_equilibrium_inside_its_limits_is_controlled_by_the_reference_alone():
+    plant = km.discretize(Drift(), 0.1)
+    controller = km.BilinearMPC(plant, km.Cost(Q=[1.0, 1.0], R=0.1), km.Limits(u_min=-1, u_max=1), 10)
+    moves = [controller([0.1 * k, 0.5], [0.0, 0.0]) for k in range(3)]
+    assert all(move.u[0] == pytest.approx(-1.0, abs=1e-3) for move in moves)  # it holds against the drift
