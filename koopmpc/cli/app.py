@@ -255,9 +255,7 @@ def view(
             return
         open_viewer(shown)
         if len(shown) > 1:
-            out.print(
-                Text("the panel at the left of the window lists the logs; --compare draws them in one set of plots")
-            )
+            out.print(Text("the first panel button at the top right lists the logs; --compare draws all in one set"))
 
 
 @app.command("export-video")

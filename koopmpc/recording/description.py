@@ -25,9 +25,11 @@ _FORMAT = "koopmpc-log-1"
 
 
 def application_of(about: About) -> str:
-    """Return the Rerun application of the problem; Rerun stores the layouts of its users by application."""
-    own = "run-" + "-".join((*about.states, *about.inputs))  # scripts of one plant share a layout
-    return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]+", "_", str(about.metadata.get("problem", own)))
+    """Return the Rerun application of a problem and a controller, by which Rerun stores layouts: each has its own."""
+    plant = about.metadata.get("problem", "run-" + "-".join((*about.states, *about.inputs)))
+    controller = about.metadata.get("controller")
+    parts = [str(part) for part in (plant, controller) if part is not None]
+    return "koopmpc-" + re.sub(r"[^A-Za-z0-9_-]+", "_", "-".join(parts))
 
 
 def title_of(about: About) -> str:

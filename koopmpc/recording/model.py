@@ -110,17 +110,14 @@ def record_model(
 
 def _forecast_curves(ahead: Forecast, i: int) -> list[Curve]:
     """Return truth, prediction and, where it is finite, the band of the i-th state."""
-    curves: list[Curve] = [
-        ("truth", _TRUTH, 2.0, ahead.truth[:, i]),
-        ("prediction", _PREDICTED, 2.0, ahead.predicted[:, i]),
-    ]
+    curves: list[Curve] = [("prediction", _PREDICTED, 3.0, ahead.predicted[:, i])]
     known = np.isfinite(ahead.predicted[:, i])
     if ahead.band and np.isfinite(ahead.low[known, i]).all() and np.isfinite(ahead.high[known, i]).all():
         curves += [
             (f"{ahead.band}, low", _BAND, 1.0, ahead.low[:, i]),
             (f"{ahead.band}, high", _BAND, 1.0, ahead.high[:, i]),
         ]
-    return curves
+    return [*curves, ("truth", _TRUTH, 1.2, ahead.truth[:, i])]  # thin, and over the prediction
 
 
 def _error_curves(score: Score, i: int) -> list[Curve]:
@@ -184,8 +181,10 @@ def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str
     lines = [f"# Model of {', '.join(predictor.states)}", ""]
     if report is not None:
         lines += ["```", str(report), "```", ""]
-    if note:
-        lines += [note, ""]
+    lines += [
+        note or "Eigenfunctions: dark is the least value, light the largest; of a phase, dark is 0, light ±π.",
+        "",
+    ]
     rows = {
         "kind": type(predictor).__name__,
         "inputs": ", ".join(predictor.inputs) or "none",

@@ -19,7 +19,7 @@ from koopmpc.loop.run import About, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.format.rrd import block_of_run, block_of_steps
 from koopmpc.recording.format.writer import Writer
-from koopmpc.recording.viewer import PORT, find_viewer, why_none
+from koopmpc.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
 from koopmpc.scene import Scene
 
 _BATCH = 0.2  # time between two batches [s]
@@ -181,6 +181,8 @@ class Recorder:
 
     def __enter__(self) -> "Recorder":
         """Open the log, and find the viewer."""
+        if self._live:
+            quiet()
         if self._path is not None:
             self._writers[str(self._path)] = self._opened(self._path, None)
         if self._live:
@@ -206,10 +208,17 @@ class Recorder:
     ) -> None:
         """Write what is queued, the metrics and the end, and close."""
         self._open = False
-        for name, writer in self._writers.items():
-            failure = writer.close(_PATIENCE_FILE if name == str(self._path) else _PATIENCE_VIEWER)
-            if failure is not None:
+        kept = "the run went on"
+        for name, writer in self._writers.items():  # the file comes first
+            of_file = name == str(self._path)
+            failure = writer.close(_PATIENCE_FILE if of_file else _PATIENCE_VIEWER)
+            if failure is None:
+                kept = f"the log {name} is complete" if of_file else kept
+            elif of_file:
                 warnings.warn(f"the recording to {name} is not complete: {failure}", UserWarning, stacklevel=2)
+            else:
+                closed = "was closed" if not is_up(self._port) else f"takes in nothing more ({failure})"
+                warnings.warn(f"the viewer {closed} before the end; {kept}", UserWarning, stacklevel=2)
         self._writers = {}
 
     def _opened(self, path: Path | None, viewer: str | None) -> BackgroundWriter:

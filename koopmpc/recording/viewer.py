@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 
 from koopmpc.errors import LogError
@@ -23,6 +24,17 @@ def find_viewer(port: int = PORT) -> str | None:
     if not is_up(port) and not (has_display() and open_viewer([], port)):
         return None
     return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def quiet() -> None:
+    """Keep lines of Rerun's own off stderr when a viewer is closed; the Recorder says it in words.
+
+    Rerun reads its setting when it is first imported: once that is done nothing changes.
+    """
+    if "rerun" not in sys.modules and "RUST_LOG" not in os.environ:
+        os.environ["RUST_LOG"] = "warn,re_grpc_client=off,re_sdk=off"
+        import_module("rerun")
+        del os.environ["RUST_LOG"]
 
 
 def why_none(port: int = PORT) -> str:

@@ -70,8 +70,8 @@ def reach(model: Predictor) -> float:
 def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
     """Return the view of the unit circle, and a closer one where the eigenvalues crowd."""
     size, values = reach(model), np.asarray(model.eigenvalues)
-    views = [_view("Eigenvalues of A and the unit circle", 0.0, 0.0, size)]
-    told = "Darker: smaller residual; rings may be spurious" if residuals else "Closer"
+    views = [_view("Eigenvalues, unit circle", 0.0, 0.0, size)]
+    told = "Closer; rings may be spurious" if residuals else "Closer"
     re, im = np.real(values), np.imag(values)
     half = max(np.ptp(re), np.ptp(im)) / 2
     if half < _CROWDED * size:
@@ -104,15 +104,15 @@ def draw_eigenfunctions(
         if value.imag == 0:
             low, high = float(phi.real.min()), float(phi.real.max())
             level = (phi.real - low) / ((high - low) or 1.0)
-            title = f"φ{j} from {low:.2g} (dark) to {high:.2g} (light), λ = {value.real:.4g}"
+            title = f"φ{j}, λ = {value.real:.4g}"
             pictures.append((f"{entity}/value", title, _picture(f"{entity}/value", shades(level, SEQUENTIAL), plane)))
             continue
         turns = np.angle(phi) / (2 * np.pi) + 0.5  # dark at 0, blue below, red above, light at ±π
         shaded = {"magnitude": shades(np.abs(phi), SEQUENTIAL), "phase": shades(turns, CYCLIC)}
         sign = "+" if value.imag > 0 else "−"
         titles = {
-            "magnitude": f"|φ{j}|, 0 (dark) to 1 (light), λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i",
-            "phase": f"phase of φ{j}: 0 dark, ±π light, + red, − blue",
+            "magnitude": f"|φ{j}|, λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i",
+            "phase": f"Phase of φ{j}",
         }
         pictures += [(f"{entity}/{k}", titles[k], _picture(f"{entity}/{k}", shaded[k], plane)) for k in shaded]
     return pictures
