@@ -18,6 +18,8 @@ from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
+_SHARES = (1.0, 0.7, 0.45)  # of the states' sizes at which observables are read for theirs
+_LEAST = 1e-150  # what an observable that vanishes there is smaller than
 _CONSTANT = 1e-12  # share of the mean square below which a variance is rounding
 Read = TypeVar("Read", np.ndarray, ca.Function)
 
@@ -188,6 +190,22 @@ def data_ranges(model: LinearPredictor | BilinearPredictor) -> dict[str, float]:
     half = np.sqrt(3 * np.where(known, spread, 0.0))
     names = [*model.lifting.names, *model.states]
     return {name: float(value) for name, value in zip(names, half, strict=True) if value > 0}
+
+
+def observable_sizes(predictor: LinearPredictor, sizes: Sizes) -> Float[np.ndarray, " nz"]:
+    """Return the sizes of observables: those of a model's data, else the largest |ψ| on the way to the states' sizes.
+
+    An observable that is zero there has size 1.
+    """
+    if predictor.scale is not None:
+        return np.linalg.norm(predictor.scale, axis=0)
+    point = sizes.states
+    if predictor.embedding is not None:
+        point = predictor.embedding.held(sizes.states, sizes.inputs)
+    seen = np.abs(predictor.lifting(np.outer(_SHARES, point))).max(axis=0)
+    if seen.shape != (predictor.nz,):  # a reduced model
+        return np.ones(predictor.nz)
+    return np.where(np.isfinite(seen) & (seen > _LEAST), seen, 1.0)
 
 
 @dataclass(frozen=True)

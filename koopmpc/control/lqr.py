@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Limits, admitted
+from koopmpc.control.linear.horizon import horizon_of
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.control.turns import alone, token
+from koopmpc.control.units import Units
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.base import HUGE
@@ -56,10 +58,13 @@ class LQR:
         checks.kind(predictor, "predictor", LinearPredictor, advice)
         self.predictor, self.cost, self.limits = predictor, cost, limits
         track = lifted_tracking(predictor, cost, Limits() if limits is None else limits)
-        A, B, E, C = predictor.A, predictor.B, predictor.E, track.tracked
-        rest = tail_of(tail_stage(A, B, E, C, track.Q, track.R, track.R_delta), None)
-        self.gain, self._v = Gain(rest.K, rest.P), rest.v  # the feedforward of [w; r; u_r]
-        self._K, self._K_rate = np.split(rest.K, [predictor.nz], axis=1)  # the second is of u_{k−1}
+        units, C = Units.of(predictor, track), track.tracked
+        h = units.horizon(horizon_of(predictor, track, (1,), disturbed=False))
+        rest = tail_of(tail_stage(h.A, h.B, h.E, h.C, h.Q, h.R, h.R_delta), None)
+        self.gain = Gain(units.gain(rest.K), units.value(rest.P))
+        told = np.concatenate([np.ones(predictor.nw), units.tracked, units.inputs])
+        self._v = units.inputs[:, None] * rest.v / told  # the feedforward of [w; r; u_r]
+        self._K, self._K_rate = np.split(self.gain.K, [predictor.nz], axis=1)  # the second is of u_{k−1}
         self._targets, self._inputs, self._nr = targets_of(predictor, cost, track), track.inputs, len(C)
         self._given_rows = track.given
         self._rates = track.rates

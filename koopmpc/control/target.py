@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import null_space
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, LiftedTracking
+from koopmpc.control.cost import Cost, LiftedTracking, observable_sizes
 from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolver
@@ -105,7 +106,19 @@ def targets_of(predictor: LinearPredictor, cost: Cost, tracking: LiftedTracking)
     """Return the equilibria of a predictor under a cost and limits."""
     track, hold = tracking, isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
     A, B, constant = predictor.A, predictor.B, predictor.lifting.constant_index
-    return targets(A, B, track.tracked, track.Q_root, track.inputs, track.limited, track.outputs, constant, hold=hold)
+    return targets(
+        A,
+        B,
+        track.tracked,
+        track.Q_root,
+        track.inputs,
+        track.limited,
+        track.outputs,
+        constant,
+        hold=hold,
+        R_root=track.R_root,
+        sizes=np.concatenate([observable_sizes(predictor, track.sizes), track.sizes.inputs]),
+    )
 
 
 def targets(
@@ -119,8 +132,13 @@ def targets(
     constant: int | None,
     *,
     hold: bool,
+    R_root: Float[np.ndarray, "nu nu"] | None = None,
+    sizes: Float[np.ndarray, " n"] | None = None,
 ) -> Targets:
     """Return the equilibria of z⁺ = A z + B u for tracked outputs C z and limits on u and G z.
+
+    Ranks are decided by the sizes of states and inputs, so that their units mean nothing. Of all equilibria that are as
+    near to a reference, that of the least ‖u‖_R is taken.
 
     Parameters
     ----------
@@ -130,24 +148,37 @@ def targets(
         Index of the Constant observable, pinned to 1.
     hold
         False: u_r is not that of the equilibrium, but zero or given.
+    R_root
+        S with SᵀS = R, by default the identity.
+    sizes
+        Of z and u, by default 1.
     """
-    nz, nu = B.shape
-    E = np.hstack([A - np.eye(nz), B])
-    push = np.eye(nz)
+    nz, nu = len(A), B.shape[1]
+    measure = checks.array(1.0 if sizes is None else sizes, "sizes") * np.ones(nz + nu)
+    size = measure[:nz]
+    E, push = np.hstack([A - np.eye(nz), B]) * measure / size[:, None], np.diag(1 / size)
     if constant is not None:  # 1 = 1, whatever a fit has made of it
         E, push = np.delete(E, constant, axis=0), np.delete(push, constant, axis=0)
     free = np.array([i for i in range(nz + nu) if i != constant])
-    pinned = np.zeros(nz) if constant is None else -E[:, constant]
+    pinned = np.zeros(nz) if constant is None else -E[:, constant] / size[constant]
     left, sigma, right = np.linalg.svd(E[:, free])
     rank = int((sigma > TOLERANCE * max(float(sigma[0]), 1e-300)).sum())
     inverse = right[:rank].T @ (left[:, :rank].T / sigma[:rank, None])
     base, span, pushed = np.zeros(nz + nu), np.zeros((nz + nu, len(free) - rank)), np.zeros((nz + nu, nz))
     base[free], span[free], pushed[free] = inverse @ pinned, right[rank:].T, -inverse @ push
+    base, span, pushed = measure * base, measure[:, None] * span, measure[:, None] * pushed
     if constant is not None:
         base[constant] = 1.0
     z0, u0, Z, W = base[:nz], base[nz:], span[:nz], span[nz:]
     weighted = Q_root @ C @ Z
     back = np.linalg.pinv(weighted, rcond=TOLERANCE) @ Q_root
+    price = np.eye(nu) if R_root is None else R_root / max(float(np.linalg.norm(R_root * measure[nz:])), 1e-300)
+    free_of_cost = null_space(weighted, rcond=TOLERANCE) if len(weighted) else np.eye(weighted.shape[1])
+    cheaper = -free_of_cost @ np.linalg.pinv(price @ W @ free_of_cost, rcond=TOLERANCE) @ price
+    offset, from_disturbance = -back @ C @ z0, -back @ C @ pushed[:nz]
+    offset = offset + cheaper @ (u0 + W @ offset)
+    from_disturbance = from_disturbance + cheaper @ (pushed[nz:] + W @ from_disturbance)
+    back = back + cheaper @ W @ back
     rows, values = np.vstack([W, G @ Z]), np.concatenate([u0, G @ z0])
     rows_disturbance = np.vstack([pushed[nz:], G @ pushed[:nz]])
     low, high = (np.concatenate([inputs[i], outputs[i]]) - values for i in (0, 1))
@@ -159,7 +190,7 @@ def targets(
         z_disturbance=pushed[:nz],
         u_disturbance=pushed[nz:] * float(hold),
         from_reference=back,
-        offset=-back @ C @ z0,
+        offset=offset,
         rows=rows,
         rows_disturbance=rows_disturbance,
         low=low,
@@ -167,7 +198,7 @@ def targets(
         size=magnitude(Interval(low, high)),
         hard=nu,
         weighted=weighted,
-        from_disturbance=-back @ C @ pushed[:nz],
+        from_disturbance=from_disturbance,
     )
 
 

@@ -90,7 +90,9 @@ def tail_of(stage: Stage, steps: int | None) -> Tail:
     return Tail(P, p, K, -solved(L, B.T @ (p + P @ e) + r))
 
 
-def learned_steps(stage: Stage, predictor: LinearPredictor, N: int) -> int:
+def learned_steps(
+    stage: Stage, predictor: LinearPredictor, N: int, inverse: Float[np.ndarray, "nz nz"] | None = None
+) -> int:
     """Return the steps of the default tail of a learned model: until the gain rests as far as the model is accurate.
 
     Every further step of the tail changes the gain K. Once the change is a smaller share of K than what the model
@@ -99,7 +101,7 @@ def learned_steps(stage: Stage, predictor: LinearPredictor, N: int) -> int:
     their mean: that of the change is ‖Lᵀ(K⁺ − K)(z − z̄)‖ over ‖LᵀK⁺(z − z̄)‖, S = L Lᵀ, so that inputs count by what
     they cost. The gain rests when the change is so small for as many steps as the model's point has entries, for a
     weight may take that long to reach an input. The tail has N steps where this takes more than 10 N, and where the
-    model does not know its errors.
+    model does not know its errors. `inverse` takes z into the coordinates of the stage, where these are others.
     """
     report, scale = predictor.report, predictor.scale
     if report is None or scale is None:
@@ -111,6 +113,8 @@ def learned_steps(stage: Stage, predictor: LinearPredictor, N: int) -> int:
     sizes: Float[np.ndarray, " nx"] = np.linalg.norm(spread @ predictor.C.T, axis=0)
     missed: Float[np.ndarray, " n"] = report.residual[sizes > 0] / sizes[sizes > 0]
     enough = max(float(np.sqrt(np.mean(missed**2))) if missed.size else 0.0, SETTLED)
+    if inverse is not None:
+        spread = spread @ inverse.T
     A, B, P, M, R = stage.A, stage.B, _last(stage), stage.M, stage.R
     (nz, _), needed, rested = scale.shape, len(predictor.lifting.bound or ()), 0
     K = np.zeros((B.shape[1], len(A)))

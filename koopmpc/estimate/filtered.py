@@ -120,5 +120,7 @@ class Kalman:
         if key not in self._gains:
             M, R = system.M[came], self._R[np.ix_(came, came)]
             PM = self._P @ M.T
-            self._gains[key] = np.asarray(scipy.linalg.solve(M @ PM + R, PM.T, assume_a="pos")).T
+            S = M @ PM + R
+            size = np.sqrt(S.diagonal())[:, None]  # units of the outputs are no ill condition
+            self._gains[key] = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos") / size).T
         return s + self._gains[key] @ (y[came] - system.M[came] @ s - system.h[came])

@@ -38,8 +38,8 @@ class Telling:
         return bool(np.isfinite(y).all())
 
 
-def equilibrium(A, B, C, Q, r, constant=None):
-    """(z_r, u_r) by a null space and least squares; the index `constant` is pinned to 1."""
+def equilibrium(A, B, C, Q, r, constant=None, R=None):
+    """(z_r, u_r) by null spaces and least squares; the index `constant` is pinned to 1; of several the least ‖u‖_R."""
     nz = len(A)
     E = np.hstack([A - np.eye(nz), B])
     keep = [i for i in range(nz) if i != constant]
@@ -56,6 +56,10 @@ def equilibrium(A, B, C, Q, r, constant=None):
     S = scipy.linalg.sqrtm(Q).real
     alpha = np.linalg.lstsq(S @ C @ span[:nz], S @ (r - C @ base[:nz]), rcond=None)[0]
     v = base + span @ alpha
+    more = span @ scipy.linalg.null_space(S @ C @ span[:nz], rcond=1e-9)
+    if R is not None and more.shape[1]:
+        T = scipy.linalg.sqrtm(R).real
+        v = v - more @ np.linalg.lstsq(T @ more[nz:], T @ v[nz:], rcond=1e-9)[0]
     return v[:nz], v[nz:]
 
 

@@ -40,7 +40,7 @@ def test_the_plan_is_the_least_squares_solution(seed, nx, nu, N, constant, termi
     move = mpc(x, rows)
     assert move.status is km.Status.UNCONSTRAINED
     pinned = nx if constant else None
-    targets = [equilibrium(model.A, model.B, model.C, np.diag(cost.Q), row, pinned) for row in rows]
+    targets = [equilibrium(model.A, model.B, model.C, np.diag(cost.Q), row, pinned, np.diag(cost.R)) for row in rows]
     if target == "zero":
         targets = [(z, np.zeros(nu)) for z, _ in targets]
     U = dense_plan(model, cost, model.lift(x), rows, targets)

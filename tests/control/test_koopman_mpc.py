@@ -37,7 +37,7 @@ def test_loose_limits_give_the_feedback_law(seed, nx, nu, constant):
     Q, R = model.C.T @ np.diag(cost.Q) @ model.C, np.diag(cost.R)
     K = stationary(model.A, model.B, Q, R, 10_000).K
     r, x = rng.normal(size=nx), rng.normal(size=nx)
-    z_r, u_r = equilibrium(model.A, model.B, model.C, np.diag(cost.Q), r, nx if constant else None)
+    z_r, u_r = equilibrium(model.A, model.B, model.C, np.diag(cost.Q), r, nx if constant else None, R)
     mpc = km.KoopmanMPC(model, cost, km.Limits(-1e9, 1e9, -1e9, 1e9), horizon=40)
     move = mpc(x, z_r[:nx])  # where the reference is an equilibrium, the stages and the end agree on it
     assert move.status is km.Status.UNCONSTRAINED

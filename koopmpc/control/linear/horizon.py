@@ -192,8 +192,14 @@ class Terminal(NamedTuple):
     given: Float[np.ndarray, "nx nu"]
 
 
-def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, targets: Targets) -> Terminal:
-    """Return the terminal cost that `cost` asks for.
+def terminal_of(
+    predictor: LinearPredictor,
+    cost: Cost,
+    horizon: Horizon,
+    targets: Targets,
+    inverse: Float[np.ndarray, "nz nz"] | None = None,
+) -> Terminal:
+    """Return the terminal cost that `cost` asks for; `inverse` takes z into the coordinates of the horizon.
 
     The default tail of a model with a fit report or a scale is no longer than the model is accurate, see
     `learned_steps`; that of a given model goes on until it rests.
@@ -210,7 +216,7 @@ def terminal_of(predictor: LinearPredictor, cost: Cost, horizon: Horizon, target
     D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
     stage, steps = tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), cost.tail
     if steps is None and not (predictor.report is None and predictor.scale is None):
-        steps = learned_steps(stage, predictor, h.N)
+        steps = learned_steps(stage, predictor, h.N, inverse)
     tail = tail_of(stage, steps)
     n, nr = len(tail.P), len(h.C)
     P, p_g = np.zeros((size, size)), np.zeros((size, tail.p.shape[1]))

@@ -12,6 +12,7 @@ from koopmpc.control.linear.horizon import Horizon, horizon_of, stages, terminal
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.qp import StepQP
 from koopmpc.control.target import ROUNDING, Targets, targets_of
+from koopmpc.control.units import Units
 from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -105,10 +106,11 @@ def plan_map(
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
     targets = targets_of(predictor, track.cost, track)
     horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
-    steps = stages(horizon, targets)
-    end = terminal_of(predictor, track.cost, horizon, targets)
-    law = recursion(steps, end.P, end.p)
-    maps = condense(horizon, law, end, targets, coordinates)
+    units = Units.of(predictor, track)
+    own, aims = units.horizon(horizon), units.targets(targets)
+    end = terminal_of(predictor, units.cost(track.cost), own, aims, units.inverse)
+    law = recursion(stages(own, aims), end.P, end.p)
+    maps = units.maps(condense(own, law, end, aims, coordinates), horizon)
     return PlanMap(track, targets, horizon, scaled(maps, track.inputs, len(blocks)))
 
 
