@@ -122,5 +122,6 @@ class Kalman:
             PM = self._P @ M.T
             S = M @ PM + R
             size = np.sqrt(S.diagonal())[:, None]  # units of the outputs are no ill condition
-            self._gains[key] = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos") / size).T
+            scaled = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos"))
+            self._gains[key] = (scaled / size).T
         return s + self._gains[key] @ (y[came] - system.M[came] @ s - system.h[came])
