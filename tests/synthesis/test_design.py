@@ -1,5 +1,6 @@
 """design: what it chooses, what it says of what is asked, and that time and workers do not count."""
 
+import importlib
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -15,6 +16,7 @@ from koopmpc.synthesis.judging import LOST, Outcome, ratios, scores
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
+room = importlib.import_module("koopmpc.synthesis.design")  # the module; the room has a function of this name
 COST = km.Cost(Q=[1.0, 0.1], R=0.1)
 LIMITS = km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, -0.5], x_max=[np.inf, 0.5])
 
@@ -237,3 +239,37 @@ def test_limits_are_tightened_by_the_models_errors_unless_told():
 def test_a_margin_that_is_capped_is_advice():
     found = designed(noisy(data(), 0.3))
     assert any("20 % of the range, though the errors ask for up to" in sentence for sentence in found.advice)
+
+
+def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(monkeypatch):
+    confirmed, seen = room.confirmed, []
+
+    def first_fails(test, controller, outcome):
+        seen.append(controller)
+        return len(seen) > 1 and confirmed(test, controller, outcome)
+
+    monkeypatch.setattr(room, "confirmed", first_fails)
+    found = designed(data())
+    assert found.controller is not seen[0]
+    assert any(note.startswith("passed over: ") for note in found.notes)
+    assert found.best == found.leaderboard[found.chosen]
+
+
+def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
+    test, jobs = [], []
+    judged = room.judged
+
+    def kept(one, job):
+        test.append(one)
+        jobs.append(job)
+        return judged(one, job)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(room, "judged", kept)
+        found = designed(data())
+    last = next(job for job in jobs if job.recipe == found.best.recipe and len(job.conditions) == 12)
+    outcome = judged(test[-1], last)
+    assert room.confirmed(test[-1], found.controller, outcome)
+    model = found.controller.predictor
+    wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)
+    assert not room.confirmed(test[-1], wrong, outcome)
