@@ -1,0 +1,79 @@
+"""Input that cannot be meant so is refused with a sentence; input that is merely unusual is answered."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+MODEL = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "v"), ("u",))
+COST = km.Cost(1, 0.1)
+CONTROLLERS = (km.KoopmanMPC, km.BilinearMPC, km.NonlinearMPC)
+
+
+def loop(rows):
+    """Run ten steps under a u_target of these rows."""
+    cost = km.Cost(1, 1, u_target=rows)
+    mpc = km.KoopmanMPC(MODEL, cost, None, 5)
+    return km.simulate(MODEL.step_map(), mpc, x0=[0, 0], reference=[0, 0], steps=10, cost=cost)
+
+
+REFUSED = {
+    "a negative tail": (lambda: km.Cost(1, 1, tail=-1), r"tail is -1; it must be at least 0"),
+    "a tail of NaN": (lambda: km.Cost(1, 1, tail=float("nan")), r"tail is nan; pass a whole number"),
+    "Q_N and a tail": (
+        lambda: km.Cost(1, 1, Q_N=1.0, tail=3),
+        r"Q_N and tail = 3 are given; Q_N takes the tail's place: pass one of them",
+    ),
+    "too few rows of u_target": (
+        lambda: loop(np.zeros((3, 1))),
+        r"u_target has 3 rows, the run 10 steps; pass one row, or one a step",
+    ),
+    "rows of u_target for two inputs": (
+        lambda: loop(np.zeros((3, 2))),
+        r"u_target has shape \(3, 2\), expected \(1,\) or rows \(k, 1\), one value an input",
+    ),
+    "an estimator that cannot see p": (
+        lambda: km.KoopmanMPC(MODEL, COST, None, 5, estimator=km.LiftedKalman("v")),
+        r"not detectable from v: with λ = 1, 'p' can move without a trace in y; measure one of them, drop it from",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_it_is_refused_with_what_was_got_and_what_to_do(what):
+    make, sentence = REFUSED[what]
+    with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=sentence):
+        make()
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_a_u_target_outside_the_limits_is_refused_by_every_controller(kind):
+    sentence = r"u_target is 2 for input 0 in row 0, outside its limits -1 … 1; pass inputs that the limits allow"
+    with pytest.raises(km.errors.DataError, match=sentence):
+        kind(MODEL, km.Cost(1, 1, u_target=[2.0]), km.Limits(-1, 1), 5)
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_limits_without_width_or_with_one_end_are_limits(kind):
+    assert kind(MODEL, COST, km.Limits(0.5, 0.5), 5)([0.2, 0], [0, 0]).u == pytest.approx(0.5)
+    soft = kind(MODEL, COST, km.Limits(-1, 1, x_min=[-np.inf, 0], x_max=[np.inf, 0]), 5)([0, 0.05], [1, 0])
+    assert soft.status is km.Status.OPTIMAL
+    assert soft.u == pytest.approx(-0.5, abs=1e-3)  # v is at its only value after one step
+    upper = kind(MODEL, COST, km.Limits(x_max=[np.inf, 0.1]), 5)([0, 0], [50, 0])
+    assert upper.u == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_state_that_never_moved_in_the_data_may_have_a_limit():
+    """Neither its range nor a cost says how large it is; its slack then counts by |limit|."""
+    rng = np.random.default_rng(0)
+    episodes = []
+    for _ in range(5):
+        U, X = rng.uniform(-1, 1, (40, 1)), np.ones((41, 2))
+        for k in range(40):
+            X[k + 1, 1] = 0.9 * X[k, 1] + U[k, 0]
+        episodes.append(km.Episode(X=X, U=U))
+    model = km.edmd(km.Episodes(episodes, 0.1, ["p", "v"], ["u"]), km.State())
+    mpc = km.KoopmanMPC(model, km.Cost([0, 1], 0.1), km.Limits(-1, 1, x_max=[2, 1]), 5)
+    assert mpc([1, 0.5], [1, 0]).status is km.Status.UNCONSTRAINED
+    assert mpc([3, 0.5], [1, 0]).status is km.Status.SOFTENED
