@@ -16,7 +16,7 @@ from koopmpc.figures.plane import Axes, Plane, plane_through
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.format.writer import file_recording, times
-from koopmpc.recording.views.blueprint import color, framed
+from koopmpc.recording.views.blueprint import color, framed, shared_time
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
 from koopmpc.scene import Color
 from koopmpc.validate.bands import Forecast, forecast
@@ -217,8 +217,9 @@ def _blueprint(
 
     def plot(origin: str, name: str, *, legend: bool) -> Any:
         corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
-        return rrb.TimeSeriesView(origin=origin, name=drawable(name), plot_legend=corner)
+        return rrb.TimeSeriesView(origin=origin, name=drawable(name), axis_x=shared_time(length), plot_legend=corner)
 
+    length = max((len(one.truth) for one in ahead), default=1) * predictor.dt
     states = list(enumerate(predictor.states))[:_SHOWN]
     tabs = []
     for r in range(len(ahead)):

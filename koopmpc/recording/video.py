@@ -70,7 +70,7 @@ def export_video(
     about, _ = about_of(columns, Path(log))
     layers = sorted(_layers(columns), key=lambda layer: layer.order)
     if not layers:
-        raise LogError(f"{log} has no scene to draw; give the Dynamics a method scene(x, u), see docs/problems.md")
+        raise LogError(f"{log} has no scene to draw; give the Dynamics a method scene(x, u), or the plant a scene=")
     bodies = [s for one in layers if one.body for row in one.strokes for s in row]
     last = max(len(columns.vectors("/state")) - 1, 1) * about.dt
     end = last if until is None else min(checks.positive(until, "until", "s"), last)

@@ -240,7 +240,13 @@ class Writer:
         self._shown = self._extent.ranges()
         extent = self._extent if self._scene is not None else None
         return blueprint(
-            self._about, self._nr, extent=extent, model=self._model, horizon=self._horizon, spans=self._spans
+            self._about,
+            self._nr,
+            extent=extent,
+            model=self._model,
+            horizon=self._horizon,
+            spans=self._spans,
+            length=None if self._steps is None else self._steps * self._about.dt,
         )
 
     def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray) -> None:

@@ -34,6 +34,7 @@ _MEASURED: Color = (120, 126, 138)
 _STEP_TIME = "Time of a step, 10^y s: -6 is 1 µs, -3 is 1 ms"
 _FASTEST = -6.2
 _TICKS = 5.0, 8.0  # as many as have numbers, in a low plot and in a high one
+_LINKED = 50.0  # length of a run whose plots are moved together [s]
 _ENDLESS = 1e100  # a span that no axis shows
 _CROWDED = 3  # plots of states from which on their titles are left out
 _AHEAD = 16  # at most so many stages of a plan are drawn into the plots
@@ -186,11 +187,13 @@ def blueprint(
     model: Predictor | None,
     horizon: int,
     spans: Mapping[str, Sequence[float]],
+    length: float | None,
 ) -> Any:
     """Return the layout of one run with `nr` references; there is no view without data.
 
     `extent` is what the animation shows, None where there is no scene; `horizon` the length of the plans, 0 if none;
-    `spans` the values, by the entity of a `Panel`, that its axis has to hold, as far as they are known.
+    `spans` the values, by the entity of a `Panel`, that its axis has to hold, as far as they are known; `length` the
+    length of the run [s], None of a running one.
     """
     import rerun.blueprint as rrb
 
@@ -199,7 +202,7 @@ def blueprint(
             titlebar=titled,
             contents=[f"/{entity}/**", *contents],
             name=drawable(name),
-            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+            axis_x=shared_time(length),
             axis_y=axis_y,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
             overrides=cast("Any", _now(entity, horizon, about.dt)),
@@ -241,6 +244,20 @@ def framed(views: Any) -> Any:
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
     )
+
+
+def shared_time(length: float | None) -> Any:
+    """Return a time axis that is moved with those of all other plots; for a long run the whole of it, not moved along.
+
+    Of axes that move together, and of a running loop, the viewer shows a minute about the cursor.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    if length is None or length <= _LINKED:
+        return rrb.TimeAxis(link="LinkToGlobal")
+    begin, end = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (0.0, length))
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=begin, end=end))
 
 
 def _now(entity: str, horizon: int, dt: float) -> dict[str, Any]:

@@ -13,7 +13,16 @@ from koopmpc.loop.run import About, Run
 from koopmpc.recording.description import drawable, table_figures, title_of
 from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.format.writer import file_recording, times
-from koopmpc.recording.views.blueprint import LIMIT, REFERENCE, color, framed, input_limits, readable, state_limits
+from koopmpc.recording.views.blueprint import (
+    LIMIT,
+    REFERENCE,
+    color,
+    framed,
+    input_limits,
+    readable,
+    shared_time,
+    state_limits,
+)
 from koopmpc.validate.text import markdown_table
 
 _MOST = 8  # plots of states and inputs in one column
@@ -53,8 +62,11 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     plots += [(f"input/{j}", name, _curves(runs, name, "inputs", "U")) for j, name in enumerate(inputs)]
     plots = plots[:_MOST]
     plots += [("cost", "Cost so far", costs)] if any(values is not None for values in costs) else []
+    longest = max(run.steps * run.dt for run in runs)
     layout = rrb.Horizontal(
-        rrb.Vertical(*(_view(entity, title, curves, i == 0) for i, (entity, title, curves) in enumerate(plots))),
+        rrb.Vertical(
+            *(_view(entity, title, curves, i == 0, longest) for i, (entity, title, curves) in enumerate(plots))
+        ),
         rrb.TextDocumentView(origin="metrics", name="Metrics"),
         column_shares=[2.0, 1.0],
     )
@@ -140,14 +152,14 @@ def _line(
         rec.send_columns(entity, times(k, dt), rr.Scalars.columns(scalars=values[k]))
 
 
-def _view(entity: str, title: str, curves: Sequence[np.ndarray | None], first: bool) -> Any:
+def _view(entity: str, title: str, curves: Sequence[np.ndarray | None], first: bool, length: float) -> Any:
     import rerun.blueprint as rrb
 
     values = np.concatenate([c[np.isfinite(c)] for c in curves if c is not None])
     return rrb.TimeSeriesView(
         origin=entity,
         name=drawable(title),
-        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_x=shared_time(length),
         axis_y=readable(values.tolist(), 8.0),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=first),
     )
