@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.bench.problem import Problem as Problem
     from koopmpc.bench.problem import Training as Training
     from koopmpc.bench.sweep import sweep as sweep
+    from koopmpc.control.adaptive import Adaptive as Adaptive
+    from koopmpc.control.adaptive import Guarded as Guarded
     from koopmpc.control.cost import Cost as Cost
     from koopmpc.control.limits import Limits as Limits
     from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
@@ -36,6 +38,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.control.lqr import LQR as LQR
     from koopmpc.control.lqr import dlqr as dlqr
     from koopmpc.control.lqr import lqr as lqr
+    from koopmpc.control.monitor import Monitor as Monitor
     from koopmpc.control.move import Move as Move
     from koopmpc.control.move import Status as Status
     from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC as BilinearMPC

@@ -114,6 +114,7 @@ _FIGURES: dict[str, type] = {
     "solve_time_p99": float,
     "solve_time_max": float,
     "late": int,
+    "unknown": int,
 }
 
 

@@ -14,6 +14,7 @@ from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import admitted
+from koopmpc.control.monitor import Monitor, Watch
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.saved import Kind, SavedController
 from koopmpc.control.turns import token
@@ -188,6 +189,8 @@ class MPCBase:
         Wall-clock time of a step [s].
     with_rates
         Whether the last input counts.
+    monitor
+        Says of each step whether the model knows; None where nobody asks.
     """
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
@@ -206,6 +209,7 @@ class MPCBase:
         *,
         with_rates: bool,
         move_of: Int[np.ndarray, " N"],
+        monitor: Monitor | None = None,
     ) -> None:
         self.cost, self.limits = tracking.cost, tracking.limits
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
@@ -220,7 +224,13 @@ class MPCBase:
             model, observer, self._N, self._latency, with_rates=with_rates, estimated=estimator is not None
         )
         self._token, self._inside = token(), 0
+        self._watch = None if monitor is None else Watch(monitor, model, self._latency)
         MPCBase.reset(self)
+
+    @property
+    def watch(self) -> Watch | None:
+        """What is known of the last step; None without a monitor."""
+        return self._watch
 
     def as_data(self) -> SavedController:
         """Return what the controller was made of.
@@ -248,6 +258,7 @@ class MPCBase:
             self._blocks,
             self._time_limit,
             options,
+            None if self._watch is None else self._watch.monitor,
         )
 
     def _made_of(self) -> tuple[Kind, LinearPredictor | BilinearPredictor | StepMap, dict[str, Any]]:
@@ -289,11 +300,19 @@ class MPCBase:
         self._age, self._planned = 0, False
         self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
         self._initial.reset(x0, self._given)
+        if self._watch is not None:
+            self._watch.reset()
 
     def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
         """Keep a good plan (by reference, for speed): its first entries are the moves."""
         self._kept, self._age, self._planned = plan, 0, True
         self._given = plan[: self.nu]
+
+    def _watched(self, watch: Watch, move: Move, applied: ArrayLike | None, start: float) -> Move:
+        """Return the step that says whether its model knows."""
+        move.known = watch.look(self._initial, move.u, applied)
+        move.solve_time = perf_counter() - start
+        return move
 
     def _move(
         self,

@@ -39,6 +39,7 @@ class Fallback(Enum):
     SHIFTED_PLAN = 1  # the last good plan, moved on by one step
     CLIPPED_LQR = 2  # the unconstrained optimum, clipped to the input limits
     HOLD = 3  # the last input again
+    OTHER_CONTROLLER = 4  # the move of the controller that stands by where the model does not know
 
 
 @dataclass(slots=True)
@@ -59,6 +60,9 @@ class Move:
         How far the plan breaks the soft limit, or the rate, that gives way most, in its own unit; 0 but for SOFTENED.
     solver
         Whose answer it is where several may solve a step: "osqp" or "daqp", the last asked where none had one.
+    known
+        Whether state and input lie where the data of the model were, and what came is what it predicted; None where
+        the controller has no monitor.
     """
 
     u: Float[np.ndarray, " nu"]
@@ -68,6 +72,7 @@ class Move:
     iterations: int
     slack: float = 0.0
     solver: str = ""
+    known: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)

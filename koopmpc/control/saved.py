@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
+from koopmpc.control.monitor import Monitor
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
@@ -26,6 +27,8 @@ class SavedController(Value):
         Its arguments; `moves` are the lengths of the blocks of held inputs.
     options
         The arguments that only this class has.
+    monitor
+        What it knows, where it watches.
     """
 
     name: Kind
@@ -38,3 +41,4 @@ class SavedController(Value):
     moves: tuple[int, ...]
     time_limit: float | None
     options: Mapping[str, Any]
+    monitor: Monitor | None = None

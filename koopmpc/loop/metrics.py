@@ -50,7 +50,9 @@ class Metrics(Value):
     fallback
         Number of steps whose input each fallback gave, by its name: NONE (the controller's own answer),
         SHIFTED_PLAN (the last plan, moved on by one step), CLIPPED_LQR (the unconstrained optimum, clipped), HOLD
-        (the last input again).
+        (the last input again), OTHER_CONTROLLER (that which stands by).
+    unknown
+        Number of steps that the controller's monitor did not know; None where it has none.
     """
 
     cost: float
@@ -66,6 +68,7 @@ class Metrics(Value):
     late: int
     status: Mapping[str, int]
     fallback: Mapping[str, int]
+    unknown: int | None = None
 
     def __str__(self) -> str:
         """Return a line a figure."""
@@ -87,6 +90,7 @@ class Metrics(Value):
             "steps later than dt": str(self.late),
             "status": _counts(self.status),
             "fallback": _counts(self.fallback),
+            **({} if self.unknown is None else {"unknown steps": str(self.unknown)}),
         }
 
 
@@ -149,6 +153,7 @@ def metrics(run: Run) -> Metrics:
         late=int((run.solve_time > run.dt).sum()),
         status=dict(Counter(s.name for s in run.status)),
         fallback=dict(Counter(f.name for f in run.fallback)),
+        unknown=int((run.known == 0).sum()) if (run.known >= 0).any() else None,
     )
 
 

@@ -61,6 +61,8 @@ class StepRows(Value):
         (m,) how far the plan of each step breaks the soft limit that gives way most, in its own unit; zeros by default.
     u_reference
         (m, nu) inputs that hold the reference: the cost charges an input's distance from them; zeros by default.
+    known
+        (m,) 1 where the controller's monitor knew the step, 0 where it did not, −1 where nobody looked, by default.
     """
 
     X: Float[np.ndarray, "n nx"]
@@ -73,12 +75,15 @@ class StepRows(Value):
     iterations: Int[np.ndarray, " m"]
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
     slack: Float[np.ndarray, " ms"] = field(default_factory=lambda: np.empty(0))
+    known: Int[np.ndarray, " mk"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         if not self.u_reference.size:
             object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
         if not self.slack.size:
             object.__setattr__(self, "slack", np.zeros(len(self.U)))
+        if not self.known.size:
+            object.__setattr__(self, "known", np.full(len(self.U), -1, dtype=np.int64))
 
     @staticmethod
     def of(steps: Sequence[Step], nx: int, *, end: bool) -> "StepRows":
@@ -106,6 +111,7 @@ class StepRows(Value):
             iterations=np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
             u_reference=np.array(held, dtype=np.float64),
             slack=np.array([0.0 if m is None else m.slack for m in moves]),
+            known=np.array([_looked(m) for m in moves], dtype=np.int64),
         )
 
     @staticmethod
@@ -126,6 +132,12 @@ class StepRows(Value):
     def part(self, first: int, last: int) -> "StepRows":
         """Return rows first … last − 1; the state after the last move is among them where `last` is beyond it."""
         return StepRows(**{name: values[first:last] for name, values in self.columns().items()})
+
+
+def _looked(move: Move | None) -> int:
+    """Return 1 or 0 as the move is known or not, −1 where nobody looked; a Move of one's own need not say."""
+    known = getattr(move, "known", None)
+    return -1 if known is None else int(known)
 
 
 _OF_STATES = ("X", "Y", "reference")  # the columns with a row for each state; the others have one for each move
@@ -198,8 +210,8 @@ class Run(About, StepRows):
         (T+1, nx) true states, (T+1, ny) measurements, (T+1, nr) references.
     U, u_reference
         (T, nu) inputs as applied, and the inputs that hold the reference.
-    status, fallback, solve_time, iterations, slack
-        T entries each: how each step ended, how long it took [s], and what its solver did.
+    status, fallback, solve_time, iterations, slack, known
+        T entries each: how each step ended, how long it took [s], what its solver did, and whether its model knew.
     plans
         The plan of each step, where asked for.
     cost, limits, dt, states, inputs, outputs, angles, metadata

@@ -45,6 +45,7 @@ def made(saved: SavedController | SavedDesign, path: str | Path) -> AnyMPC:
             latency=one.latency,
             moves=one.moves,
             time_limit=one.time_limit,
+            monitor=one.monitor,
             **one.options,
         )
     except (KoopmpcError, TypeError) as error:

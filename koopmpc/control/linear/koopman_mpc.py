@@ -15,12 +15,14 @@ from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan import plan_map
+from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows
 from koopmpc.control.turns import alone, busy
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
@@ -67,6 +69,8 @@ class KoopmanMPC(MPCBase):
     time_limit
         Wall-clock time that a step may take [s]. A QP that is not solved in this time is given up, and the fallback
         acts. A solution that was found, but late, is used. In both cases the status is TIME_LIMIT.
+    monitor
+        The data that the model was fitted to, or a `Monitor` of them: then each Move says whether it is `known`.
 
     Raises
     ------
@@ -98,6 +102,7 @@ class KoopmanMPC(MPCBase):
         solver: SolverName = "osqp",
         settings: Mapping[str, Any] | None = None,
         time_limit: float | None = None,
+        monitor: Monitor | Episodes | None = None,
     ) -> None:
         if solver not in SOLVERS:
             raise DataError(f"solver is {solver!r}; there are {', '.join(map(repr, SOLVERS))}")
@@ -116,6 +121,7 @@ class KoopmanMPC(MPCBase):
             time_limit,
             with_rates=track.with_rates,
             move_of=np.repeat(np.arange(len(blocks)), blocks),
+            monitor=monitor_of(monitor, predictor),
         )
         self.predictor, self._disturbed = predictor, estimator is not None
         self._options = {"solver": solver, "settings": dict(settings or {})}
@@ -184,6 +190,8 @@ class KoopmanMPC(MPCBase):
         self._qps.update(self._map.qp)
         self._reference_key = None
         self._initial.update(predictor)
+        if self._watch is not None:
+            self._watch.update(predictor)
 
     def __call__(
         self,
@@ -225,9 +233,10 @@ class KoopmanMPC(MPCBase):
             self._map.matrix.dot(origin.known, t)
             np.greater_equal(t, self._map.low, out=self._met_low)
             np.less_equal(t, self._map.high, out=self._met_high)
-            if 0 not in self._met:  # every limit is met, and nothing is NaN
-                return self._unconstrained(t, start)
-            return self._limited(t, applied, start)
+            # where 0 is not among them, every limit is met, and nothing is NaN
+            move = self._limited(t, applied, start) if 0 in self._met else self._unconstrained(t, start)
+            watch = self._watch
+            return move if watch is None else self._watched(watch, move, applied, start)
         finally:
             self._token.append(held)
 

@@ -11,11 +11,13 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
+from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import heard
 from koopmpc.lifting.base import HUGE
@@ -82,6 +84,8 @@ class BilinearMPC(StagedMPC):
         Wall-clock time a step may take [s]. An iteration that has not ended by then is given up for the fallback, and
         its plan is improved in the next step; what is late although it was found is used. Either way the status is
         TIME_LIMIT.
+    monitor
+        As for KoopmanMPC, where the model is learned.
 
     Raises
     ------
@@ -108,8 +112,9 @@ class BilinearMPC(StagedMPC):
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,
+        monitor: Monitor | Episodes | None = None,
     ) -> None:
-        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit)
+        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem)
         self._iteration.theta[:] = self._map.theta
@@ -128,6 +133,7 @@ class BilinearMPC(StagedMPC):
             latency=self._latency,
             moves=self._blocks,
             time_limit=self._time_limit,
+            monitor=None if self._watch is None else self._watch.monitor,
         )
         held = {name: getattr(self, name) for name in _COPIED}
         iteration = self._iteration

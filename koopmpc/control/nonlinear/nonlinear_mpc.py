@@ -10,11 +10,13 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver, Shooting, Start
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import heard
@@ -55,6 +57,8 @@ class NonlinearMPC(StagedMPC):
     time_limit
         Wall-clock time a step may take [s]. Ipopt stops at it, and a fallback stands in; the other solvers know no
         such limit. What is late although it was solved is used. Either way the status is TIME_LIMIT.
+    monitor
+        As for BilinearMPC.
 
     Raises
     ------
@@ -83,8 +87,9 @@ class NonlinearMPC(StagedMPC):
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,
+        monitor: Monitor | Episodes | None = None,
     ) -> None:
-        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit)
+        super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         if solver not in OPTIONS:
             raise DataError(f'solver is {solver!r}; pass "ipopt", "fatrop" or "sqpmethod"')
         self._starts = checks.count(starts, "starts")

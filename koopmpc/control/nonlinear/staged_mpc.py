@@ -13,11 +13,13 @@ from koopmpc import checks
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
+from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.target import reference_rows
 from koopmpc.control.turns import alone
+from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
@@ -66,6 +68,7 @@ class StagedMPC(MPCBase):
         estimator: Estimator | None,
         latency: int,
         time_limit: float | None,
+        monitor: Monitor | Episodes | None,
     ) -> None:
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
@@ -84,6 +87,7 @@ class StagedMPC(MPCBase):
             time_limit,
             with_rates=self._problem.with_rates,
             move_of=np.arange(N),
+            monitor=monitor_of(monitor, model),
         )
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._row = 0  # of a u_target that is given in rows, for the next call
@@ -121,6 +125,8 @@ class StagedMPC(MPCBase):
         self._map = self._map.updated(model)
         self._terminal.update(self._map)
         self._initial.update(self._map)
+        if self._watch is not None:
+            self._watch.update(self._map)
         self._forget_targets()
 
     def _forget_targets(self) -> None:
@@ -142,6 +148,13 @@ class StagedMPC(MPCBase):
     ) -> Move:
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
+        move = self._step(y, reference, applied, w, start)
+        watch = self._watch
+        return move if watch is None else self._watched(watch, move, applied, start)
+
+    def _step(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None, w: ArrayLike | None, start: float
+    ) -> Move:
         initial = self._initial
         initial.take(y, self._given, applied, w)
         x, u_prev = initial.z, self._known_input()

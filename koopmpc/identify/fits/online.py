@@ -132,6 +132,24 @@ class OnlineEDMD:
             online.learn(episode.X[:-1], episode.U, episode.X[1:], episode.W)
         return online
 
+    def check(self, model: LinearPredictor) -> None:
+        """Check that what is learned can take the place of this model.
+
+        Raises
+        ------
+        DataError
+            The model has another lifting, dt, states, inputs or disturbances.
+        """
+        own = {
+            "lifting": (self._lifting, model.lifting),
+            "dt": (self._dt, model.dt),
+            "inputs": (self._inputs, model.inputs),
+            "disturbances": (self._disturbances, model.disturbances),
+        }
+        for name, (learned, given) in own.items():
+            if learned != given:
+                raise DataError(f"OnlineEDMD learns another {name} than the model's; start it with those of the model")
+
     def learn(self, x: ArrayLike, u: ArrayLike, x_next: ArrayLike, w: ArrayLike | None = None) -> None:
         """Learn that u (and w) led from x to x_next: one pair, or rows of pairs, the newest last.
 

@@ -18,6 +18,7 @@ class Entity(StrEnum):
     INPUT_REFERENCE = "control/u_reference"  # the input that holds r_k, in the rows where it is not 0
     INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and the last step of a block
     SLACK = "solver/slack"  # how far the plan breaks a soft limit, in the rows where it does
+    KNOWN = "solver/known"  # 1 where the model knows and 0 where it does not, in the rows where a monitor looked
     SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" and "iterations" hold time and iterations to the bit
     DEADLINE = "solver/deadline_ms"  # dt [ms], at the first and the last step of a block
     STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes

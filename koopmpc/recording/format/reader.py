@@ -73,6 +73,7 @@ def _run(log: LogColumns, path: Path) -> Run:
         plans=_plans(log, steps),
         u_reference=_sparse(log, Entity.INPUT_REFERENCE, steps, len(about.inputs)),
         slack=_sparse(log, Entity.SLACK, steps, 1)[:, 0],
+        known=_sparse(log, Entity.KNOWN, steps, 1, absent=-1.0)[:, 0].astype(np.int64),
         **about.about(),
     )
 
@@ -100,10 +101,10 @@ def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
     return Y
 
 
-def _sparse(log: LogColumns, entity: str, steps: int, width: int) -> np.ndarray:
-    """Return the rows of an entity, zero where no row was written."""
+def _sparse(log: LogColumns, entity: str, steps: int, width: int, absent: float = 0.0) -> np.ndarray:
+    """Return the rows of an entity, `absent` where no row was written."""
     k, values = log.matrix(entity)
-    held, inside = np.zeros((steps, width)), k < steps
+    held, inside = np.full((steps, width), absent), k < steps
     if len(k):
         held[k[inside]] = values[inside]
     return held

@@ -157,6 +157,8 @@ class Writer:
             self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
             gave = np.flatnonzero(rows.slack)
             self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
+            looked = np.flatnonzero(rows.known >= 0)
+            self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
             ends = np.unique(k[[0, m - 1]])
             limits = [value for *_, value in input_limits(self._about)]
             self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))

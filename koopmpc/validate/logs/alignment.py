@@ -5,7 +5,7 @@ counts is the information on all states together, −½ log det of the residuals
 belongs raises it, and it cannot be raised by moving what one sensor knows to another.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ _ROWS = 5_000  # rows that are looked at
 _GAIN = 0.02  # nats a sample that a hypothesis must win
 _SURE = 30.0  # nats in all
 _PREFERRED = 1.15  # of the gain of an input that is late, over that of a sensor: the commoner fault
+_CLEAR = 0.75  # share of the gain of a late sensor that moving another signal may win
 _BLOCKS = 8  # parts of the log of which nearly all must agree
 
 
@@ -108,12 +109,24 @@ def late(log: Log) -> Iterator[LogFault]:
         if won(log, E, 0 * E) < _GAIN:
             return
         scores = {shift: won(log, E, rows(log, (*found, *shift)).residuals(log)) for shift in _shifts(log, found)}
-        best = max(scores, key=lambda shift: scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0))
+        best = max(scores, key=_weighed(scores, nx))
+        rival = max(score for shift, score in scores.items() if shift[0].column != best[0].column)
+        if best[0].column < nx and rival > _CLEAR * scores[best]:
+            return
         other = rows(log, (*found, *best)).residuals(log)
         if not better(log, E, other, _least(log, best[0], E)) or not _alone(log, found, best, other):
             return
         found, E = (*found, *best), other
         yield _said(log, best)
+
+
+def _weighed(scores: dict[tuple[Shift, ...], float], nx: int) -> Callable[[tuple[Shift, ...]], float]:
+    """Return the gain of a shift, that of an input made larger: inputs are late more often than sensors."""
+
+    def weighed(shift: tuple[Shift, ...]) -> float:
+        return scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0)
+
+    return weighed
 
 
 def _least(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"]) -> float:

@@ -1,0 +1,308 @@
+"""Controllers around a controller: Adaptive renews its model, Guarded hands over where the model does not know."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import numbers
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.move import Controller, Fallback, Move, Plan
+from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.identify.fits.online import OnlineEDMD
+from koopmpc.lifting.base import HUGE
+from koopmpc.predict.predictors import LinearPredictor
+
+_BETTER = 0.9  # of the error of the model in use that a new one may have on the memory
+_WORSE = 1.25  # times the error of an earlier model from which on the model in use is given up for it
+_SUFFICES = 1.5  # times the residuals of its own fit up to which the model in use is left alone
+_PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
+_KEPT = 5  # earlier models that can be gone back to
+
+
+class Pair(NamedTuple):
+    """One step as it was: x, what acted, and where it led."""
+
+    x: Float[np.ndarray, " nx"]
+    u: Float[np.ndarray, " nu"]
+    w: Float[np.ndarray, " nw"]
+    x_next: Float[np.ndarray, " nx"]
+
+
+class Adaptive:
+    """A KoopmanMPC whose z⁺ = A z + B u + E w is learned on while it runs.
+
+    Each step is a pair (x, u, x⁺), from which `online` learns unless it is faulty: a number is NaN, the state stands
+    still to the bit, the controller's monitor does not know state and input, or the sample is off by far more than
+    those before it. A sample that is off three times in sequence is no spike but a change of the plant, and counts.
+
+    Where the model in use predicts a short memory of recent pairs worse than the first one did its own data, the fit
+    of all pairs so far, with the forgetting or the window of `online`, is compared with it on these pairs every few
+    steps, and takes its place where it predicts them clearly better. Where an earlier model predicts them clearly
+    better than the one in use, that one comes back.
+
+    Parameters
+    ----------
+    controller
+        What controls; its model is where learning begins, and the first to go back to. Its y is the state.
+    online
+        Learns; of the same lifting. Start it with the data of the controller's model:
+        ``OnlineEDMD.start(data, lifting, forgetting=0.98)``.
+    every
+        Steps from one comparison to the next.
+    memory
+        Recent pairs on which models are compared.
+    outlier
+        Times the usual misfit from which on a sample is off.
+
+    Attributes
+    ----------
+    learned, skipped
+        Number of pairs that were learned from, and that were not.
+    renewed, returned, refused
+        How often a new model came into use, an earlier one came back, and a new one was no better.
+
+    Raises
+    ------
+    DataError
+        The controller's model has an embedding, or another lifting, dt or names than what `online` learns.
+    """
+
+    def __init__(
+        self,
+        controller: KoopmanMPC,
+        online: OnlineEDMD,
+        *,
+        every: int = 5,
+        memory: int = 20,
+        outlier: float = 8.0,
+    ) -> None:
+        checks.kind(controller, "controller", KoopmanMPC, "only its model can be learned by OnlineEDMD")
+        checks.kind(online, "online", OnlineEDMD, "start one: km.OnlineEDMD.start(data, lifting, forgetting=0.98)")
+        model = controller.predictor
+        if model.embedding is not None:
+            raise DataError("the controller's model has an embedding, and OnlineEDMD takes none; fit one without")
+        online.check(model)
+        self.controller, self.online = controller, online
+        self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon
+        self._every, self._outlier = checks.count(every, "every"), checks.positive(outlier, "outlier")
+        self._first = model
+        self._usual = None if model.report is None else model.report.residual
+        self._memory: deque[Pair] = deque(maxlen=checks.count(memory, "memory"))
+        self._clear()
+
+    def _clear(self) -> None:
+        self._memory.clear()
+        self._before: tuple[np.ndarray, np.ndarray, np.ndarray, bool] | None = None
+        self._misfits: deque[float] = deque(maxlen=self._memory.maxlen)
+        self._off = self._steps = 0
+        self.learned = self.skipped = self.renewed = self.returned = self.refused = 0
+        self._good: deque[LinearPredictor] = deque(maxlen=_KEPT)
+
+    @property
+    def predictor(self) -> LinearPredictor:
+        """The model in use."""
+        return self.controller.predictor
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Begin a run with the model that the controller came with; what `online` has learned it keeps."""
+        if self.controller.predictor is not self._first:
+            self.controller.update(self._first)
+        self._clear()
+        self.controller.reset(x0, u_prev)
+
+    def plan(self) -> Plan | None:
+        """Return the plan of the last call; None where it had none."""
+        return self.controller.plan()
+
+    def __call__(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+    ) -> Move:
+        """Learn from the step that led to y, and return the controller's move; arguments as for KoopmanMPC."""
+        start = perf_counter()
+        x = numbers(y, "y").copy()
+        if self._before is not None:
+            self._take(x, applied)
+        self._steps += 1
+        if self._steps % self._every == 0 and len(self._memory) >= min(self._every, cast("int", self._memory.maxlen)):
+            self._renew()
+        move = self.controller(x, reference, applied, w)
+        watch = self.controller.watch
+        now = np.zeros(self.predictor.nw) if w is None else np.atleast_2d(numbers(w, "w"))[0].copy()
+        self._before = x, move.u.copy(), now, watch is None or watch.inside
+        return replace(move, solve_time=perf_counter() - start)
+
+    def _take(self, x: Float[np.ndarray, " nx"], applied: ArrayLike | None) -> None:
+        """Learn from the step before, which led to x, unless it is faulty."""
+        assert self._before is not None
+        old, u, w, inside = self._before
+        pair = Pair(old, u if applied is None else numbers(applied, "applied").copy(), w, x)
+        together = np.concatenate(pair)
+        if not (inside and (np.abs(together) < HUGE).all()) or np.array_equal(old, x):
+            self.skipped += 1
+            return
+        misfit = float(np.linalg.norm(self._errors(self.predictor, [pair])[0]))
+        usual = float(np.median(self._misfits)) if len(self._misfits) >= _PERSISTENT else np.inf
+        self._off = self._off + 1 if misfit > self._outlier * usual else 0
+        if 0 < self._off < _PERSISTENT:
+            self.skipped += 1
+            return
+        self._misfits.append(misfit)
+        self._memory.append(pair)
+        self.online.learn(pair.x, pair.u, pair.x_next, pair.w if len(w) else None)
+        self.learned += 1
+
+    def _errors(self, model: LinearPredictor, pairs: list[Pair]) -> Float[np.ndarray, "m nx"]:
+        """Return the one-step errors of a model, each state in the size of its changes over the memory."""
+        Z = np.array([model.lift(pair.x) for pair in pairs])
+        U, W = np.array([pair.u for pair in pairs]), np.array([pair.w for pair in pairs])
+        ahead = (Z @ model.A.T + U @ model.B.T + W @ model.E.T) @ model.C.T
+        return (np.array([pair.x_next for pair in pairs]) - ahead) / self._size
+
+    @property
+    def _size(self) -> Float[np.ndarray, " nx"]:
+        """Root mean square of each state's change from step to step in the memory; 1 where it does not move."""
+        if not self._memory:
+            return np.ones(self.predictor.nx)
+        changes = np.array([pair.x_next - pair.x for pair in self._memory])
+        size = np.sqrt((changes**2).mean(axis=0))
+        return np.where(size > 0, size, 1.0)
+
+    def _renew(self) -> None:
+        """Compare the models on the memory, and take the one that predicts it clearly better."""
+        pairs, used = list(self._memory), self.predictor
+        if self._suffices(used, pairs):
+            return
+        error = self._error(used, pairs)
+        try:
+            candidate = self.online.predictor()
+        except KoopmpcError:  # too little was learned for a fit
+            candidate = None
+        if candidate is not None and self._error(candidate, pairs) < _BETTER * error and self._use(candidate):
+            self._good.append(used)
+            self.renewed += 1
+            return
+        self.refused += 1
+        earlier = [self._first, *self._good]
+        errors = [self._error(model, pairs) for model in earlier]
+        best = int(np.argmin(errors))
+        if earlier[best] is not used and error > _WORSE * errors[best] and self._use(earlier[best]):
+            self.returned += 1
+
+    def _suffices(self, model: LinearPredictor, pairs: list[Pair]) -> bool:
+        """Return whether the model predicts these pairs as well as the first model did its own data."""
+        usual = self._usual
+        if usual is None:
+            return False
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = np.sqrt(((self._errors(model, pairs) * self._size) ** 2).mean(axis=0))
+        return bool((found <= _SUFFICES * usual).all())
+
+    def _error(self, model: LinearPredictor, pairs: list[Pair]) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = float(np.sqrt((self._errors(model, pairs) ** 2).mean()))
+        return found if np.isfinite(found) else np.inf
+
+    def _use(self, model: LinearPredictor) -> bool:
+        """Go on with this model; return False where no controller can be made of it."""
+        used = self.predictor
+        try:
+            self.controller.update(model)
+        except KoopmpcError:
+            self.controller.update(used)
+            return False
+        return True
+
+
+class Guarded:
+    """A controller with a monitor, and a second one that takes over where the first does not know.
+
+    After `patience` unknown steps in sequence the second one's moves are returned, with the fallback OTHER_CONTROLLER,
+    until the first has known as many in sequence. Both are asked at every step, so that either can go on at once.
+
+    Parameters
+    ----------
+    controller
+        One whose Moves say whether they are `known`: a KoopmanMPC or BilinearMPC with ``monitor=``, or an Adaptive one.
+    standby
+        Any controller of the same plant that needs no model of where it is: an LQR, a safe feedback.
+    patience
+        Steps in sequence; one alone is unknown in about 2 of 100 steps like the data.
+
+    Raises
+    ------
+    DataError
+        The two have another dt or number of inputs.
+    """
+
+    def __init__(self, controller: Controller, standby: Controller, *, patience: int = 3) -> None:
+        for name in ("dt", "nu"):
+            mine, other = getattr(controller, name), getattr(standby, name)
+            if mine != other:
+                raise DataError(
+                    f"the controller has {name} = {mine:g}, the one that stands by {other:g}; they must agree"
+                )
+        self.controller, self.standby = controller, standby
+        self.dt, self.nu = controller.dt, controller.nu
+        self.horizon = max(controller.horizon, standby.horizon)
+        self._patience = checks.count(patience, "patience")
+        self._forget()
+
+    def _forget(self) -> None:
+        self.handed_over, self._in_sequence = False, 0
+        self._given: Float[np.ndarray, " nu"] | None = None
+
+    @property
+    def predictor(self) -> Any:
+        """The model of the first controller; None where it has none."""
+        return getattr(self.controller, "predictor", None)
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Begin a run with the first controller."""
+        self._forget()
+        self.controller.reset(x0, u_prev)
+        self.standby.reset(x0, u_prev)
+
+    def plan(self) -> Plan | None:
+        """Return the plan behind the last move; None where it had none."""
+        acting = self.standby if self.handed_over else self.controller
+        look = cast("Callable[[], Plan | None] | None", getattr(acting, "plan", None))
+        return None if look is None else look()
+
+    def __call__(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+    ) -> Move:
+        """Return the move of the one that is in charge.
+
+        Raises
+        ------
+        DataError
+            The first controller does not say whether it knows.
+        """
+        got = self._given if applied is None else applied
+        rows = numbers(reference, "reference")
+        first = self.controller(y, _ahead(rows, self.controller), got, w)
+        second = self.standby(y, _ahead(rows, self.standby), got, w)
+        if first.known is None:
+            raise DataError("the controller does not say whether it knows; give it monitor=data")
+        against = first.known if self.handed_over else not first.known
+        self._in_sequence = self._in_sequence + 1 if against else 0
+        if self._in_sequence >= self._patience:
+            self.handed_over, self._in_sequence = not self.handed_over, 0
+        taken = first.solve_time + second.solve_time
+        move = replace(first, solve_time=taken)
+        if self.handed_over:
+            move = replace(second, solve_time=taken, fallback=Fallback.OTHER_CONTROLLER, known=first.known)
+        self._given = move.u.copy()
+        return move
+
+
+def _ahead(rows: Float[np.ndarray, "..."], controller: Controller) -> Float[np.ndarray, "..."]:
+    """Return the rows of the reference that this controller reads."""
+    return rows if rows.ndim == 1 else rows[: controller.horizon + 1]

@@ -1,0 +1,231 @@
+"""Monitor: where the data of a model were and how well it predicted them; each step asks whether that holds now."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import numbers
+from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.errors import DataError
+from koopmpc.estimate.observer import StateModel
+from koopmpc.lifting.base import Lifting, buffered
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.validate.scoring import comparable, forecast_errors
+from koopmpc.values import Value
+
+if TYPE_CHECKING:
+    from koopmpc.control.base import InitialCondition
+
+_THIN = 1e-9  # share of the widest direction of the data below which a direction counts as this wide
+_EXACT = 1e-9  # share of a state's size that a prediction may always be off
+
+
+@dataclass(frozen=True, eq=False)
+class Monitor(Value):
+    """‖L [ψ(x); u]‖² ≤ 1 where the data were, and ‖W (x⁺ − x̂⁺)‖² ≤ 1 where the model predicts as it did there.
+
+    ‖L v‖² is the leverage vᵀ (VᵀV)⁻¹ v of v = [ψ(x); u] over the rows V of the data, divided by its `level` quantile
+    among them; ‖W e‖² is the squared one-step error in units of its covariance, divided by the conformal quantile of
+    the same level. On new data like these a step is outside of either with a probability of about 1 − level. Make one
+    by `Monitor.of`.
+
+    Attributes
+    ----------
+    leverage
+        (nz + nu, nz + nu) L.
+    band
+        (nx, nx) W.
+    level
+        Share of the data that is inside.
+    lifting
+        ψ, bound.
+    """
+
+    leverage: Float[np.ndarray, "n n"]
+    band: Float[np.ndarray, "nx nx"]
+    level: float
+    lifting: Lifting
+
+    @classmethod
+    def of(cls, model: LinearPredictor | BilinearPredictor, data: Episodes, *, level: float = 0.99) -> "Monitor":
+        """Return the monitor of a model and its data.
+
+        Parameters
+        ----------
+        model
+            The predictor of the controller.
+        data
+            The episodes that it was fitted to; held-out episodes make the band honest where the fit is close.
+        level
+            Share of these data that is to count as known, by each of the two checks.
+
+        Raises
+        ------
+        DataError
+            The data are of another plant, or have fewer than 1 / (1 − level) rows; the level is not inside (0, 1).
+        """
+        level = checks.positive(level, "level")
+        if level >= 1:
+            raise DataError(f"level is {level:g}; it must lie between 0 and 1, 0.99 calls 1 % of the data unknown")
+        points = comparable(model, episodes_of(data), 1)
+        V = np.concatenate([np.hstack([model.lifting(e.X[:-1]), e.U[:, : model.nu]]) for e in points])
+        starts = [np.arange(len(e)) for e in points]
+        E = np.concatenate([gap[0] for gap, _ in forecast_errors(model, points, starts, 1)])
+        X = np.concatenate([e.X[:, : model.nx] for e in points])
+        rank = int(np.ceil((len(V) + 1) * level - 1e-9))
+        if rank > len(V):
+            raise DataError(
+                f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level)))} are needed for a level of "
+                f"{level:g}; pass more data, or a lower level"
+            )
+        size: np.ndarray = np.maximum(np.abs(X).max(axis=0), np.finfo(float).tiny)
+        band = _whitening(E, _EXACT * size)
+        inside = _whitening(V, np.zeros(V.shape[1]))
+        return cls(_to_one(inside, V, rank), _to_one(band, E, rank), level, model.lifting)
+
+
+def _whitening(rows: Float[np.ndarray, "M n"], floor: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """Return G with mean ‖G v‖² = n over the rows, whose directions count as no thinner than the floor."""
+    norm = np.sqrt((rows**2).mean(axis=0) + floor**2)
+    norm = np.where(norm > 0, norm, 1.0)
+    scaled = rows / norm
+    values, Q = np.linalg.eigh(scaled.T @ scaled / len(rows) + np.diag((floor / norm) ** 2))
+    return (Q / np.sqrt(np.maximum(values, _THIN * values.max()))).T / norm
+
+
+def _to_one(G: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "M n"], rank: int) -> Float[np.ndarray, "n n"]:
+    """Return G scaled so that the rank-th smallest ‖G v‖² of the rows is 1."""
+    bound = np.sort(((rows @ G.T) ** 2).sum(axis=1))[rank - 1]
+    return G / np.sqrt(bound) if bound > 0 else G
+
+
+def monitor_of(given: Monitor | Episodes | None, model: Any) -> Monitor | None:
+    """Return the monitor that a controller was given, or that of the data that it was given.
+
+    Raises
+    ------
+    DataError
+        The controller's model was not fitted to data, or the monitor is of another lifting.
+    """
+    if given is None:
+        return None
+    if not isinstance(model, LinearPredictor | BilinearPredictor):
+        raise DataError("a monitor compares with data, and this controller's model is not learned; leave out monitor=")
+    monitor = Monitor.of(model, given) if isinstance(given, Episodes) else given
+    checks.kind(monitor, "monitor", Monitor, "make one by km.Monitor.of(model, data), or pass the data")
+    if monitor.lifting != model.lifting or len(monitor.leverage) != model.nz + model.nu:
+        raise DataError("the monitor is of another lifting than the controller's model; make one of this model")
+    return monitor
+
+
+class Watch:
+    """The monitor of one closed loop: `inside` where the data were, `fits` as the model predicted there.
+
+    Both are of the last step. What came is compared with the prediction of the step before, under the input that the
+    plant got, the measured disturbances and the estimated one.
+
+    Parameters
+    ----------
+    monitor
+        What is known.
+    model
+        What predicts.
+    latency
+        Steps until an input acts; the prediction that is compared is that of the plan's start.
+    """
+
+    _VIEWS = ("_now", "_before", "_z", "_u", "_acted", "_error", "_reach", "_old_z")
+
+    def __init__(self, monitor: Monitor, model: LinearPredictor | StateModel, latency: int) -> None:
+        self.monitor, self._latency = monitor, latency
+        nx, n = len(monitor.band), len(monitor.leverage)
+        self._n, self._nu = n, n - monitor.lifting.nz
+        self._rows, self._found, self._matrix = np.zeros(2 * n), np.zeros(nx + n), np.zeros((nx + n, 2 * n))
+        self._matrix[nx:, n:] = monitor.leverage
+        self._psi = None if isinstance(model, LinearPredictor) else buffered(monitor.lifting)
+        self.update(model)
+        self._see()
+        self.reset()
+
+    def _see(self) -> None:
+        """Make the views; a copy makes its own."""
+        n, nx = self._n, len(self.monitor.band)
+        self._before, self._now = self._rows[:n], self._rows[n:]
+        self._acted = self._before[n - self._nu :]
+        self._z, self._u = self._now[: n - self._nu], self._now[n - self._nu :]
+        self._error, self._reach = self._found[:nx], self._found[nx:]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
+
+    def update(self, model: LinearPredictor | StateModel) -> None:
+        """Compare with the predictions of another model from now on; what counts as known stays."""
+        self._model, W = model, self.monitor.band
+        if isinstance(model, LinearPredictor):
+            nx, n, nz = len(W), self._n, model.nz
+            C = W @ model.C
+            self._matrix[:nx, :nz], self._matrix[:nx, nz:n] = C @ model.A, C @ model.B
+            self._matrix[:nx, n : n + nz] = -C
+            self._pushed = C @ model.E, C
+        self._extra: Float[np.ndarray, " nx"] | None = None
+
+    def reset(self) -> None:
+        """Forget the step before: the first step of a run has no prediction to be compared with."""
+        self._first, self.inside, self.fits = True, True, True
+        self._rows[:] = 0.0
+        self._extra = None
+        self._old: tuple[np.ndarray, ...] | None = None
+
+    def look(self, start: "InitialCondition", u: Float[np.ndarray, " nu"], applied: ArrayLike | None) -> bool:
+        """Return whether the step that starts here, with input u, is known."""
+        self._before[:] = self._now
+        if applied is not None and not self._latency:
+            self._acted[:] = applied
+        psi = self._psi
+        if psi is None:
+            self._z[:] = start.z
+        else:
+            psi.arguments[0][:] = start.z
+            psi.evaluate()
+            self._z[:] = psi.results[0]
+        self._u[:] = u
+        self._matrix.dot(self._rows, self._found)
+        reach = self._reach
+        self.inside = bool(reach.dot(reach) <= 1.0)
+        if self._first:
+            self._first = False
+            self.fits = True
+        elif psi is None:
+            error = self._error
+            if self._extra is not None:
+                error += self._extra
+            self.fits = bool(error.dot(error) <= 1.0)
+        else:
+            self.fits = self._stepped(start, applied)
+        if psi is None and start.drive.size:
+            E, C = self._pushed
+            extra = E @ start.W[0] if start.W.size else np.zeros(len(C))
+            self._extra = extra + C @ start.d if start.d.size else extra
+        elif psi is not None:
+            w = start.W[0].copy() if start.W.size else np.zeros(0)
+            self._old = start.z.copy(), u.copy(), w, start.d.copy() if start.d.size else np.zeros(len(start.z))
+        return self.inside and self.fits
+
+    def _stepped(self, start: "InitialCondition", applied: ArrayLike | None) -> bool:
+        """Return whether the state came as the map of a nonlinear model said."""
+        model, W = self._model, self.monitor.band
+        if self._old is None or isinstance(model, LinearPredictor):
+            return True
+        z, u, w, d = self._old
+        if applied is not None and not self._latency:
+            u = numbers(applied, "applied")
+        error = W @ (model.advance(z, u, w, d) - start.z)[: len(W)]
+        return bool(error.dot(error) <= 1.0)
