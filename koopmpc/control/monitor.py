@@ -82,7 +82,7 @@ class Monitor(Value):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level)))} are needed for a level of "
                 f"{level:g}; pass more data, or a lower level"
             )
-        size: np.ndarray = np.maximum(np.abs(X).max(axis=0), np.finfo(float).tiny)
+        size = np.array([max(float(np.abs(column).max()), np.finfo(float).tiny) for column in X.T])
         band = _whitening(E, _EXACT * size)
         inside = _whitening(V, np.zeros(V.shape[1]))
         return cls(_to_one(inside, V, rank), _to_one(band, E, rank), level, model.lifting)

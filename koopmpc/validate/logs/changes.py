@@ -24,9 +24,9 @@ _SHORTEST = 30  # rows of a segment
 _SHARE = 0.6  # of the segments that agree on a law
 _RESTARTS = 12
 _TRIED = 4  # segments by which an offset is found
-_GAIN = 0.4  # nats a row and state that a change must win
+_GAIN = 1.0  # nats a row and state that a change must win
 _SURE = 40.0  # nats in all
-_BACK = 1.5  # nats a row and state by which a segment may stay behind the consensus
+_BACK = 0.7  # nats a row and state by which a segment may stay behind the consensus
 _FLOOR = 1e-8  # share of a state's size below which a residual counts as rounding
 _FACTORS = {
     "180/π": 180 / np.pi,
