@@ -26,7 +26,7 @@ _PERSISTENT = 3  # samples in sequence that are off before they count as a chang
 _KEPT = 5  # earlier models that can be gone back to
 
 
-class Transition(NamedTuple):
+class LearnedPair(NamedTuple):
     """One step as it was: x, what acted, and where it led."""
 
     x: Float[np.ndarray, " nx"]
@@ -94,7 +94,7 @@ class Adaptive:
         self._every, self._outlier = checks.count(every, "every"), checks.positive(outlier, "outlier")
         self._first = model
         self._usual = None if model.report is None else model.report.residual
-        self._memory: deque[Transition] = deque(maxlen=checks.count(memory, "memory"))
+        self._memory: deque[LearnedPair] = deque(maxlen=checks.count(memory, "memory"))
         self._clear()
 
     def _clear(self) -> None:
@@ -142,7 +142,7 @@ class Adaptive:
         """Learn from the step before, which led to x, unless it is faulty."""
         assert self._before is not None
         old, u, w, inside = self._before
-        pair = Transition(old, u if applied is None else numbers(applied, "applied").copy(), w, x)
+        pair = LearnedPair(old, u if applied is None else numbers(applied, "applied").copy(), w, x)
         together = np.concatenate(pair)
         if not (inside and (np.abs(together) < HUGE).all()) or np.array_equal(old, x):
             self.skipped += 1
@@ -158,7 +158,7 @@ class Adaptive:
         self.online.learn(pair.x, pair.u, pair.x_next, pair.w if len(w) else None)
         self.learned += 1
 
-    def _errors(self, model: LinearPredictor, pairs: list[Transition]) -> Float[np.ndarray, "m nx"]:
+    def _errors(self, model: LinearPredictor, pairs: list[LearnedPair]) -> Float[np.ndarray, "m nx"]:
         """Return the one-step errors of a model, each state in the size of its changes over the memory."""
         Z = np.array([model.lift(pair.x) for pair in pairs])
         U, W = np.array([pair.u for pair in pairs]), np.array([pair.w for pair in pairs])
@@ -195,7 +195,7 @@ class Adaptive:
         if earlier[best] is not used and error > _WORSE * errors[best] and self._use(earlier[best]):
             self.returned += 1
 
-    def _suffices(self, model: LinearPredictor, pairs: list[Transition]) -> bool:
+    def _suffices(self, model: LinearPredictor, pairs: list[LearnedPair]) -> bool:
         """Return whether the model predicts these pairs as well as the first model did its own data."""
         usual = self._usual
         if usual is None:
@@ -204,7 +204,7 @@ class Adaptive:
             found = np.sqrt(((self._errors(model, pairs) * self._size) ** 2).mean(axis=0))
         return bool((found <= _SUFFICES * usual).all())
 
-    def _error(self, model: LinearPredictor, pairs: list[Transition]) -> float:
+    def _error(self, model: LinearPredictor, pairs: list[LearnedPair]) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
             found = float(np.sqrt((self._errors(model, pairs) ** 2).mean()))
         return found if np.isfinite(found) else np.inf

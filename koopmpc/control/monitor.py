@@ -82,14 +82,13 @@ class Monitor(Value):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level)))} are needed for a level of "
                 f"{level:g}; pass more data, or a lower level"
             )
-        size = np.array([max(float(np.abs(column).max()), np.finfo(float).tiny) for column in X.T])
-        band = _whitening(E, _EXACT * size)
-        inside = _whitening(V, np.zeros(V.shape[1]))
+        band, inside = _whitening(E, _EXACT, X), _whitening(V, 0.0, V)
         return cls(_to_one(inside, V, rank), _to_one(band, E, rank), level, model.lifting)
 
 
-def _whitening(rows: Float[np.ndarray, "M n"], floor: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Return G with mean ‖G v‖² = n over the rows, whose directions count as no thinner than the floor."""
+def _whitening(rows: Float[np.ndarray, "M n"], share: float, of: Float[np.ndarray, "K n"]) -> Float[np.ndarray, "n n"]:
+    """Return G with mean ‖G v‖² = n over the rows, no column of which counts as smaller than this share of `of`."""
+    floor = share * np.sqrt((of**2).mean(axis=0))
     norm = np.sqrt((rows**2).mean(axis=0) + floor**2)
     norm = np.where(norm > 0, norm, 1.0)
     scaled = rows / norm

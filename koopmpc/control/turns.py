@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 from koopmpc.errors import ThreadError
 
-Method = TypeVar("Method", bound=Callable[..., Any])
+TurnTaker = TypeVar("TurnTaker", bound=Callable[..., Any])
 Token = list[int]
 
 
@@ -25,7 +25,7 @@ def busy(controller: object) -> ThreadError:
     return ThreadError(f"two threads entered one {name} at once; give each thread a copy: copy.copy(controller)")
 
 
-def alone(method: Method) -> Method:
+def alone(method: TurnTaker) -> TurnTaker:
     """Return the method so that it raises ThreadError while another thread is in a method of the same object.
 
     Methods of one thread may call each other.
@@ -47,4 +47,4 @@ def alone(method: Method) -> Method:
             self._inside = 0
             self._token.append(held)
 
-    return cast("Method", entered)
+    return cast("TurnTaker", entered)
