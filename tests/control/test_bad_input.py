@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.bare import shown
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
 MODEL = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "v"), ("u",))
@@ -20,7 +21,6 @@ def loop(rows):
 
 REFUSED = {
     "a negative tail": (lambda: km.Cost(1, 1, tail=-1), r"tail is -1; it must be at least 0"),
-    "a tail of NaN": (lambda: km.Cost(1, 1, tail=float("nan")), r"tail is nan; pass a whole number"),
     "Q_N and a tail": (
         lambda: km.Cost(1, 1, Q_N=1.0, tail=3),
         r"Q_N and tail = 3 are given; Q_N takes the tail's place: pass one of them",
@@ -45,6 +45,11 @@ def test_it_is_refused_with_what_was_got_and_what_to_do(what):
     make, sentence = REFUSED[what]
     with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=sentence):
         make()
+
+
+def test_a_tail_of_nan_is_refused():
+    (line,) = shown('show(lambda: km.Cost(1, 1, tail=float("nan")))')
+    assert line == "DataError tail is nan; pass a whole number"
 
 
 @pytest.mark.parametrize("kind", CONTROLLERS)
