@@ -120,8 +120,8 @@ class LQR:
         """
         start = perf_counter()
         x = checks.array(y, "y", (self.predictor.nx,), finite=False)
-        target = np.asarray(reference, dtype=np.float64)
-        told = None if w is None else self._disturbance(np.asarray(w, dtype=np.float64))
+        target = checks.numbers(reference, "reference")
+        told = None if w is None else self._disturbance(checks.numbers(w, "w"))
         key = target.tobytes() + (b"" if told is None else told.tobytes()), self._row
         if key != self._reference_key:
             self._aim(target, told)

@@ -257,6 +257,8 @@ class Feedback(Excitation):
         u_min: ArrayLike = -np.inf,
         u_max: ArrayLike = np.inf,
     ) -> None:
+        if hasattr(K, "K"):
+            raise DataError(f"K is a {type(K).__name__}; pass its matrix, gain.K")
         gain = checks.array(K, "K", (None, None))
         if noise is not None and noise.nu != len(gain):
             raise ShapeError(f"noise has {noise.nu} inputs and K {len(gain)} rows; pass one level for each input")

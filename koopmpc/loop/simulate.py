@@ -117,7 +117,7 @@ def simulate(
         raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
     first = plant.reset(x0, rng)
     states, inputs, outputs, state = tuple(plant.states), tuple(plant.inputs), tuple(plant.outputs), plant.state
-    nx, ny, nu, N = len(states), len(first), controller.nu, controller.horizon
+    nx, ny, nu, N = len(states), len(_reading(first, None, 0)), controller.nu, controller.horizon
     if state is not None and np.shape(state) != (nx,):
         raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
     scene = getattr(plant, "scene", None)
@@ -146,7 +146,7 @@ def simulate(
         metadata["faults"] = [str(fault) for fault in faults]
 
     def sensed(k: int, measurement: ArrayLike) -> Float[np.ndarray, " ny"]:
-        y = np.array(measurement, dtype=np.float64)  # NaN passes: the controller then says BAD_MEASUREMENT
+        y = _reading(measurement, ny, k)  # NaN passes: the controller then says BAD_MEASUREMENT
         if noisy is not None:
             y += noisy(k, rng)
         return y if broken is None else np.array(broken.measured(k, y), dtype=np.float64)
@@ -155,12 +155,13 @@ def simulate(
         state = plant.state
         return hidden if state is None else np.array(state, dtype=np.float64)
 
+    rows.setflags(write=False)  # they are the Run's own
     taken: list[Step] = []
     hidden = np.full(nx, np.nan)
     look_ahead = getattr(controller, "plan", None) if plans or observers else None
     x, y, applied = known(), sensed(0, first), None
     controller.reset(x0)
-    ask = cast("Callable[..., Move]", controller)
+    ask = _asked(controller)
     for k in range(steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, nr))
         more = {} if W is None else {"w": W[k : k + max(N, 1)] if preview else W[k]}
@@ -172,7 +173,7 @@ def simulate(
                 controller.solver_fails = False
         else:
             move = ask(y.copy(), ahead, applied, **more)
-        if k == 0:
+        if k == 0 or type(move) is not Move:
             checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
         u = np.array(move.u, dtype=np.float64)
         if u.shape != (nu,):
@@ -209,6 +210,37 @@ def simulate(
         scene=scene,
         model=predictor_of(controller),
     )
+
+
+def _reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
+    """Return what a plant measured at step k as an array of its own."""
+    try:
+        y = None if value is None else np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        y = None
+    if y is None:
+        raise DataError(
+            f"the plant returned {type(value).__name__} at step {k}; reset and step return y, a number each"
+        )
+    if y.ndim != 1 or (ny is not None and len(y) != ny):
+        expected = "(ny,)" if ny is None else f"({ny},), as at reset"
+        raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
+    return y
+
+
+def _asked(controller: Controller) -> Callable[..., Move]:
+    """Return the call of the controller, where writing into the reference is an error of ours."""
+    call = cast("Callable[..., Move]", controller)
+
+    def ask(*arguments: Any, **more: Any) -> Move:
+        try:
+            return call(*arguments, **more)
+        except ValueError as error:
+            if "read-only" not in str(error):
+                raise
+            raise DataError("the controller wrote into the reference, which is the Run's own; copy it first") from error
+
+    return ask
 
 
 def predictor_of(controller: object) -> Predictor | None:

@@ -23,6 +23,8 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.values import freeze
 
+_LARGEST = 1e100  # entry of A: products of two are finite
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class LinearPredictor(Predictor):
@@ -252,6 +254,9 @@ def _store(
     bound = lifting.bind(tuple(states) if embedded is None else embedded.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)
     transition = checks.array(A, "A")
+    largest = float(np.abs(transition).max(initial=0.0))
+    if largest > _LARGEST:
+        raise DataError(f"A holds {largest:.3g}, with which nothing can be computed; scale the states, or fit anew")
     if transition.shape != (nz, nz):
         raise ShapeError(
             f"A has shape {transition.shape}, but the lifting returns {nz} observables; "

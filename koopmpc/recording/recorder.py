@@ -103,6 +103,7 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     LogError
         The path cannot be written.
     """
+    checks.kind(run, "run", Run, "pass what simulate returned; a model is written by km.recording.record_model")
     scene, model = scene or run.scene, run.model if model is None else model
     writer = Writer(About(**run.about()), path=Path(path), scene=scene, model=model, steps=run.steps)
     try:

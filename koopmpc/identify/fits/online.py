@@ -99,7 +99,7 @@ class OnlineEDMD:
         else:
             self._memory = Window(width, checks.count(window, "window"), max(_BLOCK, width))
         self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
-        self._waiting = 0
+        self._waiting: int = 0
         long = factor < 1 and 1 / (1 - factor) > 4 * self._n  # else forecasts say nothing of outliers
         self._gate = Gate(width, self._n) if long else None
         self.pairs = self.outliers = 0

@@ -158,6 +158,7 @@ class Gate:
     def keep(self, rows: Table) -> int:
         """Move the rows that are no outliers to the front, and return how many they are."""
         n, kept = self._n, 0
+        row: Table
         for row in rows:
             t = row[n:]
             if self._K is None:

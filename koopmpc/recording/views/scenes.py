@@ -2,7 +2,7 @@
 """Scenes: the shapes that scene(x, u) returns over time, as columns for Rerun."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import Field, dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,6 +79,13 @@ class Names:
             A shape came or went since the first scene.
         """
         own = {shape.name: None for shape in scene}
+        for shape in scene:
+            if not all(
+                np.isfinite(np.asarray(getattr(shape, f.name), dtype=np.float64)).all() for f in _numbers(shape)
+            ):
+                raise DataError(
+                    f"the scene of step {step} draws {shape.name!r} at NaN or inf; every x and u needs a place"
+                )
         self._names = own if self._names is None else self._names
         for name in own.keys() ^ self._names.keys():
             what = "has a new shape" if name in own else "lacks the shape"
@@ -86,6 +93,11 @@ class Names:
                 f"the scene of step {step} {what} {name!r}; a scene returns the same names for every x and u"
             )
         return list(scene)
+
+
+def _numbers(shape: Shape) -> list[Field[Any]]:
+    """Return the fields of a shape that are places and sizes."""
+    return [field for field in fields(shape) if field.name not in ("name", "color")]
 
 
 def draw(names: Iterable[str], scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
