@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
-from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.errors import DataError, KoopmpcError, install
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -119,7 +119,7 @@ def _client(scheduler: str, workers: int | None) -> Generator[Any]:
         from dask import config
         from distributed import Client, LocalCluster
     except ImportError as error:
-        raise KoopmpcError("a scheduler needs Dask; install it with: pip install 'koopmpc[dask]'") from error
+        raise KoopmpcError(f"a scheduler needs Dask; install it with: {install('dask')}") from error
     with ExitStack() as open_now:
         address: Any = scheduler
         if scheduler == "local":

@@ -1,5 +1,14 @@
 """The errors of koopmpc: one root, and each class is also the builtin that it refines."""
 
+from pathlib import Path
+
+
+def install(extra: str) -> str:
+    """Return the command that installs an extra: from the folder of a clone, which no index knows, else by name."""
+    root = Path(__file__).resolve().parent.parent
+    what = f"{root}[{extra}]" if (root / "pyproject.toml").is_file() else f"koopmpc[{extra}]"
+    return f"pip install '{what}'"
+
 
 class KoopmpcError(Exception):
     """Root of every error that koopmpc raises on purpose."""

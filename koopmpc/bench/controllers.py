@@ -205,12 +205,16 @@ def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
     Raises
     ------
     ProblemError
-        There is no such controller; the message names the nearest.
+        There is no such controller, and the message names the nearest; one is named twice.
     """
     names = tuple(names or (name for name in CONTROLLERS if name not in ASKED))
     for name in names:
         if name not in CONTROLLERS:
             raise ProblemError(
                 f"there is no controller {name!r}{nearest(name, CONTROLLERS)}; there are {', '.join(CONTROLLERS)}"
+            )
+        if names.count(name) > 1:
+            raise ProblemError(
+                f"the controller {name!r} is named twice, and its logs would have one name; name it once"
             )
     return names

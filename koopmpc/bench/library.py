@@ -61,6 +61,8 @@ def load_problem(problem: str | Path) -> Problem:
         path, text, case = _find(name), name, last
     if path is None:
         raise ProblemError(_unknown(text))
+    if path.suffix != ".py":
+        raise ProblemError(f"{path} is no problem: a problem is a Python file; `koopmpc fit {path}` reads data")
     loaded = _load(path)
     return loaded.select(case) if case else loaded
 

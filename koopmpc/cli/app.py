@@ -1,6 +1,7 @@
 """The command line: each command parses, calls one function, and prints."""
 
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -419,13 +420,21 @@ def _new_file(path: Path, text: str) -> Path:
     return path
 
 
+_OPTION = re.compile(r"\b(dt|states|inputs|resample|horizon|workers|scheduler)=")
+
+
+def _as_options(message: str) -> str:
+    """Return the message with the options of this program in place of Python's arguments."""
+    return _OPTION.sub(lambda found: f"--{found.group(1)} ", message).replace(" ;", ";").replace(" ,", ",")
+
+
 @contextmanager
 def _friendly() -> Generator[None]:
     """Show each warning and error of koopmpc as one message on stderr; an error exits with 2, a full disk with 1."""
     err = Console(stderr=True)
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-        err.print(Text.assemble((f"{category.__name__}: ", "yellow"), str(message)), soft_wrap=True)
+        err.print(Text.assemble((f"{category.__name__}: ", "yellow"), _as_options(str(message))), soft_wrap=True)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", FitWarning)
@@ -433,5 +442,5 @@ def _friendly() -> Generator[None]:
         try:
             yield
         except KoopmpcError as error:
-            err.print(Text.assemble((f"{type(error).__name__}: ", "red"), str(error)), soft_wrap=True)
+            err.print(Text.assemble((f"{type(error).__name__}: ", "red"), _as_options(str(error))), soft_wrap=True)
             raise typer.Exit(1 if isinstance(error, FullDiskError) else 2) from error

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from koopmpc import disk
-from koopmpc.errors import DataError, LogError
+from koopmpc.errors import DataError, LogError, install
 
 _MARGIN = 0.06  # around what is drawn, as a share of its size
 _SHADES = 48  # colours of a .gif
@@ -97,7 +97,7 @@ def save_video(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: st
         import imageio_ffmpeg
     except ImportError as error:
         raise LogError(
-            "an .mp4 needs imageio-ffmpeg, which is not installed: pip install 'koopmpc[video]', or write a .gif"
+            f"an .mp4 needs imageio-ffmpeg, which is not installed: {install('video')}, or write a .gif"
         ) from error
     first = next(pictures)
     with TemporaryDirectory() as folder:

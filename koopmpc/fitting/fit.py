@@ -12,6 +12,7 @@ import numpy as np
 from koopmpc import checks
 from koopmpc.bench.page import Page
 from koopmpc.bench.sweep import RESULTS
+from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError
 from koopmpc.figures.comparisons import error
@@ -118,6 +119,9 @@ def fit_data(
     """
     place, draw = Path(folder), checks.generator(rng)
     horizon = None if horizon is None else checks.count(horizon, "horizon")
+    workers = None if workers is None else checks.count(workers, "workers")
+    if scheduler is not None:
+        address_of(scheduler, workers)
     tell = silent if say is None else say
     notes: list[str] = []
     with noted(notes):

@@ -255,7 +255,7 @@ def _in_memory(
     whole = list(episodes)
     notes: tuple[str, ...] = ()
     if len(_long(whole, needed)) < _ENOUGH:
-        block = max(2 * needed, sum(lengths) // (4 * _ENOUGH))
+        block = max(2 * needed, min(sum(lengths) // (4 * _ENOUGH), _JUDGED // _ENOUGH))
         whole = [piece for episode in episodes for piece in blocks(episode, block)]
         if len(whole) > number:
             notes = (

@@ -9,13 +9,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, install
 from koopmpc.scene import Scene
 
 try:
     import gymnasium
 except ImportError as error:
-    raise ImportError("GymPlant needs gymnasium, which is not installed: pip install 'koopmpc[gym]'") from error
+    raise ImportError(f"GymPlant needs gymnasium, which is not installed: {install('gym')}") from error
 
 _ROUNDING = 1e-5  # of an action, which many environments hold in float32
 

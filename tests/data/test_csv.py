@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*text, and no part:koopmpc.errors.FitWarning")
+
 
 def text(file: Path, content: str, encoding: str = "utf-8") -> Path:
     file.write_bytes(content.encode(encoding))

@@ -12,6 +12,8 @@ from koopmpc.data.source import Changed, source_of
 from tests.bare import shown
 from tests.example_plants import random_episodes
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*holds the same bytes:koopmpc.errors.FitWarning")
+
 
 def sets(count: int = 4) -> list[km.Episodes]:
     return [random_episodes(seed, [30, 5], 2, 1) for seed in range(count)]

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 import koopmpc as km
 from tests.data.test_storage import random_episodes
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*text, and no part:koopmpc.errors.FitWarning")
+
 TOLD = {"dt": 0.1, "states": ["x"], "inputs": ["u"]}
 
 

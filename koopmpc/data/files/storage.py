@@ -1,8 +1,10 @@
 """Episodes in .npz, .parquet and .csv files, exact to the bit, in tables of users, and in folders of such files."""
 
 import json
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from filecmp import cmp
 from functools import partial
 from importlib import import_module
 from os import PathLike
@@ -17,7 +19,7 @@ from koopmpc.data.files import csv, parquet
 from koopmpc.data.files.parquet import RowGroup, row_groups
 from koopmpc.data.files.tables import Told, read_table
 from koopmpc.data.source import Part, Source
-from koopmpc.errors import DataError, KoopmpcError, LogError
+from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
 _WRITERS = {".parquet": parquet.write, ".csv": csv.write}
@@ -258,7 +260,7 @@ def _found(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[
         for file in files:
             if not file.is_file():
                 raise LogError(f"{file} is no file; pass files, or one folder")
-        return files
+        return _distinct(files)
     folder = Path(paths)
     if folder.is_file():
         return (folder,)
@@ -268,4 +270,23 @@ def _found(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[
     if not files:
         held = ", ".join(sorted(item.name for item in folder.iterdir())[:5]) or "nothing"
         raise LogError(f"{folder} holds no {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file: it holds {held}")
+    return _distinct(files)
+
+
+def _distinct(files: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Return the files; raise where one stands twice, and warn where two hold the same bytes."""
+    known: dict[Path, Path] = {}
+    for file in files:
+        if file.resolve() in known:
+            raise DataError(f"{file} is given twice; its data would count twice")
+        known[file.resolve()] = file
+    sizes: dict[int, list[Path]] = {}
+    for file in files:
+        sizes.setdefault(file.stat().st_size, []).append(file)
+    for group in sizes.values():
+        for i, file in enumerate(group):
+            twin = next((other for other in group[:i] if cmp(file, other, shallow=False)), None)
+            if twin is not None:
+                warnings.warn(f"{file} holds the same bytes as {twin}, and counts beside it", FitWarning, stacklevel=2)
+                break
     return files

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc import checks, disk
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.csv import numbers
 from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
@@ -189,6 +189,17 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         numeric=numeric,
     )
     table = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
+    for name, column in table.items():
+        _plausible(column, name, where)
+    kinds = {name: columns[name].dtype.kind for name in names if name in columns}
+    text = [name for name, kind in kinds.items() if every and kind == "O" and not label(name)]
+    if text:
+        warnings.warn(
+            f"{where}: {', '.join(map(repr, text))} hold{'s' * (len(text) == 1)} text, and no part of it is a state or "
+            "an input; write numbers, or pass states= and inputs=",
+            FitWarning,
+            stacklevel=2,
+        )
     time = None if found.time is None else _time(columns[found.time], found)
     if time is None and told.resample is not None:
         raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
@@ -218,6 +229,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         dt = sample_time([part.time for part in parts if part.time is not None], where)
     dt = checks.positive(dt, "dt", "s")
     if told.resample is not None:
+        _affordable(parts, dt, len(found.values), where)
         parts = [piece for part in parts for piece in resampled(part, dt)]
     if found.guessed:
         _doubt(found, table, where, alone=told.inputs is None and not found.inputs)
@@ -228,6 +240,41 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         if str(error).startswith(where):
             raise
         raise DataError(f"{where}: {error}") from error
+
+
+_USUAL, _ABSURD = 0.99, 1e6  # share of usual cells, and how many times larger none can be
+_MANY = 100  # cells that say what is usual
+
+
+def _plausible(column: Float[np.ndarray, " M"], name: str, where: str) -> None:
+    """Raise where one cell is a million times larger than 99 % of the column, or no model could compute with it.
+
+    Raises
+    ------
+    DataError
+        The message names the row.
+    """
+    size = np.abs(column[np.isfinite(column)])
+    if not len(size):
+        return
+    usual, largest = float(np.quantile(size, _USUAL, method="lower")), float(size.max())
+    if largest > 1e30 or (len(size) >= _MANY and usual > 0 and largest > _ABSURD * usual):
+        row = int(np.nanargmax(np.where(np.isfinite(column), np.abs(column), np.nan)))
+        raise DataError(
+            f"{where}: {name!r} is {column[row]:g} in row {row + 1}, where 99 % of its cells are within {usual:.3g}; "
+            "repair the cell, or leave it empty"
+        )
+
+
+def _affordable(parts: list[Signals], dt: float, columns: int, where: str) -> None:
+    """Raise where the resampled rows do not fit into memory."""
+    rows = sum(float(np.nanmax(p.time) - np.nanmin(p.time)) / dt for p in parts if p.time is not None and len(p.time))
+    free = disk.memory()
+    if free is not None and 16 * rows * columns > free:
+        raise DataError(
+            f"{where}: resample={dt:g} makes {rows:.3g} rows of {columns} columns, {16e-9 * rows * columns:.3g} GB, and "
+            f"{free / 1e9:.3g} GB are free; pass a longer sample time"
+        )
 
 
 def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, install
 from koopmpc.identify.regression import scale_factor
 from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting, lifting_of
@@ -18,9 +18,7 @@ try:
     from sklearn.base import BaseEstimator, RegressorMixin
     from sklearn.utils.validation import check_is_fitted, validate_data
 except ImportError as error:
-    raise ImportError(
-        "KoopmanRegressor needs scikit-learn, which is not installed: pip install 'koopmpc[sklearn]'"
-    ) from error
+    raise ImportError(f"KoopmanRegressor needs scikit-learn, which is not installed: {install('sklearn')}") from error
 
 
 class KoopmanRegressor(RegressorMixin, BaseEstimator):

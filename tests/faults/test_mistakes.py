@@ -1,0 +1,142 @@
+"""Mistakes get a sentence of ours: what was got, and what to do."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+PENDULUM = km.load_problem("pendulum")
+PLANT = km.discretize(PENDULUM.dynamics, 0.05)
+
+
+@pytest.fixture(scope="module")
+def model():
+    data = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=30, steps=20)
+    return km.edmd(data, km.State() + km.Fourier(1, states=[0]) + km.Constant())
+
+
+@pytest.mark.parametrize("bad", [None, "x", [[1], [2, 3]], {}, object(), [1j, 0], [1, 2, 3], 5.0])
+def test_lqr_says_what_is_wrong_with_its_reference_and_its_disturbance(model, bad):
+    controller = km.LQR(model, PENDULUM.cost)
+    with pytest.raises(km.errors.KoopmpcError, match="reference"):
+        controller([0.0, 0.0], bad)
+    if bad is not None:
+        with pytest.raises(km.errors.KoopmpcError, match="w "):
+            controller([0.0, 0.0], [0.0, 0.0], None, bad)
+
+
+class Answering:
+    dt, nu, horizon = 0.05, 1, 0
+
+    def __init__(self, answer):
+        self.answer, self.calls = answer, 0
+
+    def reset(self, x0=None, u_prev=None):
+        pass
+
+    def __call__(self, y, reference, applied=None):
+        self.calls += 1
+        return self.answer(self.calls, reference)
+
+
+def move(*_):
+    return km.Move(np.zeros(1), km.Status.OPTIMAL, km.control.Fallback.NONE, 0.0, 0)
+
+
+def writes(_, reference):
+    reference[:] = 7
+    return move()
+
+
+def loop(plant, answer):
+    return km.simulate(plant, Answering(answer), x0=[0.1, 0], reference=[0, 0], steps=5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (lambda k, _: None, "returned is a NoneType .* return a km.Move"),
+        (lambda k, _: move() if k < 3 else None, "returned is a NoneType .* return a km.Move"),
+        (writes, "wrote into the reference, which is the Run's own; copy it first"),
+    ],
+)
+def test_simulate_says_what_a_controller_did(answer, said):
+    with pytest.raises(km.errors.DataError, match=said):
+        loop(PLANT, answer)
+
+
+class Returning:
+    dt, states, inputs, outputs, state = 0.05, ("a", "b"), ("u",), ("a", "b"), None
+
+    def __init__(self, y, first=(0.0, 0.0)):
+        self.y, self.first = y, first
+
+    def reset(self, x0, rng=0):
+        return self.first
+
+    def step(self, u):
+        return self.y
+
+
+@pytest.mark.parametrize("bad", [None, np.zeros(3), "x", 1.0])
+def test_simulate_says_what_a_plant_returned(bad):
+    with pytest.raises(km.errors.KoopmpcError, match=r"the plant returned .* at step 1"):
+        loop(Returning(bad), move)
+    if not isinstance(bad, np.ndarray):
+        with pytest.raises(km.errors.KoopmpcError, match=r"the plant returned .* at step 0"):
+            loop(Returning(np.zeros(2), first=bad), move)
+
+
+def test_what_cannot_be_used_is_named(model, tmp_path: Path):
+    huge = model.A.copy()
+    huge[0, 0] = 1e308
+    with pytest.raises(km.errors.DataError, match=r"A holds 1e.308"):
+        replace(model, A=huge)
+    with pytest.raises(km.errors.DataError, match="run is a LinearPredictor, expected a Run"):
+        km.record(model, tmp_path / "run.rrd")
+    with pytest.raises(km.errors.DataError, match=r"K is a Gain; pass its matrix, gain\.K"):
+        km.Feedback(km.dlqr(model.A, model.B, np.eye(model.nz), np.eye(1)), km.Noise(-1, 1))
+    run = replace(loop(PLANT, move), scene=lambda x, u: [km.scene.Line("arm", [(0, 0), (float("nan"), 1)])])
+    with pytest.raises(km.errors.DataError, match=r"step 0 draws 'arm' at NaN"):
+        km.record(run, tmp_path / "run.rrd")
+    assert not list(tmp_path.iterdir())
+
+
+def table(path: Path, rows: int = 50, **cells: dict[int, float]) -> Path:
+    columns = {"time": 0.1 * np.arange(rows), "x": np.sin(np.arange(rows)), "u": np.cos(np.arange(rows))}
+    for name, changed in cells.items():
+        for row, value in changed.items():
+            columns[name][row] = value
+    lines = [",".join(columns), *(",".join(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("value", [1e9, 1e300])
+def test_one_absurd_cell_is_named_with_row_and_column(tmp_path: Path, value: float):
+    with pytest.raises(
+        km.errors.DataError, match=r"log\.csv: 'x' is 1e.* in row 8, where 99 % of its cells are within"
+    ):
+        km.load_episodes(table(tmp_path / "log.csv", rows=300, x={7: value}))
+
+
+def test_files_that_count_twice_are_named(tmp_path: Path):
+    first = table(tmp_path / "a.csv")
+    with pytest.raises(km.errors.DataError, match=r"a\.csv is given twice"):
+        km.Files([first, first])
+    (tmp_path / "b.csv").write_bytes(first.read_bytes())
+    with pytest.warns(km.FitWarning, match=r"b\.csv holds the same bytes as .*a\.csv"):
+        km.Files(tmp_path)
+
+
+def test_resampling_beyond_memory_is_refused_with_the_number(tmp_path: Path):
+    with pytest.raises(km.errors.DataError, match=r"resample=1e-12 makes 4.9e\+12 rows of 2 columns, .* GB are free"):
+        km.load_episodes(table(tmp_path / "log.csv"), resample=1e-12)
+
+
+def test_a_table_is_no_problem(tmp_path: Path):
+    with pytest.raises(km.errors.ProblemError, match="is no problem: a problem is a Python file; `koopmpc fit"):
+        km.load_problem(str(table(tmp_path / "log.csv")))
