@@ -272,8 +272,8 @@ def _affordable(parts: list[Signals], dt: float, columns: int, where: str) -> No
     free = disk.memory()
     if free is not None and 16 * rows * columns > free:
         raise DataError(
-            f"{where}: resample={dt:g} makes {rows:.3g} rows of {columns} columns, {16e-9 * rows * columns:.3g} GB, and "
-            f"{free / 1e9:.3g} GB are free; pass a longer sample time"
+            f"{where}: resample={dt:g} makes {rows:.3g} rows of {columns} columns, {16e-9 * rows * columns:.3g} GB, "
+            f"and {free / 1e9:.3g} GB are free; pass a longer sample time"
         )
 
 
