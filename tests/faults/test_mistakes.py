@@ -140,3 +140,10 @@ def test_resampling_beyond_memory_is_refused_with_the_number(tmp_path: Path):
 def test_a_table_is_no_problem(tmp_path: Path):
     with pytest.raises(km.errors.ProblemError, match="is no problem: a problem is a Python file; `koopmpc fit"):
         km.load_problem(str(table(tmp_path / "log.csv")))
+
+
+def test_the_example_of_the_page_runs():
+    text = (Path(__file__).parents[2] / "docs" / "what_can_go_wrong.md").read_text()
+    namespace = {}
+    exec(text.split("```python\n")[1].split("```")[0], namespace)
+    assert namespace["mine"] is not namespace["mpc"]

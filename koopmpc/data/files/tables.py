@@ -258,7 +258,7 @@ def _plausible(column: Float[np.ndarray, " M"], name: str, where: str) -> None:
     if not len(size):
         return
     usual, largest = float(np.quantile(size, _USUAL, method="lower")), float(size.max())
-    if largest > 1e30 or (len(size) >= _MANY and usual > 0 and largest > _ABSURD * usual):
+    if len(size) >= _MANY and (largest > 1e30 or (usual > 0 and largest > _ABSURD * usual)):
         row = int(np.nanargmax(np.where(np.isfinite(column), np.abs(column), np.nan)))
         raise DataError(
             f"{where}: {name!r} is {column[row]:g} in row {row + 1}, where 99 % of its cells are within {usual:.3g}; "
