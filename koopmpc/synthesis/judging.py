@@ -223,7 +223,7 @@ def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
         return False
     little = LITTLE * float(np.median(outcome.cost[both])) if both.any() else 0.0
     change = np.log((cost[both] + little) / np.maximum(outcome.cost[both] + little, 1e-300))
-    return not both.any() or float(change.mean()) <= np.log(CONFIRMED)
+    return not both.any() or bool(change.mean() <= np.log(CONFIRMED))
 
 
 def _run(test: LoopTest, one: Condition, plant: StepMap, controller: Designed, seed: int) -> Run:
