@@ -8,7 +8,7 @@ PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable
 TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
 
-.PHONY: bench test typed full loops speed check format clean
+.PHONY: bench test typed full loops soak speed check format clean
 
 bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
@@ -29,6 +29,11 @@ loops: $(VENV)/installed-dev
 
 speed: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
+
+# Ten minutes of closed loops with faults, damaged files and interrupts; memory must stay flat.
+soak: $(VENV)/installed-dev
+	$(PINNED) $(BIN)/python -m tests.faults.soak
+
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .

@@ -67,7 +67,7 @@ def make_run(
         U=numbers(T, nu),
         reference=numbers(T + 1, nx if cost else 3),
         status=tuple(rng.choice(list(km.Status), T)),
-        fallback=tuple(rng.choice(list(km.control.Fallback), T, p=[0.7, 0.1, 0.1, 0.1])),
+        fallback=tuple(rng.choice(list(km.control.Fallback), T)),
         solve_time=rng.random(T) * 1e-3,
         iterations=rng.integers(0, 4000, T),
         cost=km.Cost(Q=rng.random(nx), R=np.eye(nu) / 3) if cost else None,
