@@ -57,6 +57,7 @@ TERMS: dict[str, str] = {
         "along its plan once a step."
     ),
     "bilinear-offset": "bilinear-mpc with an estimate of what the model misses, so that no error remains at rest.",
+    "designed": "The controller that km.design chooses, by closed loops on models learned from the same data.",
     "nonlinear-mpc": (
         "Predictive control on your equations as they are, solved to the end: slow, and the measure for all."
     ),

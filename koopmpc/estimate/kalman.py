@@ -255,8 +255,10 @@ def _settling(
     """
     nz, nd, whole = len(process), len(F) - len(process), int(np.ceil(4 * steps))
     left = np.empty((len(DRIFTS), nd))
+    known, drifting = np.zeros_like(F), np.diag(np.repeat([0.0, 1.0], [nz, nd]))
+    known[:nz, :nz] = process
     for row, drift in zip(left, DRIFTS, strict=True):
-        P = _stationary(F, M, scipy.linalg.block_diag(process, drift * np.eye(nd)), R)
+        P = _stationary(F, M, known + drift * drifting, R)
         PM = P @ M.T
         K = np.asarray(scipy.linalg.solve(M @ PM + R, PM.T, assume_a="pos")).T
         row[:] = np.abs(np.linalg.matrix_power(F - F @ K @ M, whole).diagonal()[nz:])

@@ -57,7 +57,7 @@ def audited(episodes: Episodes, *, cut: bool = True) -> Audited:
             rest = episodes
     notes: list[str] = []
     for fault in report.faults:
-        if fault.kind in _REPAIRED:
+        if fault.name in _REPAIRED:
             continue
         if fault.places and rest is not episodes:
             done = "these rows were left out"
@@ -65,7 +65,7 @@ def audited(episodes: Episodes, *, cut: bool = True) -> Audited:
             done = f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"
         else:
             done = fault.do
-        notes.append(f"{fault.kind}: {fault.says}; {done}")
+        notes.append(f"{fault.name}: {fault.says}; {done}")
     return Audited(rest, tuple(notes), report.delay)
 
 

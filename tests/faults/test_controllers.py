@@ -152,5 +152,5 @@ def test_none_raises_or_leaves_its_limits_and_runs_repeat(controllers, name, wha
     assert sum(figures.fallback.values()) == sum(figures.status.values()) == STEPS
     for status, fallback in zip(run.status, run.fallback, strict=True):
         assert (fallback is km.control.Fallback.NONE) == (status in GOOD)
-    again = run_of(controller, limits, faults, seed, x0)
+    again = run_of(Watched(controller), limits, faults, seed, x0)
     assert replace(again, solve_time=run.solve_time) == run

@@ -38,7 +38,7 @@ class LogFault(Value):
 
     Attributes
     ----------
-    kind
+    name
         Its name, as docs/identification.md lists them.
     says
         What is wrong, with the numbers.
@@ -52,7 +52,7 @@ class LogFault(Value):
         Steps by which a signal is late, 0 for all other kinds.
     """
 
-    kind: str
+    name: str
     says: str
     do: str
     columns: tuple[str, ...] = ()

@@ -65,7 +65,7 @@ class AuditReport(Value):
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of the faults, in the order of the report."""
-        return tuple(dict.fromkeys(fault.kind for fault in self.faults))
+        return tuple(dict.fromkeys(fault.name for fault in self.faults))
 
     @property
     def delay(self) -> int:
@@ -91,7 +91,7 @@ class AuditReport(Value):
         if not self.faults:
             return f"no fault found in {looked}"
         count = len(self.faults)
-        pairs = [(fault.kind, f"{fault.says}. {fault.do[0].upper()}{fault.do[1:]}.") for fault in self.faults]
+        pairs = [(fault.name, f"{fault.says}. {fault.do[0].upper()}{fault.do[1:]}.") for fault in self.faults]
         return written(f"{count} fault{'s' * (count > 1)} found in {looked}", labelled(pairs))
 
 
@@ -123,7 +123,7 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
     log = Log(data)
     for check in (*_VALUES, *(_INPUTS if data.nu else ())):
         faults += check(log)
-    kinds = {fault.kind for fault in faults}
+    kinds = {fault.name for fault in faults}
     whole = Remainder.of(_unwrapped(data, turns(log)))
     rest = whole.without([p for fault in faults for p in fault.places])
     for check in (without_effect, midway, jumps):
