@@ -23,7 +23,7 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.values import freeze
 
-_LARGEST = 1e100  # entry of A: products of two are finite
+_LARGEST = 1e300  # entry of A: sums of as many as it has are finite
 
 
 @dataclass(frozen=True, eq=False, init=False)
