@@ -105,7 +105,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.recording.recorder import record as record
     from koopmpc.recording.viewer import view as view
     from koopmpc.synthesis.design import design as design
-    from koopmpc.synthesis.saved import load_controller as load_controller
+    from koopmpc.synthesis.designed import load_controller as load_controller
     from koopmpc.synthesis.select import select as select
     from koopmpc.synthesis.stabilise import stabilise as stabilise
     from koopmpc.validate.report import trust as trust

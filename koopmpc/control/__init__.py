@@ -7,6 +7,7 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.control.move import Controller as Controller
     from koopmpc.control.move import Fallback as Fallback
+    from koopmpc.control.move import Fallible as Fallible
     from koopmpc.control.move import Plan as Plan
     from koopmpc.control.riccati import Gain as Gain
     from koopmpc.control.saved import SavedController as SavedController

@@ -15,9 +15,8 @@ from koopmpc.checks import numbers
 from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import admitted
 from koopmpc.control.monitor import Monitor, Watch
-from koopmpc.control.move import Fallback, Move, Status
+from koopmpc.control.move import Fallback, Move, Status, token
 from koopmpc.control.saved import Kind, SavedController
-from koopmpc.control.turns import token
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
 from koopmpc.lifting.base import HUGE

@@ -12,11 +12,10 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.linear.horizon import horizon_of
-from koopmpc.control.move import Fallback, Move, Status
+from koopmpc.control.move import Fallback, Move, Status, alone, token
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import reference_rows, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
-from koopmpc.control.turns import alone, token
 from koopmpc.control.units import Units
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured

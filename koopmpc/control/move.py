@@ -1,17 +1,23 @@
-"""What a controller returns, a Move with a Status for every outcome; move blocking; the protocol of a controller."""
+"""What a controller returns, a Move with a Status; the protocol of a controller; move blocking; one thread at a time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, cast, runtime_checkable
+from functools import wraps
+from threading import get_ident
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ThreadError
 from koopmpc.values import Value
+
+TurnTaker = TypeVar("TurnTaker", bound=Callable[..., Any])
+# One thread at a time: each controller has a list of one element. `pop` and `append` are atomic and take 20 ns each.
+Token = list[int]
 
 
 class Status(Enum):
@@ -157,3 +163,39 @@ def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
     if M > N:
         raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
     return (1,) * (M - 1) + (N - M + 1,)
+
+
+def token() -> Token:
+    """Return the token of a new controller, or of a copy of one."""
+    return [0]
+
+
+def busy(controller: object) -> ThreadError:
+    """Return the error of a thread that found another one inside."""
+    name = type(controller).__name__
+    return ThreadError(f"two threads entered one {name} at once; give each thread a copy: copy.copy(controller)")
+
+
+def alone(method: TurnTaker) -> TurnTaker:
+    """Return the method so that it raises ThreadError while another thread is in a method of the same object.
+
+    Methods of one thread may call each other.
+    """
+
+    @wraps(method)
+    def entered(self: Any, *arguments: Any, **options: Any) -> Any:
+        me = get_ident()
+        if self._inside == me:
+            return method(self, *arguments, **options)
+        try:
+            held = self._token.pop()
+        except IndexError:
+            raise busy(self) from None
+        self._inside = me
+        try:
+            return method(self, *arguments, **options)
+        finally:
+            self._inside = 0
+            self._token.append(held)
+
+    return cast("TurnTaker", entered)

@@ -18,9 +18,8 @@ from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSenso
 from koopmpc.loop.metrics import duration
 from koopmpc.loop.simulate import simulate
 from koopmpc.parallel import StageProgress
-from koopmpc.synthesis.designed import Evidence, SavedDesign
+from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, made, saved_controller
 from koopmpc.synthesis.judging import Fenced, LostError
-from koopmpc.synthesis.saved import AnyMPC, made, saved_controller
 from koopmpc.validate.text import percent, table, written
 
 ALLOWED, ALLOWED_OFF = 0.01, 0.05  # violation, as a share of the range: as in the data, and with noise or inputs off

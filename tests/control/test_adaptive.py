@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.move import Fallback
-from koopmpc.errors import DataError
 from tests.drift.arm import (
     COST,
     HORIZON,
@@ -91,10 +89,10 @@ def test_a_run_begins_with_the_first_model_and_repeats_what_it_was_told(model, t
 
 def test_what_cannot_learn_is_refused_in_words(model, train):
     mpc = km.KoopmanMPC(model, COST, LIMITS, HORIZON)
-    with pytest.raises(DataError, match="OnlineEDMD learns another lifting than the model's"):
+    with pytest.raises(km.errors.DataError, match="OnlineEDMD learns another lifting than the model's"):
         km.Adaptive(mpc, km.OnlineEDMD.start(train, km.State()))
     late = km.edmd(train, km.State(), embedding=km.Delay(1))
-    with pytest.raises(DataError, match="has an embedding, and OnlineEDMD takes none"):
+    with pytest.raises(km.errors.DataError, match="has an embedding, and OnlineEDMD takes none"):
         km.Adaptive(km.KoopmanMPC(late, COST, LIMITS, HORIZON), km.OnlineEDMD.start(train, LIFTING))
 
 
@@ -105,20 +103,20 @@ def test_the_controller_that_stands_by_takes_over_where_the_model_does_not_know(
     first = km.KoopmanMPC(model, COST, LIMITS, HORIZON, monitor=train)
     mpc = km.Guarded(first, standby, patience=2)
     found = km.simulate(plant, mpc, x0=[1.0, 40.0], reference=[0.0, 0.0], steps=60, cost=COST, limits=LIMITS)
-    other = [k for k, f in enumerate(found.fallback) if f is Fallback.OTHER_CONTROLLER]
+    other = [k for k, f in enumerate(found.fallback) if f is km.control.Fallback.OTHER_CONTROLLER]
     assert other[0] == 1  # the second unknown step
     assert found.known[0] == found.known[1] == 0
-    assert found.fallback[-1] is not Fallback.OTHER_CONTROLLER
+    assert found.fallback[-1] is not km.control.Fallback.OTHER_CONTROLLER
     assert (found.known[-5:] == 1).all()
     assert km.metrics(found).fallback["OTHER_CONTROLLER"] == len(other)
 
 
 def test_guarded_controllers_must_agree_and_the_first_must_say_what_it_knows(model, train):
     first, other = km.KoopmanMPC(model, COST, LIMITS, HORIZON), km.LQR(model, COST, LIMITS)
-    with pytest.raises(DataError, match="does not say whether it knows; give it monitor=data"):
+    with pytest.raises(km.errors.DataError, match="does not say whether it knows; give it monitor=data"):
         km.Guarded(first, other)([0, 0], [0, 0])
     slower = km.LQR(km.LinearPredictor(model.A, model.B, model.C, model.lifting, 0.1, model.states, model.inputs), COST)
-    with pytest.raises(DataError, match=r"the controller has dt = 0\.05, the one that stands by 0\.1"):
+    with pytest.raises(km.errors.DataError, match=r"the controller has dt = 0\.05, the one that stands by 0\.1"):
         km.Guarded(first, slower)
 
 

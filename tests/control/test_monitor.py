@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
 from tests.bare import shown
 from tests.example_plants import Pendulum
 
@@ -174,14 +173,14 @@ def test_a_log_keeps_what_was_known(model, data, tmp_path):
 
 
 def test_what_cannot_be_monitored_is_refused_in_words(model, data):
-    with pytest.raises(DataError, match="this controller's model is not learned"):
+    with pytest.raises(km.errors.DataError, match="this controller's model is not learned"):
         km.BilinearMPC(km.discretize(Pendulum(), DT), COST, LIMITS, 10, monitor=data)
     other = km.Monitor.of(km.edmd(data, km.State()), data)
-    with pytest.raises(DataError, match="the monitor is of another lifting"):
+    with pytest.raises(km.errors.DataError, match="the monitor is of another lifting"):
         km.KoopmanMPC(model, COST, LIMITS, 15, monitor=other)
-    with pytest.raises(DataError, match=r"at least 99 are needed for a level of 0\.99"):
+    with pytest.raises(km.errors.DataError, match=r"at least 99 are needed for a level of 0\.99"):
         km.Monitor.of(model, data[:1])
-    with pytest.raises(DataError, match="level is 1"):
+    with pytest.raises(km.errors.DataError, match="level is 1"):
         km.Monitor.of(model, data, level=1.0)
     said = shown(
         "model = km.edmd(km.Episodes([km.Episode(X=np.random.rand(9, 1), U=np.random.rand(8, 1))], 0.1), km.State())\n"

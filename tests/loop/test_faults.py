@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.move import Fallible
 from tests.bare import shown
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -46,7 +45,7 @@ class Recorded:
 
     @solver_fails.setter
     def solver_fails(self, value):
-        if isinstance(self._controller, Fallible):
+        if isinstance(self._controller, km.control.Fallible):
             self._controller.solver_fails = value
 
     def __call__(self, y, reference, applied=None):
@@ -251,7 +250,7 @@ def test_a_solver_that_nobody_asks_cannot_fail(controllers):
     near = closed_loop(controllers["koopman-mpc"], (km.faults.SolverFailure(1.0),), x0=(0.05, 0.0))
     assert set(near.status) == {km.Status.UNCONSTRAINED}
     for name in ("lqr", "koopman-lqr"):
-        assert not isinstance(controllers[name], Fallible)
+        assert not isinstance(controllers[name], km.control.Fallible)
         bare, run = (closed_loop(controllers[name], faults) for faults in ((), (km.faults.SolverFailure(1.0),)))
         assert np.array_equal(bare.U, run.U)
 

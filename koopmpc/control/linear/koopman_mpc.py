@@ -16,12 +16,11 @@ from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan import plan_map
 from koopmpc.control.monitor import Monitor, monitor_of
-from koopmpc.control.move import Move, Plan, Status, blocked
+from koopmpc.control.move import Move, Plan, Status, alone, blocked, busy
 from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
 from koopmpc.control.target import reference_rows
-from koopmpc.control.turns import alone, busy
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, started

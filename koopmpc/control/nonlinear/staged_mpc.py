@@ -14,11 +14,10 @@ from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.monitor import Monitor, monitor_of
-from koopmpc.control.move import Move, Plan, Status, blocked
+from koopmpc.control.move import Move, Plan, Status, alone, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.target import reference_rows
-from koopmpc.control.turns import alone
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.lifting.base import HUGE
