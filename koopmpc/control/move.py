@@ -1,4 +1,4 @@
-"""What a controller returns, a Move with a Status; the protocol of a controller; move blocking; one thread at a time."""
+"""What a controller returns: a Move with a Status; a controller's protocol; move blocking; one thread at a time."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
