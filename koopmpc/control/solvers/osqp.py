@@ -9,7 +9,8 @@ spares the 15 µs that its Python wrapper spends on copies of the problem.
 Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
 """
 
-from collections.abc import Mapping
+import signal
+from collections.abc import Callable, Mapping
 from functools import cache
 from time import perf_counter
 from typing import Any, ClassVar
@@ -23,6 +24,8 @@ from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolver
 from koopmpc.control.solvers.qp import QP, QPSolution
 from koopmpc.errors import DataError
+
+_SIGINT = (signal.SIGINT,)
 
 # sigma: on plans of an unstable plant that saturate for many steps, half the iterations of OSQP's own 1e-6.
 # eps_prim_inf: its 1e-4 calls 5 % of feasible degenerate problems infeasible, and 18 % of badly scaled ones; 1e-7
@@ -190,7 +193,7 @@ class OSQP(QPSolver):
         self._solver.update_data_vec(q=None, l=self.low, u=self.high)
         self._allow(limit)
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
-        self._solver.solve()
+        _uninterrupted(self._solver.solve)
         info, solution = self._solver.info, self._solver.solution
         if int(info.status_val) == _INTERRUPTED:
             raise KeyboardInterrupt
@@ -208,3 +211,19 @@ class OSQP(QPSolver):
         if seconds != options.time_limit:
             options.time_limit = seconds
             self._solver.update_settings(options)
+
+
+def _uninterrupted(solve: Callable[[], object]) -> None:
+    """Solve while SIGINT waits: Python raises KeyboardInterrupt right after, some milliseconds later.
+
+    OSQP takes the signal for itself and forgets one that comes in its last iteration. In a program with threads another
+    thread may still receive it; OSQP then ends with the status that says so.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        solve()
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGINT)
+    try:
+        solve()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
