@@ -58,38 +58,39 @@ def simulate(
     Parameters
     ----------
     plant
-        A StepMap, or any Plant. Model mismatch is a plant other than the controller's model.
+        A StepMap, or any Plant. For model mismatch pass a plant that differs from the controller's model.
     controller
         Any Controller with the plant's dt. It is reset to x0 at the beginning.
     x0
-        (nx,) initial state; None: the plant begins where it begins by itself.
+        (nx,) initial state; None: the plant chooses its own initial state.
     reference
         (nr,) held throughout, or (steps+1, nr): row k belongs to x_k. The controller gets rows k … k+horizon, the
-        last one repeated; with ``preview=False`` row k throughout.
+        last one repeated; with ``preview=False`` it gets row k repeated over its horizon.
     steps
-        Number of steps T. Where the plant itself ends the episode before, as a `GymPlant` may, the run ends there, a
-        UserWarning says so and the metadata hold the reason under "ended".
+        Number of steps T. If the plant ends the episode earlier, as a `GymPlant` may, the run ends there with a
+        UserWarning, and the reason is in the metadata under "ended".
     cost, limits
         What the run is judged by; kept in the Run.
     u_reference
         (nu,) or (steps, nu): the inputs that hold the reference. The metrics charge ‖u_k − u_reference_k‖²_R, so
-        that rest on the reference costs nothing. By default they are those of the cost's u_target where that is given
-        as numbers, else zero. The controller is not told.
+        staying at the reference costs nothing. By default they are those of the cost's u_target if that is given as
+        numbers, else zero. Only the metrics use them; the controller does not see them.
     disturbance
         d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
     noise
         n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
     measured
         w_k, (nw,) or (steps, nw): disturbances that the controller is told as `w`, rows k … k+horizon−1, the last
-        one repeated; with ``preview=False`` row k throughout. They do not move the plant: pass their effect as
-        `disturbance`, for example ``disturbance=W @ E.T``. The metadata keep them under "measured".
+        one repeated; with ``preview=False`` it gets row k alone, to hold over its horizon. They do not move the
+        plant: pass their effect as `disturbance`, for example ``disturbance=W @ E.T``. The metadata keep them under
+        "measured".
     faults
         What breaks, see `km.faults`. A signal passes through them in order, y_k after its noise. Run.Y is what the
         controller got. Run.U is what the plant got, which the controller is told at the next step. The metadata
-        name them under "faults".
+        list the faults under "faults".
     rng
-        Seed of noise, disturbance and faults. Each fault draws from random numbers of its own, so noise and
-        disturbance are the same with and without faults.
+        Seed of noise, disturbance and faults. Each fault has its own random generator, so noise and disturbance are
+        the same with and without faults.
     observers
         Called once a step with a Step.
     plans
@@ -155,7 +156,7 @@ def simulate(
         state = plant.state
         return hidden if state is None else np.array(state, dtype=np.float64)
 
-    rows.setflags(write=False)  # they are the Run's own
+    rows.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
     taken: list[Step] = []
     hidden = np.full(nx, np.nan)
     look_ahead = getattr(controller, "plan", None) if plans or observers else None
@@ -229,7 +230,7 @@ def _reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
 
 
 def _asked(controller: Controller) -> Callable[..., Move]:
-    """Return the call of the controller, where writing into the reference is an error of ours."""
+    """Return the controller's call; if it writes into the read-only reference, a DataError says so."""
     call = cast("Callable[..., Move]", controller)
 
     def ask(*arguments: Any, **more: Any) -> Move:
@@ -263,7 +264,10 @@ def _rows_ahead(
 
 
 def _held(u_reference: ArrayLike | None, cost: Cost | None, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
-    """Return one row a step of the inputs from which the metrics count: as given, or those of the cost's u_target."""
+    """Return the reference input of each step, for the metrics.
+
+    It is `u_reference` if given, else the cost's u_target if that is given as numbers, else zero.
+    """
     if u_reference is None:
         given = None if cost is None else cost.given_inputs(nu)
         if given is None:

@@ -33,12 +33,12 @@ _VIEWS = ("_met", "_met_low", "_met_high")
 class KoopmanMPC(MPCBase):
     """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
 
-    The backward Riccati recursion gives the unconstrained plan as one matrix–vector product of [z, 1], or of
-    [z, u_{−1}, w, d, 1] where those matter; where that plan meets every limit it is the optimum (status
-    UNCONSTRAINED). Otherwise the condensed QP is solved for the deviation from it, warm-started with the last
-    solution moved on by one step (OPTIMAL, or SOFTENED where a limit had to give way). A failed step falls back on
-    the last plan, then on the clipped unconstrained input, then on the last input. Inputs always keep their limits.
-    Their changes keep hard limits wherever the two do not exclude each other.
+    The backward Riccati recursion gives one matrix; times [z, 1], or [z, u_{−1}, w, d, 1] if those matter, it is the
+    unconstrained plan. If that plan meets every limit, it is the optimum (status UNCONSTRAINED). Otherwise the
+    condensed QP is solved for the deviation from that plan. It is warm-started with the last solution, shifted by one
+    step (OPTIMAL, or SOFTENED if a limit had to give way). A failed step falls back on the last plan, then on the
+    clipped unconstrained input, then on the last input. Inputs always keep their limits. Hard limits on their changes
+    are kept, too, unless they contradict the limits of the inputs.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
@@ -51,15 +51,16 @@ class KoopmanMPC(MPCBase):
     horizon
         N steps of the predictor's dt.
     moves
-        How many inputs the plan has: M of them, the last held to the end of the horizon, or the lengths of the
-        blocks of steps in which each is held. By default one a step.
+        Move blocking. A number M: M inputs, the last one held to the end of the horizon. A sequence: how many steps
+        each input is held; they sum to N. By default every step has its own input.
     estimator
         Estimates z and a disturbance d of every lifted coordinate, so that no offset is left: `LiftedDisturbance`
         where y is the state, `LiftedKalman` where y is some of it. Without one y is the state, and d zero.
     latency
         Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts at
-        the state that is predicted for that time. Until the first input of a run arrives, zero is supposed to act,
-        or the limit nearest to it. The attribute `horizon`, the steps of reference that are read, is N + latency.
+        the state that is predicted for that time. Until the first input of a run takes effect, the controller
+        assumes that the `u_prev` of `reset` acts: by default zero, or the limit nearest to zero if zero is not
+        allowed. The attribute `horizon` is N + latency: how many steps ahead the reference is read.
     solver
         The solver that is asked first: "osqp", an operator-splitting method, or "daqp", an active-set method. A QP that
         OSQP has not solved in 100 iterations, or in the ``max_iter`` of `settings`, is handed over to DAQP.
@@ -86,7 +87,7 @@ class KoopmanMPC(MPCBase):
     control", Automatica 93, 2018.
     """
 
-    _wanted: ClassVar[Coordinates | None] = None  # the coordinates of the QP whatever the solver, in comparisons
+    _wanted: ClassVar[Coordinates | None] = None  # QP coordinates, set by a subclass in tests; None: the solver's
 
     def __init__(
         self,
@@ -133,11 +134,14 @@ class KoopmanMPC(MPCBase):
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
-        self._given_row, self._rows_left = 0, False  # of a u_target that is given in rows, for the next call
+        self._given_row, self._rows_left = 0, False  # if u_target has rows: that of step k, and if another follows
         self._see()
 
     def _see(self) -> None:
-        """Make the views of the bytes that say which limits are met; a copy makes its own."""
+        """Allocate one byte for each limit, met or not, with one numpy view of the lower limits and one of the upper.
+
+        A copy must have its own.
+        """
         rows = len(self._plan)
         self._met = bytearray(2 * rows)
         met = np.frombuffer(self._met, dtype=np.bool_)
@@ -206,12 +210,12 @@ class KoopmanMPC(MPCBase):
         y
             (nx,) measured state, or the (ny,) measurements of the estimator; there NaN is a missed one.
         reference
-            (nr,) held over the horizon, or rows r_k … r_{k+N}, the last repeated; r_{k+N+latency} with latency.
+            (nr,) held over the horizon, or rows r_k … r_{k+N+latency}; missing rows repeat the last one.
         applied
             (nu,) what the plant really got last; by default the last u returned.
         w
-            (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N−1}, the last repeated,
-            w_{k+N+latency−1} with latency; by default zero.
+            (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N+latency−1}; missing rows repeat
+            the last one. By default zero.
         """
         try:
             held = self._token.pop()
@@ -232,7 +236,7 @@ class KoopmanMPC(MPCBase):
             self._map.matrix.dot(origin.known, t)
             np.greater_equal(t, self._map.low, out=self._met_low)
             np.less_equal(t, self._map.high, out=self._met_high)
-            # where 0 is not among them, every limit is met, and nothing is NaN
+            # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
             move = self._limited(t, applied, start) if 0 in self._met else self._unconstrained(t, start)
             watch = self._watch
             return move if watch is None else self._watched(watch, move, applied, start)
@@ -253,7 +257,7 @@ class KoopmanMPC(MPCBase):
         return Plan(Z @ C.T, U)
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
-        """Write the reference's part of the plan into the last column, NaN where a row is."""
+        """Write the reference's part of the plan into the matrix's last column: all NaN if a row is not finite."""
         plan, maps, found = self._map, self._map.maps, self._map.targets
         R = self._reference = reference_rows(reference, self._N, self._reference.shape[1], self._latency)
         given, column = plan.track.given, plan.matrix[:, -1]
@@ -281,10 +285,10 @@ class KoopmanMPC(MPCBase):
         return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
 
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
-        """Go on where the plan breaks a limit, its target does, or something is not finite."""
+        """Handle a step in which the plan or its target breaks a limit, or something is not finite."""
         plan, origin, u_prev = self._map, self._initial, self._initial.u_prev
-        changed = self._with_rates and not (np.abs(u_prev) < HUGE).all()  # what was applied is not known
-        if changed:
+        changed = self._with_rates and not (np.abs(u_prev) < HUGE).all()
+        if changed:  # the applied input was reported as NaN or huge: take the last one returned instead
             u_prev[:] = self._given
             np.dot(plan.matrix, origin.known, out=t)
         if not t.dot(t) < HUGE * HUGE:
@@ -292,7 +296,8 @@ class KoopmanMPC(MPCBase):
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
         n, v = plan.planned, t[: plan.planned]
         if n < len(t) and not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
-            e = plan.disturbance @ origin.drive  # a limit moves a target
+            # the disturbance puts a target outside its limits: use the nearest one inside
+            e = plan.disturbance @ origin.drive
             moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
             v += plan.maps.from_target @ moved.ravel()
             changed = True
@@ -314,7 +319,7 @@ class KoopmanMPC(MPCBase):
         u = U[: self.nu]
         if self._hard_rates is not None:
             u[:] = admitted(u, inputs, self._hard_rates, u_prev)
-        self._plan, self._spare = t, self._plan  # the array of the plan before it is free for the next step
+        self._plan, self._spare = t, self._plan  # swap: the previous plan's array becomes the spare
         self._keep(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
         return self._move(u.copy(), status, found.iterations, start, gave_way, found.solver)

@@ -31,11 +31,14 @@ def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method
     regression
         The regression.
     ridge
-        Weight of ‖[A B] S‖², S the diagonal of column norms; 0 takes the minimum-norm solution, "gcv" chooses.
+        Weight of ‖[A B] S‖², S the diagonal matrix of the regressors' column norms; without a rank, the identity if
+        the regression is not `scaled`. 0: the minimum-norm solution. "gcv": chosen by generalised cross-validation.
     rank
-        Keep so many left singular vectors U_r of the snapshots ψ(x), columns unscaled: z = U_rᵀ ψ(x).
+        How many left singular vectors U_r of the unscaled snapshots ψ(x) to keep; then z = U_rᵀ ψ(x). A share or
+        "hard-threshold" as in `edmd`.
     method
-        "ls", or "tls" or "fb" for snapshots with noise, whose rows hold all of T.
+        "ls"; for noisy snapshots "tls" or "fb". These two need a regression that was read with ``noisy=True``, so
+        that the rows hold all of T.
     """
     ridge = ridge_of(ridge)
     if method not in _WORDS:
@@ -43,7 +46,7 @@ def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method
     if method != "ls" and ridge != 0:
         raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
     rows, nz = regression.rows, regression.lifting.nz
-    if regression.B is not None:  # what is known of x⁺ goes to the left side
+    if regression.B is not None:  # a given B: subtract B u from the targets, and fit A alone
         known = rows.P[:, nz:] @ regression.B.T
         rows = RegressionRows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
     free = regression.inputs if regression.B is None else ()
@@ -81,7 +84,7 @@ def _reduced(
     condition: float,
     sentences: list[str],
 ) -> FitResult:
-    """Regress on [U_rᵀψ(x) u]; Ã = U_rᵀ X′ V_r Σ_r⁻¹ without input (Tu et al. 2014)."""
+    """Return the fit on [U_rᵀψ(x) u]. Without inputs that is Ã = U_rᵀ X′ V_r Σ_r⁻¹ (Tu et al. 2014)."""
     nz = regression.lifting.nz
     basis, words = leading(rows, nz, rank, sentences)
     r = len(basis.T)
@@ -117,7 +120,7 @@ def _reduced(
 
 
 def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
-    """Return the rows without the noise of ψ; a Constant and inputs have none."""
+    """Return the rows with the noise of ψ(x) and ψ(x⁺) projected out; the Constant and the inputs count as exact."""
     nz, one = regression.lifting.nz, Constant().bind(regression.states).names[0]
     exact = [*(i for i, name in enumerate(regression.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
     constants = sum(i < nz for i in exact)
@@ -136,38 +139,43 @@ def edmd(
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
 
-    Nothing is added to the lifting: no state, no constant. C picks the states where the lifting holds them,
-    by name, else it is the least-squares fit of x by ψ(x), its residual in ``report.state_residual``.
+    Nothing is added to the lifting: no state, no constant. C picks by name the states that the lifting holds. The
+    other states it fits by ψ(x) in least squares, with the residual in ``report.state_residual``.
 
     Parameters
     ----------
     episodes
-        No pair spans two of them. A Source, ``Files("logs")`` say, is read in parts that memory need not hold.
+        No snapshot pair crosses from one episode to the next. A Source, e.g. ``Files("logs")``, is read in parts, so
+        the data need not fit in memory.
     lifting
         ψ: R^nx → R^nz.
     embedding
-        ψ acts on the state and its past, ``Delay(2)`` say; C still returns x alone.
+        Delays, e.g. ``Delay(2)``: ψ then acts on the state and its past. C still returns x alone.
     ridge
-        Tikhonov weight on unit-norm columns. With 0, singular values below eps · max(M, nz + nu) of the
-        largest, on unit-norm columns, are cut; the report's route says so. "gcv" chooses by generalised
-        cross-validation, each observable counted relative to its size; the report says what.
+        Tikhonov weight on unit-norm columns. With 0, singular values of the unit-norm columns below
+        eps · max(M, nz + nu) times the largest are cut; ``report.route`` gives the cut. "gcv" chooses the
+        weight by generalised cross-validation, with each observable's error relative to its size; the report holds
+        the chosen value.
     rank
-        With rank=r the columns are unscaled, and the predictor is reduced to z = U_rᵀ ψ(x), A = Ã (r, r),
-        C = C U_r, with the exact modes X′ V Σ⁻¹ W. A truncated SVD depends on the units of the data. A share
-        in (0, 1) keeps the fewest directions with that part of the energy Σσ²; "hard-threshold" keeps those
-        above the optimal threshold for white noise of unknown size (Gavish & Donoho 2014).
+        With rank=r the predictor is reduced to z = U_rᵀ ψ(x), with A = Ã (r, r), C U_r in place of C, and the exact
+        DMD modes X′ V Σ⁻¹ W, W the eigenvectors of Ã. The columns are not scaled, so the truncated SVD depends on
+        the units of the data. A share in (0, 1) keeps the fewest directions with that part of the energy Σσ²;
+        "hard-threshold" keeps those above the optimal threshold for white noise of unknown size (Gavish & Donoho
+        2014).
     method
-        "ls", least squares: noise in ψ(x) shrinks A. "tls", total least squares, takes ψ(x) and ψ(x⁺) as noisy
-        alike, relative to each observable's size; inputs and a Constant as exact. "fb", forward and backward,
-        supposes no sizes, but that the motion can be run backward. Both suppose that noise in x adds to ψ(x).
+        "ls", least squares: noise in ψ(x) shrinks A. "tls", total least squares, assumes equal noise in ψ(x) and
+        ψ(x⁺), relative to each observable's size, and none in the inputs and the Constant. "fb", forward and
+        backward, assumes nothing about the size of the noise, but the motion must be reversible in time. Both treat
+        the noise as added to ψ(x).
     **options
-        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads, w of each pair.
+        ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads the data, and
+        the weight of each pair.
 
     Raises
     ------
     DataError
-        ridge is negative or given with "tls" or "fb", rank too large, an observable not finite on the data, or
-        too few pairs for "tls", or a motion that "fb" cannot run backward.
+        ridge is negative, or is given with "tls" or "fb"; rank is too large; an observable is not finite on the data;
+        "tls" has too few pairs; "fb" meets a motion that cannot be run backward.
 
     Warns
     -----

@@ -72,9 +72,9 @@ def second_moments(
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
     weights
-        w of each pair, 0 or above; by default 1. With Episodes one item an episode, a number or (T,), one a step,
-        of which an embedding of d steps leaves the last T − d; with any source a function Episode → number or
-        (T,). They weigh pairs against each other: residuals are weighted means, and a common factor changes nothing.
+        The weight w of each pair, 0 or above; by default 1. With Episodes one item an episode, a number or (T,), one
+        a step, of which an embedding of d steps leaves the last T − d; with any source a function Episode → number
+        or (T,). They weigh pairs against each other: residuals are weighted means, and a common factor changes nothing.
     workers, scheduler, progress
         As in `koopmpc.parallel.map_tasks`: local processes, a Dask cluster, and what is called after each part.
 
