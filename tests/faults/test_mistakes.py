@@ -1,5 +1,6 @@
 """Mistakes get a sentence of ours: what was got, and what to do."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+
+pytestmark = pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 
 PENDULUM = km.load_problem("pendulum")
 PLANT = km.discretize(PENDULUM.dynamics, 0.05)
