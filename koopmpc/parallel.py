@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sized
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
@@ -93,6 +93,7 @@ class _Pool:
 
     def __init__(self, function: Callable[[Any], Any], workers: int) -> None:
         self.workers = workers
+        _quiet_tracker()
         self._executor = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (function,))
 
     def submit(self, job: QueuedTask[Any]) -> "Future[bytes]":
@@ -188,11 +189,28 @@ def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
     raise KoopmpcError(died(str(job), f"{_TRIES} times"))
 
 
-@contextmanager
-def _one_thread() -> Generator[None]:
+def _quiet_tracker() -> None:
+    """Start the process with which Python removes semaphores that are left behind, without its warnings.
+
+    Of a process that Ctrl-C ended it would write two lines for each semaphore below what the program said last.
+    """
+    if os.name == "posix":
+        from multiprocessing import resource_tracker  # Windows has none
+
+        with _environment({"PYTHONWARNINGS": "ignore::UserWarning"}):
+            resource_tracker.ensure_running()
+
+
+def _one_thread() -> AbstractContextManager[None]:
     """Let processes that start meanwhile inherit one BLAS thread each; numpy reads it when it is imported."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
+    return _environment(ONE_THREAD)
+
+
+@contextmanager
+def _environment(added: dict[str, str]) -> Generator[None]:
+    """Let processes that start meanwhile inherit these variables."""
+    before = {name: os.environ.get(name) for name in added}
+    os.environ.update(added)
     try:
         yield
     finally:

@@ -166,6 +166,25 @@ def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
     assert 'put what the script runs under `if __name__ == "__main__":`' in ended.stderr
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no process that removes semaphores")
+def test_a_program_that_ends_at_once_leaves_no_lines_of_its_workers_semaphores(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        dedent("""
+        import os
+
+        from koopmpc.parallel import map_tasks
+
+        if __name__ == "__main__":
+            results = map_tasks(abs, range(100), workers=2)
+            print(next(results), flush=True)
+            os._exit(3)
+        """)
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "0\n", "")
+
+
 def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
     with pytest.raises(km.errors.DataError, match="workers is 0; it must be at least 1"):
         map_tasks(tasks.square, [1], workers=0)
