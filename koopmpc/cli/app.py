@@ -236,13 +236,15 @@ def view(
     """Open logs in one Rerun viewer, one beside the other or, with --compare, in the same plots."""
     import tempfile
 
-    from koopmpc.recording.viewer import served
+    from koopmpc.recording.viewer import need_display, served
     from koopmpc.recording.viewer import view as open_viewer
     from koopmpc.recording.views.comparison import record_comparison
 
     out = _console()
     with _friendly():
         shown = list(logs)
+        if compare and not web:
+            need_display(logs, options="--compare ")
         if compare:
             shown = [Path(tempfile.mkdtemp(prefix="koopmpc-")) / "comparison.rrd"]
             record_comparison(logs, shown[0])

@@ -78,8 +78,9 @@ class Metrics(Value):
         """Return each figure in words by its name; those of a tracked output in a line of its own, if named."""
         settles = f"{self.settling_time:.3g} s" if np.isfinite(self.settling_time) else "does not settle"
         times = (self.solve_time_p50, self.solve_time_p99, self.solve_time_max)
+        given = not np.isnan(self.cost) or np.isnan(self.final_error).any()
         return {
-            "cost": f"{self.cost:.6g}",
+            "cost": f"{self.cost:.6g}" if given else "none was given",
             **_by_output("tracking rmse", self.tracking_rmse, tracked),
             **_by_output("final error", self.final_error, tracked),
             "violation": f"{self.violation:.3g}",

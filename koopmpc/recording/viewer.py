@@ -110,13 +110,21 @@ def view(logs: str | Path | Sequence[str | Path]) -> None:
         A log does not exist or is no .rrd file, there is no display, or the viewer does not start.
     """
     paths = _existing(logs)
-    if not has_display():
-        raise LogError(
-            f"there is no display to open {paths[0]} on; `koopmpc view --web {shlex.join(paths)}` serves it to a "
-            f"browser, or copy it to a machine with a screen and run `koopmpc view {Path(paths[0]).name}` there"
-        )
+    need_display(paths)
     if not open_viewer(paths, free_port()):
         raise LogError(f"the viewer did not start; run `{program()} {paths[0]}` to see what it says")
+
+
+def need_display(logs: Sequence[str | Path], *, options: str = "") -> None:
+    """Raise a LogError that names other ways to see the logs, where there is no display; `options` end in a space."""
+    if has_display():
+        return
+    names = shlex.join(Path(log).name for log in logs)
+    them = "it" if len(logs) == 1 else "them"
+    raise LogError(
+        f"there is no display to open {names} on; `koopmpc view {options}--web {shlex.join(map(str, logs))}` serves "
+        f"{them} to a browser, or copy {them} to a machine with a screen and run `koopmpc view {options}{names}` there"
+    )
 
 
 @contextmanager
@@ -137,6 +145,9 @@ def served(logs: str | Path | Sequence[str | Path], port: int = WEB_PORT) -> Gen
     server = start_viewer("--serve-web", "--web-viewer-port", str(port), *paths, port=data)
     if server is None:
         raise LogError(f"the server did not start; run `{program()} --serve-web {paths[0]}` to see what it says")
+    deadline = time.monotonic() + _START
+    while not is_up(port) and server.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)  # the page comes up after the data
     try:
         yield f"http://127.0.0.1:{port}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy", data
     finally:

@@ -127,6 +127,7 @@ def test_without_a_cost_there_is_none_and_measurements_stand_in_for_a_hidden_sta
     run = random_run(rng)
     found = km.metrics(run)
     assert np.isnan(found.cost)
+    assert "none was given" in str(found)
     assert (found.violation, found.input_violation) == (0.0, 0.0)
     np.testing.assert_allclose(found.final_error, run.X[-1] - run.reference[-1])
     hidden = replace(run, X=np.full_like(run.X, np.nan), cost=km.Cost(1, 1))

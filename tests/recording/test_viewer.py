@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import koopmpc as km
+from koopmpc.cli.app import app
 from koopmpc.recording import viewer
 from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer
 from tests.recording.runs import make_run
@@ -46,6 +48,17 @@ def test_without_a_display_the_command_for_another_machine_is_told(log: Path, mo
     told = r"there is no display to open .*run\.rrd on; `koopmpc view --web .*`.*, or copy it to a machine with .* run `koopmpc view run\.rrd`"
     with pytest.raises(km.errors.LogError, match=told):
         km.view(log)
+
+
+def test_without_a_display_a_comparison_is_told_by_the_logs_that_it_compares(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer, "has_display", lambda: False)
+    shown = CliRunner().invoke(app, ["view", "--compare", str(log), str(log)])
+    assert shown.exit_code == 2
+    told = " ".join(shown.output.split())
+    assert f"`koopmpc view --compare --web {log} {log}` serves them" in told
+    assert "run `koopmpc view --compare run.rrd run.rrd` there" in told
 
 
 def test_a_viewer_that_does_not_start_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
