@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import osqp
 import pytest
+from scipy.sparse import csc_matrix
 
 import koopmpc as km
 from koopmpc.control.solvers.osqp import DEFAULTS
@@ -78,15 +79,24 @@ class Kept:
         self.limits = self.qp.low - by, self.qp.high - by
         self.solver.shift(by)
 
+    @property
+    def resumes(self):
+        return self.solver.resumes
+
+    def resume(self, time_limit=None):
+        return self.asks(self.solver.resume(time_limit), *(np.zeros(n) for n in self.qp.A.T.shape))
+
     def solve(self, v, y, time_limit=None):
-        solution = self.solver.solve(v, y, time_limit)
+        return self.asks(self.solver.solve(v, y, time_limit), v, y)
+
+    def asks(self, solution, v, y):
         low, high = np.maximum(self.limits[0], -1e30), np.minimum(self.limits[1], 1e30)
         self.asked.append((self.other, low, high, v.copy(), y.copy(), solution.iterations))
         return solution
 
 
 def bare_osqp(qp, settings):
-    solver, (P, A) = osqp.OSQP(), qp.sparse()
+    solver, P, A = osqp.OSQP(), csc_matrix(np.triu(qp.P)), csc_matrix(qp.A)
     low, high = np.maximum(qp.low, -1e30), np.minimum(qp.high, 1e30)
     solver.setup(P, qp.q, A, low, high, verbose=False, **{**DEFAULTS, **settings})
 

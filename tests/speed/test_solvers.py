@@ -8,6 +8,7 @@ import numpy as np
 import osqp
 import pytest
 import scipy.linalg
+from scipy.sparse import csc_matrix
 
 import koopmpc as km
 from tests.control.solvers.random_qps import DEFAULTS, QP, SOLVERS
@@ -84,7 +85,7 @@ def ours(name, loop):
 
 def bare_osqp(loop):
     made = osqp.OSQP()
-    P, D = loop.qp.sparse()
+    P, D = csc_matrix(loop.qp.P), csc_matrix(loop.qp.A)
     made.setup(P, loop.qp.q, D, loop.qp.low, loop.qp.high, verbose=False, **DEFAULTS)
 
     def step(low, high, v, y):

@@ -31,6 +31,8 @@ class QPSolver(ABC):
     """The settings with which it is asked first, while another one may still take over."""
     coordinates: ClassVar[Literal["auto", "riccati", "plain"]] = "riccati"
     """The coordinates of the condensed QP that suit it: in "riccati" the Hessian is the identity; see `condense`."""
+    resumes = False
+    """Whether `resume` can go on from the end of the last solve."""
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._settings, self._stale = dict(settings or {}), False
@@ -113,7 +115,7 @@ class QPSolver(ABC):
 
     def reset(self) -> None:
         """Have the next solve forget what earlier ones left behind."""
-        self._stale = True
+        self._stale, self.resumes = True, False
 
     @abstractmethod
     def _forget(self) -> None:
@@ -132,6 +134,10 @@ class QPSolver(ABC):
             self._forget()
             self._stale = False
         return self._solve(v, y, time_limit)
+
+    def resume(self, time_limit: float | None = None) -> QPSolution:
+        """Solve as `solve` does, from where the last solve ended; only while `resumes`."""
+        raise NotImplementedError(f"{self.name} starts every solve from (v, y)")
 
     @abstractmethod
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
@@ -217,8 +223,20 @@ class StepSolver:
         if room is not None:
             limits, conflict = self._widened(room)
         found, answers = self._ask(self._turn, moved, limits, deadline)
-        iterations = found.iterations
-        for i in [] if answers else [i for i in range(len(self._solvers)) if i != self._turn]:
+        if not answers:
+            found, answers = self._ask_others(found, moved, limits, deadline)
+        if not answers or found.status is not Status.OPTIMAL:
+            self._last = None
+            return found, conflict
+        self._last = found
+        return found, max(conflict, self._gave_way(found, moved, limits)) if self._soft else conflict
+
+    def _ask_others(
+        self, found: QPSolution, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
+    ) -> tuple[QPSolution, bool]:
+        """Ask all other solvers one after the other; return what the last one finds, and whether it is the answer."""
+        iterations, answers = found.iterations, False
+        for i in [i for i in range(len(self._solvers)) if i != self._turn]:
             if deadline is not None and perf_counter() >= deadline:
                 found.status = Status.TIME_LIMIT
                 break
@@ -230,10 +248,7 @@ class StepSolver:
             if found.status is Status.OPTIMAL:  # it keeps a row that has to give way
                 found.status = Status.FAILED
         found.iterations = iterations
-        self._last = found if found.status is Status.OPTIMAL else None
-        if self._last is not None and self._soft:
-            conflict = max(conflict, self._gave_way(found, moved, limits))
-        return found, conflict
+        return found, answers
 
     def _ask(
         self, i: int, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
@@ -246,15 +261,19 @@ class StepSolver:
             solver.shift(moved)
         else:
             solver.set_bounds(limits.low - moved, limits.high - moved)
-        start, last = self._cold, self._last
-        if last is not None:
-            start = np.append(last.v, 0.0)[self.qp.shift_primal], np.append(last.y, 0.0)[self.qp.shift_dual]
         left = None
         if deadline is not None:
             left = deadline - perf_counter()
             left = left / 2 if i == 0 and not solver.exact else left
             left -= min(_AFTER, left / 2)
-        found = solver.solve(*start, left)
+        last = self._last
+        if last is None:
+            found = solver.solve(*self._cold, left)
+        elif solver.resumes:
+            found = solver.resume(left)
+        else:
+            v, y = np.append(last.v, 0.0)[self.qp.shift_primal], np.append(last.y, 0.0)[self.qp.shift_dual]
+            found = solver.solve(v, y, left)
         if solver.exact:
             return found, found.status is Status.OPTIMAL or found.status is Status.INFEASIBLE
         solved = found.status is Status.OPTIMAL
