@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc.errors import DataError, DefinitenessError, ShapeError
 
+HUGE = 1e30  # a state or a reference beyond it is a bad one: its square overflows
+
 
 def array(
     value: ArrayLike,
@@ -161,6 +163,20 @@ def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: s
         raise DataError(
             f"{name} limits cross at index {i}: lower {low[i]:g} is above upper {high[i]:g}; swap or widen them"
         )
+
+
+def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:
+    """Return rows first … first + N of a reference (nr,) that is held or (M, nr) whose last row is repeated.
+
+    What is beyond 1e30 comes back as NaN: it is no reference, and its square overflows.
+    """
+    R = array(reference, "reference", finite=False)
+    if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
+        raise ShapeError(
+            f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{first + N}"
+        )
+    R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
+    return np.ascontiguousarray(R[np.minimum(np.arange(first, first + N + 1), len(R) - 1)])
 
 
 def generator(rng: np.random.Generator | int) -> np.random.Generator:

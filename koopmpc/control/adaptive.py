@@ -11,12 +11,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.checks import numbers
+from koopmpc.checks import HUGE, numbers
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.move import Controller, Fallback, Move, Plan
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.fits.online import OnlineEDMD
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 _BETTER = 0.9  # of the error of the model in use that a new one may have on the memory

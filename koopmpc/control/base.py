@@ -11,15 +11,14 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.checks import numbers
+from koopmpc.checks import HUGE, numbers
 from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import admitted
 from koopmpc.control.monitor import Monitor, Watch
-from koopmpc.control.move import Fallback, Move, Status, token
+from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.saved import Kind, SavedController
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
-from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import save_value
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -222,7 +221,7 @@ class MPCBase:
         self._initial = InitialCondition(
             model, observer, self._N, self._latency, with_rates=with_rates, estimated=estimator is not None
         )
-        self._token, self._inside = token(), 0
+        self._token, self._inside = [0], 0
         self._watch = None if monitor is None else Watch(monitor, model, self._latency)
         MPCBase.reset(self)
 
@@ -282,7 +281,7 @@ class MPCBase:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._token, self._inside = token(), 0  # that of the original may be in use
+        self._token, self._inside = [0], 0  # that of the original may be in use
 
     @property
     def observer(self) -> StateObserver:

@@ -18,8 +18,6 @@ from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
-_SHARES = (1.0, 0.7, 0.45)  # of the states' sizes at which observables are read for theirs
-_LEAST = 1e-150  # what an observable that vanishes there is smaller than
 _CONSTANT = 1e-12  # share of the mean square below which a variance is rounding
 Read = TypeVar("Read", np.ndarray, ca.Function)
 
@@ -143,13 +141,15 @@ class Sizes(NamedTuple):
 
     @staticmethod
     def of(
-        cost: Cost, limits: Limits, states: Sequence[str], nu: int, ranges: Mapping[str, float] | None = None
+        tracked: Lifting,
+        Q: Float[np.ndarray, "nr nr"],
+        R: Float[np.ndarray, "nu nu"],
+        limits: Limits,
+        states: Sequence[str],
+        ranges: Mapping[str, float] | None,
     ) -> "Sizes":
-        """Return the sizes under a cost and limits; `ranges` are half of those of the data, by name."""
-        if nu == 0:
-            raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
-        tracked = cost.of.bind(states)
-        (Q, R), known = cost.matrices(tracked.nz, nu), dict(ranges or {})
+        """Return the sizes under the weights of a cost and limits; `ranges` are half of those of the data, by name."""
+        nu, known = len(R), dict(ranges or {})
         names = [*states, *(() if limits.of is None else limits.of.bind(states).names)]
         ends, inputs = limits.ends(len(states), len(names) - len(states)), limits.inputs(nu)
         known |= {name: float(half) for name, half in zip(names, half_width(ends), strict=True) if half > 0}
@@ -162,13 +162,9 @@ class Sizes(NamedTuple):
             priced = [weights[name] * end**2 for name, end in far.items() if weights.get(name, 0.0) > 0]
         scale = max(priced or [*weights.values(), *R.diagonal()]) or 1.0
         mean = float(np.mean([price for price in prices if price > 0] or [scale]))
-
-        def size(name: str) -> float:
-            if known.get(name, 0.0) > 0:
-                return known[name]
-            return np.sqrt(mean / weights[name]) if weights.get(name, 0.0) > 0 else far.get(name, 1.0)
-
-        rows = np.array([size(name) for name in names])
+        alike = {name: np.sqrt(mean / weight) for name, weight in weights.items() if weight > 0}
+        found = {**far, **alike, **known}
+        rows = np.array([found.get(name, 1.0) for name in names])
         by_cost = np.sqrt(scale / np.where(R.diagonal() > 0, R.diagonal(), scale))
         return Sizes(rows[: len(states)], np.where(widths > 0, widths, by_cost), rows, float(scale))
 
@@ -190,22 +186,6 @@ def data_ranges(model: LinearPredictor | BilinearPredictor) -> dict[str, float]:
     half = np.sqrt(3 * np.where(known, spread, 0.0))
     names = [*model.lifting.names, *model.states]
     return {name: float(value) for name, value in zip(names, half, strict=True) if value > 0}
-
-
-def observable_sizes(predictor: LinearPredictor, sizes: Sizes) -> Float[np.ndarray, " nz"]:
-    """Return the sizes of observables: those of a model's data, else the largest |ψ| on the way to the states' sizes.
-
-    An observable that is zero there has size 1.
-    """
-    if predictor.scale is not None:
-        return np.linalg.norm(predictor.scale, axis=0)
-    point = sizes.states
-    if predictor.embedding is not None:
-        point = predictor.embedding.held(sizes.states, sizes.inputs)
-    seen = np.abs(predictor.lifting(np.outer(_SHARES, point))).max(axis=0)
-    if seen.shape != (predictor.nz,):  # a reduced model
-        return np.ones(predictor.nz)
-    return np.where(np.isfinite(seen) & (seen > _LEAST), seen, 1.0)
 
 
 @dataclass(frozen=True)
@@ -259,8 +239,8 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
     C, G = observed(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, observed(predictor, limits.of)])
-    sizes = Sizes.of(cost, limits, predictor.states, predictor.nu, data_ranges(predictor))
-    return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), sizes)
+    states, nu, ranges = predictor.states, predictor.nu, data_ranges(predictor)
+    return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), states, nu, ranges)
 
 
 def state_tracking(
@@ -281,14 +261,15 @@ def state_tracking(
     x, of = point[:nx], cost.of.bind(states)
     bound = None if limits.of is None else limits.of.bind(states)
     values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    sizes = Sizes.of(cost, limits, states, nu, ranges)
     return _tracking(
         ca.Function("tracked", [point], [ca.densify(of.symbolic(x))]),
         lambda kept: ca.Function("limited", [point], [ca.densify(values[np.flatnonzero(kept).tolist(), 0])]),
         cost,
         limits,
         of.nz,
-        sizes,
+        states,
+        nu,
+        ranges,
     )
 
 
@@ -298,9 +279,11 @@ def _tracking(
     cost: Cost,
     limits: Limits,
     nr: int,
-    sizes: Sizes,
+    states: Sequence[str],
+    nu: int,
+    ranges: Mapping[str, float] | None,
 ) -> Tracking[Read]:
-    """Return the weights and limits of nr tracked outputs.
+    """Return the weights and limits of nr tracked outputs of a model with these states and so many inputs.
 
     `limited` makes the map of those outputs that have a limit.
 
@@ -309,9 +292,11 @@ def _tracking(
     DataError
         A row of u_target is outside the limits of the inputs.
     """
-    nx, nu = len(sizes.states), len(sizes.inputs)
+    if nu == 0:
+        raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
+    nx = len(states)
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
-    Q_root, R_root = root(Q), root(R)
+    sizes = Sizes.of(cost.of.bind(states), Q, R, limits, states, ranges)
     sized = limits.sized(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
     low, high = sized.inputs
     if rows is not None:
@@ -340,8 +325,8 @@ def _tracking(
         sized.rows.margin,
         R_delta is not None or sized.rates is not None,
         rows,
-        Q_root,
-        R_root,
+        root(Q),
+        root(R),
         sizes,
     )
 

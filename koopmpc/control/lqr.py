@@ -9,17 +9,17 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.linear.horizon import horizon_of
-from koopmpc.control.move import Fallback, Move, Status, alone, token
+from koopmpc.control.move import Fallback, Move, Status, alone
 from koopmpc.control.riccati import Gain
-from koopmpc.control.target import reference_rows, targets_of
+from koopmpc.control.target import targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.control.units import Units
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 _NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here
@@ -64,7 +64,7 @@ class LQR:
         told = np.concatenate([np.ones(predictor.nw), units.tracked, units.inputs])
         self._v = units.inputs[:, None] * rest.v / told  # the feedforward of [w; r; u_r]
         self._K, self._K_rate = np.split(self.gain.K, [predictor.nz], axis=1)  # the second is of u_{k−1}
-        self._targets, self._inputs, self._nr = targets_of(predictor, cost, track), track.inputs, len(C)
+        self._targets, self._inputs, self._nr = targets_of(predictor, track), track.inputs, len(C)
         self._given_rows = track.given
         self._rates = track.rates
         self._observer = Measured(predictor)
@@ -72,7 +72,7 @@ class LQR:
         self._feedforward = np.zeros(self.nu)
         self._row = 0  # of a given u_target, for the next call
         self._last = np.zeros(self.nu)
-        self._token, self._inside = token(), 0
+        self._token, self._inside = [0], 0
         self.reset()
 
     @property
@@ -154,7 +154,7 @@ class LQR:
 
     def _aim(self, reference: Float[np.ndarray, "..."], w: Float[np.ndarray, " nw"] | None) -> None:
         """Set the feedforward of a reference and a disturbance."""
-        row = reference_rows(reference, 0, self._nr)
+        row = checks.reference_rows(reference, 0, self._nr)
         if not np.isfinite(row).all() or (w is not None and not np.isfinite(w).all()):
             self._feedforward = np.full(self.nu, np.nan)
             return

@@ -102,7 +102,7 @@ def _to_one(G: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "M n"], rank: i
     return G / np.sqrt(bound) if bound > 0 else G
 
 
-def monitor_of(given: Monitor | Episodes | None, model: Any) -> Monitor | None:
+def monitor_of(given: Monitor | Episodes, model: Any) -> Monitor:
     """Return the monitor that a controller was given, or that of the data that it was given.
 
     Raises
@@ -110,8 +110,6 @@ def monitor_of(given: Monitor | Episodes | None, model: Any) -> Monitor | None:
     DataError
         The controller's model was not fitted to data, or the monitor is of another lifting.
     """
-    if given is None:
-        return None
     if not isinstance(model, LinearPredictor | BilinearPredictor):
         raise DataError("a monitor compares with data, and this controller's model is not learned; leave out monitor=")
     monitor = Monitor.of(model, given) if isinstance(given, Episodes) else given

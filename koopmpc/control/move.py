@@ -16,7 +16,8 @@ from koopmpc.errors import DataError, ThreadError
 from koopmpc.values import Value
 
 TurnTaker = TypeVar("TurnTaker", bound=Callable[..., Any])
-# One thread at a time: each controller has a list of one element. `pop` and `append` are atomic and take 20 ns each.
+# One thread at a time: each controller, and each copy of one, has a token of its own: a list of one element, [0].
+# `pop` and `append` are atomic and take 20 ns each.
 Token = list[int]
 
 
@@ -163,11 +164,6 @@ def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
     if M > N:
         raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
     return (1,) * (M - 1) + (N - M + 1,)
-
-
-def token() -> Token:
-    """Return the token of a new controller, or of a copy of one."""
-    return [0]
 
 
 def busy(controller: object) -> ThreadError:

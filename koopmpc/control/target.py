@@ -7,19 +7,19 @@ from jaxtyping import Float
 from scipy.linalg import null_space
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, LiftedTracking, observable_sizes
+from koopmpc.control.cost import LiftedTracking, Sizes
 from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.qp import QP
-from koopmpc.errors import ShapeError
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
 ROUNDING = 1e-9  # by how much of its value and its limit a target may stand outside before it is moved
 KEPT = 10_000  # coordinates remembered before the memory starts anew
+_SHARES = (1.0, 0.7, 0.45)  # of the states' sizes at which observables are read for theirs
+_LEAST = 1e-150  # what an observable that vanishes there is smaller than
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,26 @@ class Targets:
         return self._solvers[count]
 
 
-def targets_of(predictor: LinearPredictor, cost: Cost, tracking: LiftedTracking) -> Targets:
+def observable_sizes(predictor: LinearPredictor, sizes: Sizes) -> Float[np.ndarray, " nz"]:
+    """Return the sizes of observables: those of a model's data, else the largest |ψ| on the way to the states' sizes.
+
+    An observable that is zero there has size 1.
+    """
+    if predictor.scale is not None:
+        return np.linalg.norm(predictor.scale, axis=0)
+    point = sizes.states
+    if predictor.embedding is not None:
+        point = predictor.embedding.held(sizes.states, sizes.inputs)
+    seen = np.abs(predictor.lifting(np.outer(_SHARES, point))).max(axis=0)
+    if seen.shape != (predictor.nz,):  # a reduced model
+        return np.ones(predictor.nz)
+    return np.where(np.isfinite(seen) & (seen > _LEAST), seen, 1.0)
+
+
+def targets_of(predictor: LinearPredictor, track: LiftedTracking) -> Targets:
     """Return the equilibria of a predictor under a cost and limits."""
-    track, hold = tracking, isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
+    u_target = track.cost.u_target
+    hold = isinstance(u_target, str) and u_target == "equilibrium"
     A, B, constant = predictor.A, predictor.B, predictor.lifting.constant_index
     return targets(
         A,
@@ -200,17 +217,3 @@ def targets(
         weighted=weighted,
         from_disturbance=from_disturbance,
     )
-
-
-def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:
-    """Return rows first … first + N of a reference (nr,) that is held or (M, nr) whose last row is repeated.
-
-    What is beyond 1e30 comes back as NaN: it is no reference, and its square overflows.
-    """
-    R = checks.array(reference, "reference", finite=False)
-    if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
-        raise ShapeError(
-            f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{first + N}"
-        )
-    R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
-    return np.ascontiguousarray(R[np.minimum(np.arange(first, first + N + 1), len(R) - 1)])

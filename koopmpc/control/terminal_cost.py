@@ -7,9 +7,9 @@ import scipy.linalg
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
+from koopmpc.checks import HUGE
 from koopmpc.control.riccati import LARGEST, SETTLED, Gain, Stage, gain, iterate, leap, recursion, solved, step
 from koopmpc.errors import DefinitenessError
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or not

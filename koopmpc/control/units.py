@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag, solve_triangular
 
-from koopmpc.control.cost import Cost, LiftedTracking, observable_sizes
+from koopmpc.control.cost import Cost, LiftedTracking
 from koopmpc.control.linear.condense import Condensed
 from koopmpc.control.linear.horizon import Horizon
-from koopmpc.control.target import Targets
+from koopmpc.control.target import Targets, observable_sizes
 from koopmpc.predict.predictors import LinearPredictor
 
 

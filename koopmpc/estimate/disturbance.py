@@ -8,9 +8,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Measured, StateModel
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.lifting.base import HUGE
+from koopmpc.checks import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 

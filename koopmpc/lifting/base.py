@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import HUGE
 from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.plants.compiled import Buffered
 from koopmpc.plants.graph import Graph
@@ -24,7 +25,6 @@ from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
 CONSTANT = "1"  # the name of the observable that is always 1
-HUGE = 1e30  # a state beyond it is a bad measurement
 _BLOCK = 1024  # about the number of rows evaluated at once, so that their observables stay in the cache
 
 

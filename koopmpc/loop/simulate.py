@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -121,7 +121,7 @@ def simulate(
     nx, ny, nu, N = len(states), len(_reading(first, None, 0)), controller.nu, controller.horizon
     if state is not None and np.shape(state) != (nx,):
         raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
-    scene = getattr(plant, "scene", None)
+    scene, model = getattr(plant, "scene", None), predictor_of(controller)
     if nu != len(inputs):
         raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(inputs)} ({inputs})")
     rows = _rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
@@ -162,18 +162,21 @@ def simulate(
     look_ahead = getattr(controller, "plan", None) if plans or observers else None
     x, y, applied = known(), sensed(0, first), None
     controller.reset(x0)
-    ask = _asked(controller)
     for k in range(steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, nr))
         more = {} if W is None else {"w": W[k : k + max(N, 1)] if preview else W[k]}
-        if broken is not None and broken.solver_fails(k) and isinstance(controller, Fallible):
-            controller.solver_fails = True
-            try:
-                move = ask(y.copy(), ahead, applied, **more)
-            finally:
-                controller.solver_fails = False
-        else:
-            move = ask(y.copy(), ahead, applied, **more)
+        failing = controller if broken is not None and broken.solver_fails(k) else None
+        if isinstance(failing, Fallible):
+            failing.solver_fails = True
+        try:
+            move = controller(y.copy(), ahead, applied, **more)
+        except ValueError as error:
+            if "read-only" not in str(error):
+                raise
+            raise DataError("the controller wrote into the reference, which is the Run's own; copy it first") from error
+        finally:
+            if isinstance(failing, Fallible):
+                failing.solver_fails = False
         if k == 0 or type(move) is not Move:
             checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
         u = np.array(move.u, dtype=np.float64)
@@ -209,7 +212,7 @@ def simulate(
         angles=tuple(angles),
         metadata=metadata,
         scene=scene,
-        model=predictor_of(controller),
+        model=model,
     )
 
 
@@ -227,21 +230,6 @@ def _reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
         expected = "(ny,)" if ny is None else f"({ny},), as at reset"
         raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
     return y
-
-
-def _asked(controller: Controller) -> Callable[..., Move]:
-    """Return the controller's call; if it writes into the read-only reference, a DataError says so."""
-    call = cast("Callable[..., Move]", controller)
-
-    def ask(*arguments: Any, **more: Any) -> Move:
-        try:
-            return call(*arguments, **more)
-        except ValueError as error:
-            if "read-only" not in str(error):
-                raise
-            raise DataError("the controller wrote into the reference, which is the Run's own; copy it first") from error
-
-    return ask
 
 
 def predictor_of(controller: object) -> Predictor | None:

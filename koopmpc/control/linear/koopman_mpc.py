@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.checks import numbers
+from koopmpc.checks import HUGE, numbers
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Interval, Limits, admitted
@@ -20,11 +20,9 @@ from koopmpc.control.move import Move, Plan, Status, alone, blocked, busy
 from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
-from koopmpc.control.target import reference_rows
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, started
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 _VIEWS = ("_met", "_met_low", "_met_high")
@@ -121,7 +119,7 @@ class KoopmanMPC(MPCBase):
             time_limit,
             with_rates=track.with_rates,
             move_of=np.repeat(np.arange(len(blocks)), blocks),
-            monitor=monitor_of(monitor, predictor),
+            monitor=None if monitor is None else monitor_of(monitor, predictor),
         )
         self.predictor, self._disturbed = predictor, estimator is not None
         self._options = {"solver": solver, "settings": dict(settings or {})}
@@ -259,7 +257,7 @@ class KoopmanMPC(MPCBase):
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the matrix's last column: all NaN if a row is not finite."""
         plan, maps, found = self._map, self._map.maps, self._map.targets
-        R = self._reference = reference_rows(reference, self._N, self._reference.shape[1], self._latency)
+        R = self._reference = checks.reference_rows(reference, self._N, self._reference.shape[1], self._latency)
         given, column = plan.track.given, plan.matrix[:, -1]
         self._rows_left = given is not None and self._given_row + 1 < len(given)
         if not np.isfinite(R).all():

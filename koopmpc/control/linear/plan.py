@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.limits import Interval, Softness, ahead
 from koopmpc.control.linear.condense import Condensed, Coordinates, condense, row_sizes, scaled
@@ -13,7 +14,6 @@ from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.qp import StepQP
 from koopmpc.control.target import ROUNDING, Targets, targets_of
 from koopmpc.control.units import Units
-from koopmpc.lifting.base import HUGE
 from koopmpc.predict.predictors import LinearPredictor
 
 
@@ -104,7 +104,7 @@ def plan_map(
     disturbed: bool,
 ) -> PlanMap:
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
-    targets = targets_of(predictor, track.cost, track)
+    targets = targets_of(predictor, track)
     horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
     units = Units.of(predictor, track)
     own, aims = units.horizon(horizon), units.targets(targets)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.monitor import Monitor
@@ -20,7 +21,6 @@ from koopmpc.control.saved import Kind
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import heard
-from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 
 EACH, FIRST = 12, 10  # iterations from each start of a first step, and of its best plan, at most
@@ -119,8 +119,7 @@ class BilinearMPC(StagedMPC):
         self._iteration = RealTimeIteration(self._problem)
         self._iteration.theta[:] = self._map.theta
         self._e = self._iteration.e[:, : self._map.nx]
-        self._X, self._U = self._trajectory(self._iteration.X, self._iteration.U)
-        self.reset()
+        self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
 
     def _made_of(self) -> tuple[Kind, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}

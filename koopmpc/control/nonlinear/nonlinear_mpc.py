@@ -98,7 +98,6 @@ class NonlinearMPC(StagedMPC):
         self._own = {"solver": solver, "starts": self._starts, "settings": dict(settings or {})}
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
         self._e = np.zeros((self._N, self._map.nx))
-        self.reset()
 
     def _made_of(self) -> tuple[Kind, ModelOrMap, dict[str, Any]]:
         return "NonlinearMPC", self.model, self._own

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
@@ -17,10 +18,8 @@ from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, alone, blocked
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
-from koopmpc.control.target import reference_rows
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, started
-from koopmpc.lifting.base import HUGE
 from koopmpc.plants.step_map import StepMap
 
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
@@ -69,6 +68,8 @@ class StagedMPC(MPCBase):
         time_limit: float | None,
         monitor: Monitor | Episodes | None,
     ) -> None:
+        self._warm, self._moved, self._row = False, False, 0  # the row is that of a u_target given in rows
+        self._forget_targets()
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx, ranges)
@@ -86,10 +87,9 @@ class StagedMPC(MPCBase):
             time_limit,
             with_rates=self._problem.with_rates,
             move_of=np.arange(N),
-            monitor=monitor_of(monitor, model),
+            monitor=None if monitor is None else monitor_of(monitor, model),
         )
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
-        self._row = 0  # of a u_target that is given in rows, for the next call
         self._disturbed = estimator is not None or given.nw > 0
 
     @property
@@ -106,10 +106,9 @@ class StagedMPC(MPCBase):
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         super().reset(x0, u_prev)
-        self._warm = self._moved = False
-        self._terminal.forget_missed()
+        self._warm, self._moved, self._row = False, False, 0
         self._forget_targets()
-        self._row = 0
+        self._terminal.forget_missed()
         self._e[:] = 0.0
 
     @alone
@@ -213,7 +212,7 @@ class StagedMPC(MPCBase):
         if key == self._reference and not self._moved:
             return True
         if key != self._reference:
-            R = reference_rows(reference, self._N, len(self._outputs.Q), self._latency)
+            R = checks.reference_rows(reference, self._N, len(self._outputs.Q), self._latency)
             self._reference = None
             if not np.isfinite(R).all():
                 return False
@@ -245,16 +244,15 @@ class StagedMPC(MPCBase):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
-        self._targets = self._staged(R[1:], U, end)
+        rated = self._with_rates
+        self._targets = self._rated(R[1:], U, end) if rated else StageTargets(R[1:], U, end.M, end.L, end.m)
         return True
 
-    def _staged(
+    def _rated(
         self, R: Float[np.ndarray, "N nr"], U: Float[np.ndarray, "N nu"], target: TerminalTarget
     ) -> StageTargets:
-        """Return the targets of the stages, of reference rows, reference inputs and a terminal target."""
+        """Return reference rows, reference inputs and a terminal target for stages whose state holds the last input."""
         M, L, V, m = target.M, target.L, target.V, target.m
-        if not self._with_rates:
-            return StageTargets(R, U, M, L, m)
         (n, nr), nx, nu, ns = M.shape, L.shape[1], U.shape[1], self._problem.nx
         M_s, L_s, m_s = np.zeros((ns + nr + nu, nr + nu)), np.zeros((ns + nr + nu, ns)), np.zeros(ns + nr + nu)
         last = slice(nx, nx + nu)
