@@ -130,12 +130,14 @@ class InitialCondition:
             self.u_prev[:] = last if got is None or self._latency else got
         if self.W.size or w is not None:
             self._preview(w)
-        self._sent.append(last.copy())
-        acted = self._sent[0]
+        acted = last
+        if self._latency:
+            self._sent.append(last.copy())
+            acted = self._sent[0]
         if got is not None and (np.abs(got) < HUGE).all():
             acted = got
         good = observer.observe(measured, acted, self._w)
-        if len(self._w):  # an unknown one stays as it was
+        if self._ahead.size:  # an unknown one stays as it was
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         for i in range(self._latency):

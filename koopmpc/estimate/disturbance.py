@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 from math import exp
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -11,6 +13,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Measured, StateModel
+from koopmpc.plants.compiled import interpreter
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
@@ -64,7 +67,8 @@ class LiftedDisturbance(Value):
 class Filtered(Measured):
     """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is.
 
-    The disturbances of what is known are zero: of the Constant, and of a state's past.
+    The disturbances of what is known are zero: of the Constant, and of a state's past. A step is one product,
+    A z + B u + E w, and one call of the CasADi function `_rule`: an observer has half of the time of a step.
 
     Parameters
     ----------
@@ -74,83 +78,97 @@ class Filtered(Measured):
         In (0, 1].
     """
 
+    _OWN = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_evaluate", "_buffer")
+
     def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
         super().__init__(model)
-        self._gain = gain
-        self._C = self._state_rows(model)
-        nz, nx = len(self.d), len(self._C)
-        self._still = np.zeros(nz)
-        # of the newest misfit e and f = C e, and the means of all: [e; f; f² less half the square of its change]
-        self._newest, self._means = np.zeros(nz + 2 * nx), np.zeros(nz + 2 * nx)
-        self._lifted, self._states, self._squares = slice(nz), slice(nz, nz + nx), slice(nz + nx, None)
-        self._known = self._known_places(model)
-        self._forget()
+        own = self._model
+        known = slice(self.ny, None)
+        if isinstance(model, LinearPredictor):
+            constant = model.lifting.constant_index
+            known = slice(0, 0) if constant is None else slice(constant, constant + 1)
+        self._sizes = own.nz, own.nu, own.nw
+        self._rule = _rule(self._sizes, self.ny, known, gain, None if self.lift is None else self.lift.function)
+        self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
+        self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
+        self._see()
+        self._take(model)
 
-    def _state_rows(self, model: LinearPredictor | StateModel) -> Float[np.ndarray, "nx nz"]:
-        """Return the matrix that reads the states from z."""
-        return model.C if isinstance(model, LinearPredictor) else np.eye(self.ny, len(self.d))
+    def _see(self) -> None:
+        """Make the views of the memory, and the call of the rule on these arrays; a copy makes its own."""
+        nz, nu, nw = self._sizes
+        self.z, self._u, self._w, _, self.d = np.split(self._memory, np.cumsum([nz, nu, nw, nz, nz]))[:5]
+        self._driven, self._seen = self._memory[: nz + nu + nw], self._memory[-1:]
+        self._x, self._after = np.zeros(self._rule.numel_in(0)), np.zeros(len(self._memory))
+        arguments = self._x, self._predicted, self._memory, self._C
+        self._evaluate, self._buffer = interpreter(self._rule, arguments, (self._after,))
 
-    def _known_places(self, model: LinearPredictor | StateModel) -> slice:
-        """Return where z is known beforehand."""
-        if not isinstance(model, LinearPredictor):
-            return slice(self.ny, None)
-        known = model.lifting.constant_index
-        return slice(0, 0) if known is None else slice(known, known + 1)
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._OWN}
 
-    def _forget(self) -> None:
-        self._means[:] = 0.0
-        self._learned = False
-        self._sizes, self._weights = np.zeros(len(self._C)), np.zeros(len(self._C))
-        self._last: Float[np.ndarray, " nz"] | None = None
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
+
+    def _take(self, model: LinearPredictor | StateModel) -> None:
+        """Take over the matrices of a model."""
+        linear = isinstance(model, LinearPredictor)
+        self._ABE = np.hstack([model.A, model.B, model.E]) if linear else None
+        self._C[:] = (model.C if linear else np.eye(self.ny, len(self.d))).ravel("F")
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget the last state, all misfits, d and the past; x0 will come as the first measurement."""
         super().reset(x0)
-        self._forget()
+        self._memory[:] = 0.0
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
         super().update(model)
-        self._C = self._state_rows(model)
+        self._take(model)
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and learn from the misfit of the step that led here."""
-        super().observe(y, u, w)
-        z, last = self.z, self._last
-        if not z.dot(z) < HUGE * HUGE:  # False for NaN
-            self._last = None
-            return False
-        if last is not None:
-            self._learn(z - self._model.advance(last, u, w, self._still), z - last)
-        self._last = z.copy()
-        return True
+        self._x[:] = y if self._history is None else self._history.take(y, u)
+        if self._seen[0]:
+            if self._ABE is None:
+                self._predicted[:] = self._model.advance(self.z, u, w, self._still)
+            else:
+                self._u[:] = u
+                if len(w):
+                    self._w[:] = w
+                self._ABE.dot(self._driven, self._predicted)
+        self._evaluate()
+        self._memory[:] = self._after
+        return bool(self._seen[0])
 
-    def _learn(self, misfit: Float[np.ndarray, " nz"], moved: Float[np.ndarray, " nz"]) -> None:
-        """Move d towards the mean of the misfits, by the share of them that was constant."""
-        misfit[self._known] = 0.0
-        if not misfit.dot(misfit) < HUGE * HUGE:
-            return
-        C, newest, means = self._C, self._newest, self._means
-        states, step = C.dot(misfit), C.dot(moved)
-        squares = states * states
-        self._measure(np.maximum(step * step, squares))
-        if self._learned:
-            change = states - newest[self._states]
-            newest[self._squares] = squares - 0.5 * change * change
-        else:
-            newest[self._squares] = squares
-            self._learned = True
-        newest[self._lifted], newest[self._states] = misfit, states
-        means += self._gain * (newest - means)
-        mean, believed = means[self._states], C.dot(self.d)
-        mean = mean * mean
-        varied = float(np.maximum(means[self._squares] - mean, 0.0).dot(self._weights))
-        most = float(np.maximum(mean, believed * believed).dot(self._weights))
-        if varied < most:
-            self.d += (1.0 - varied / most) * (means[self._lifted] - self.d)
 
-    def _measure(self, squares: Float[np.ndarray, " nx"]) -> None:
-        """Weigh each state by one over the square of the largest step or misfit that it has shown."""
-        if (squares > self._sizes).any():
-            self._sizes = np.maximum(self._sizes, squares)
-            np.divide(1.0, self._sizes, out=self._weights, where=self._sizes > 0)
+def _rule(sizes: tuple[int, int, int], nx: int, known: slice, gain: float, lift: ca.Function | None) -> ca.Function:
+    """Return (x, A z + B u + E w, memory, C) → memory after x has come; z = ψ(x), or x itself without a `lift`.
+
+    The memory is [z; u; w; m; d; C e; the mean of (C e)² less half the square of its change; s²; whether there has been
+    a misfit; whether z is known].
+    """
+    nz, nu, nw = sizes
+    x, C = ca.SX.sym("x", nz if lift is None else lift.numel_in(0)), ca.SX.sym("C", nx, nz)
+    predicted, memory = ca.SX.sym("predicted", nz), ca.SX.sym("memory", 3 * nz + nu + nw + 3 * nx + 2)
+    ends = np.cumsum([0, nz, nu + nw, nz, nz, nx, nx, nx, 1, 1]).tolist()
+    last, driven, m, d, f, rough, squares, learned, seen = ca.vertsplit(memory, ends)
+    z = x if lift is None else ca.SX(lift(x))
+    good = ca.dot(z, z) < HUGE**2  # False for NaN
+    unknown = np.ones(nz)
+    unknown[known] = 0.0
+    e = ca.DM(unknown) * (z - predicted)
+    learns = ca.logic_and(ca.logic_and(good, seen), ca.dot(e, e) < HUGE**2)
+    f_new, moved = C @ e, C @ (z - last)
+    squares_new = ca.fmax(squares, ca.fmax(moved**2, f_new**2))
+    weights = ca.if_else(squares_new > 0, 1 / squares_new, 0)
+    m_new = m + gain * (e - m)
+    rough_new = rough + gain * (f_new**2 - 0.5 * learned * (f_new - f) ** 2 - rough)
+    mean = (C @ m_new) ** 2
+    varied = ca.dot(ca.fmax(rough_new - mean, 0), weights)
+    most = ca.dot(ca.fmax(mean, (C @ d) ** 2), weights)
+    d_new = d + ca.if_else(varied < most, 1 - varied / most, 0) * (m_new - d)
+    before = ca.vertcat(m, d, f, rough, squares, learned)
+    after = ca.vertcat(m_new, d_new, f_new, rough_new, squares_new, 1)
+    result = ca.vertcat(z, driven, ca.if_else(learns, after, before), good)
+    return ca.Function("rule", [x, predicted, memory, C], [ca.densify(result)], {"cse": True})

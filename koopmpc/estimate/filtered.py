@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -58,32 +58,59 @@ class FilterModel(NamedTuple):
 class Kalman:
     """The observer of a `LiftedKalman`: s ← s + K (y − M s − h), the gain K from the stationary covariance P.
 
-    Where some of y is NaN the gain is that of the rest; where all is, s is predicted.
+    Where some of y is NaN the gain is that of the rest; where all is, s is predicted. Where all of y has come, without
+    delay, a step is one product, [s; z; d] = Ω [s; u; w; y; 1].
     """
+
+    _VIEWS = ("z", "d", "_s", "_uw", "_y", "_s_new")
 
     def __init__(
         self, model: Callable[[LinearPredictor], FilterModel], predictor: LinearPredictor, delay: int, patience: int
     ) -> None:
         self._model, self._delay, self._patience = model, delay, patience
         self._inputs: deque[Float[np.ndarray, " nuw"]] = deque()
-        self.update(predictor)
-        system = self._system
-        self.ny = len(system.M)
-        self.z: Float[np.ndarray, " nz"] = np.zeros(len(system.one))
-        self.d: Float[np.ndarray, " nz"] = np.zeros(len(system.one))
+        self._take(predictor)
+        self.ny, nz = len(self._system.M), len(self._system.one)
+        n, inputs = self._system.G.shape
+        self._parts = n, inputs, nz
+        self._known, self._found = np.ones(n + inputs + self.ny + 1), np.zeros(n + 2 * nz)
+        self._see()
         self.reset()
+
+    def _see(self) -> None:
+        """Make the views of what the product reads and writes; a copy makes its own."""
+        n, inputs, nz = self._parts
+        self._s, self._uw, self._y, _ = np.split(self._known, [n, n + inputs, n + inputs + self.ny])
+        self._s_new, self.z, self.d = np.split(self._found, [n, n + nz])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with another model, from the same state."""
+        self._take(predictor)
+
+    def _take(self, predictor: LinearPredictor) -> None:
+        """Take over the matrices of a model."""
         self._system, self._P, self._R = self._model(predictor)
         self._gains: dict[bytes, Float[np.ndarray, "n m"]] = {}
+        system = self._system
+        K = self._gain(np.ones(len(system.M), dtype=np.bool_))
+        kept = np.eye(len(system.F)) - K @ system.M
+        s = np.hstack([kept @ system.F, kept @ system.G, K, (kept @ system.f - K @ system.h)[:, None]])
+        self._omega = np.vstack([s, system.to_z @ s, system.to_d @ s])
+        self._omega[len(s) : len(s) + len(system.one), -1] += system.one
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Start at z = ψ(x0), by default ψ(0), and d = 0."""
         system = self._system
         nx = system.predictor.nx
         start = np.zeros(nx) if x0 is None else checks.array(x0, "x0", (nx,))
-        self._s = np.zeros(len(system.F))
+        self._s[:] = 0.0
         self._s[: len(system.kept)] = system.predictor.lift(system.predictor.held(start))[system.kept]
         self._inputs.clear()
         self._started = False
@@ -91,37 +118,50 @@ class Kalman:
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Correct the state of `delay` steps ago with y, and predict it to now through the inputs since."""
+        if self._started and not self._delay:
+            self._uw[: len(u)] = u
+            if len(w):
+                self._uw[len(u) :] = w
+            self._y[:] = y
+            self._omega.dot(self._known, self._found)
+            if self._found.dot(self._found) < HUGE**2:  # False for NaN: some of y is missing
+                self._s[:] = self._s_new
+                self._missed = 0
+                return True
+        return self._corrected(y, u, w)
+
+    def _corrected(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+        """Predict, and correct with what has come of y."""
+        system = self._system
         if self._started:
             self._inputs.append(np.concatenate([u, w]))
         if len(self._inputs) > self._delay:
-            self._s = self._next(self._s, self._inputs.popleft())
+            self._s[:] = self._next(self._s, self._inputs.popleft())
         came = np.abs(y) < HUGE  # False for NaN
         first = len(self._inputs) < self._delay  # y is older than the start
         if not first and came.any():
-            self._s = self._corrected(self._s, y, came)
+            self._s += self._gain(came) @ (y[came] - system.M[came] @ self._s - system.h[came])
         self._missed = 0 if came.any() else self._missed + 1
         self._started = True
         s = self._s
         for v in self._inputs:
             s = self._next(s, v)
-        np.add(self._system.to_z @ s, self._system.one, out=self.z)
-        np.dot(self._system.to_d, s, out=self.d)
+        np.add(system.to_z @ s, system.one, out=self.z)
+        np.dot(system.to_d, s, out=self.d)
         return self._missed <= self._patience and bool(np.abs(s).max() < HUGE)
 
     def _next(self, s: Float[np.ndarray, " n"], v: Float[np.ndarray, " nuw"]) -> Float[np.ndarray, " n"]:
         system = self._system
         return system.F @ s + system.G @ v + system.f
 
-    def _corrected(
-        self, s: Float[np.ndarray, " n"], y: Float[np.ndarray, " ny"], came: Bool[np.ndarray, " ny"]
-    ) -> Float[np.ndarray, " n"]:
-        system = self._system
+    def _gain(self, came: Bool[np.ndarray, " ny"]) -> Float[np.ndarray, "n m"]:
+        """Return the gain of those measurements that have come."""
         key = came.tobytes()
         if key not in self._gains:
-            M, R = system.M[came], self._R[np.ix_(came, came)]
+            M, R = self._system.M[came], self._R[np.ix_(came, came)]
             PM = self._P @ M.T
             S = M @ PM + R
             size = np.sqrt(S.diagonal())[:, None]  # units of the outputs are no ill condition
             scaled = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos"))
             self._gains[key] = (scaled / size).T
-        return s + self._gains[key] @ (y[came] - system.M[came] @ s - system.h[came])
+        return self._gains[key]

@@ -62,7 +62,7 @@ class Buffered(threading.local):
         self.function = function
         self.arguments = tuple(np.zeros(function.size1_in(i)) for i in range(function.n_in()))
         self.results = tuple(np.zeros(function.nnz_out(i)) for i in range(function.n_out()))
-        self.evaluate, self._buffer = _interpreter(function, self.arguments, self.results)
+        self.evaluate, self._buffer = interpreter(function, self.arguments, self.results)
         if not function.is_a("SXFunction"):  # it may hold an integrator
             self.evaluate = heard(self.evaluate)
 
@@ -230,7 +230,7 @@ class Routine:
         call = _machine(function, arguments, results, self._kept)
         self.compiled = call is not None
         if call is None:
-            call, buffer = _interpreter(function, arguments, results)
+            call, buffer = interpreter(function, arguments, results)
             self._kept.append(buffer)
         self.call: Callable[[], object] = call
 
@@ -259,7 +259,7 @@ def _machine(
     return lambda: call(*pointers)
 
 
-def _interpreter(
+def interpreter(
     function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
 ) -> tuple[Callable[[], None], Any]:
     """Return the call that evaluates `function` on these arrays, and its buffer: CasADi keeps no reference to them."""

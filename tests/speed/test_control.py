@@ -223,6 +223,25 @@ def test_whole_step_against_the_bare_solver(benchmark, name, N, outputs):
     )
 
 
+ESTIMATORS = {"relifted": km.LiftedDisturbance(), "filtered": km.LiftedKalman(("theta", "omega"))}
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_step_with_an_estimator(benchmark, model, name):
+    """Steps with nothing active, with an estimator and without, one after the other."""
+    cost, limits, reference = km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25), np.zeros(2)
+    sides = [km.KoopmanMPC(model, cost, limits, 40, estimator=chosen) for chosen in (ESTIMATORS[name], None)]
+    times = []
+    for x in 0.05 * np.random.default_rng(0).normal(size=(8000, 2)):
+        found = [timed(mpc, x, reference) for mpc in sides]
+        assert all(move.status is km.Status.UNCONSTRAINED for _, move in found)
+        times.append([t for t, _ in found])
+    benchmark(sides[0], np.zeros(2), reference)
+    (half, plain), (high, plain_high) = np.quantile(times, [0.5, 0.99], axis=0) * 1e6
+    figures = {"median µs": half, "without µs": plain, "p99 µs": high, "without p99 µs": plain_high}
+    report(benchmark, **figures, ratio=half / plain)
+
+
 class Lifted:
     """A lifting that costs nothing: z is there already."""
 
@@ -236,7 +255,7 @@ def controller(nz, rng):
     B = rng.normal(size=(nz, 1))
     predictor = km.LinearPredictor(A, B, np.eye(2, nz), lifting, 0.05, ("a", "b"), ("u",))
     mpc = km.KoopmanMPC(predictor, km.Cost(1, 1, Q_N=np.eye(nz)), km.Limits(-1e6, 1e6), 40)
-    mpc.observer._lift = Lifted(0.1 * rng.normal(size=nz))
+    mpc.observer.lift = Lifted(0.1 * rng.normal(size=nz))
     return mpc
 
 
