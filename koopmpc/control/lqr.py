@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
+from koopmpc.control.horizon import Units, horizon_of
 from koopmpc.control.limits import Limits, admitted
-from koopmpc.control.linear.horizon import horizon_of
 from koopmpc.control.move import Fallback, Move, Status, alone
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
-from koopmpc.control.units import Units
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.predict.predictors import LinearPredictor

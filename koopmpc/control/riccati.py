@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
+from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dpotrs
 
 from koopmpc.errors import DefinitenessError
@@ -35,6 +36,21 @@ class Stage(NamedTuple):
     e: Float[np.ndarray, "nx nf"] | None = None
     q: Float[np.ndarray, "nx nf"] | None = None
     r: Float[np.ndarray, "nu nf"] | None = None
+
+
+def one_step(
+    A: Float[np.ndarray, "nz nz"],
+    B: Float[np.ndarray, "nz nu"],
+    Q: Float[np.ndarray, "nz nz"],
+    R: Float[np.ndarray, "nu nu"],
+    R_delta: Float[np.ndarray, "nu nu"] | None = None,
+) -> Stage:
+    """Return one step with the cost ‖z‖²_Q + ‖u‖²_R, on [z; u_{k−1}] with ‖u − u_{k−1}‖²_{R_delta} where given."""
+    nz, nu = B.shape
+    if R_delta is None:
+        return Stage(A, B, Q, None, R)
+    M = np.vstack([np.zeros((nz, nu)), -R_delta])
+    return Stage(block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)]), block_diag(Q, R_delta), M, R + R_delta)
 
 
 class Law(NamedTuple):
@@ -85,9 +101,9 @@ def _plain(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[
     K, L, v = np.empty((N, nu, nx)), np.empty((N, nu, nu)), np.empty((N, nu, p_N.shape[1]))
     P, p = P_N, p_N
     for k in range(N - 1, -1, -1):
-        A, B, Q, M, R, e, q, r = stages[k]
+        A, B, _, _, _, e, q, r = stages[k]
         p = p if e is None else p + P @ e
-        K[k], L[k], P = step(A, B, Q, R, P, M)
+        K[k], L[k], P = step(stages[k], P)
         g = B.T @ p if r is None else B.T @ p + r
         v[k] = -solved(L[k], g)
         p = A.T @ p - K[k].T @ g if q is None else q + A.T @ p - K[k].T @ g
@@ -160,31 +176,22 @@ def root(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def step(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    P: Float[np.ndarray, "nz nz"],
-    M: Float[np.ndarray, "nz nu"] | None,
+    stage: Stage, P: Float[np.ndarray, "nz nz"]
 ) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "nz nz"]]:
     """Return K, L and P of the stage before: P ← Q + AᵀPA − KᵀSK."""
-    K, L = gain(A, B, R, P, M)
+    A, B, Q, M = stage.A, stage.B, stage.Q, stage.M
+    K, L = gain(stage, P)
     P = Q + A.T @ (P @ (A - B @ K))
     if M is not None:
         P = P - M @ K
     return K, L, 0.5 * (P + P.T)
 
 
-def gain(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    R: Float[np.ndarray, "nu nu"],
-    P: Float[np.ndarray, "nz nz"],
-    M: Float[np.ndarray, "nz nu"] | None,
-) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"]]:
+def gain(stage: Stage, P: Float[np.ndarray, "nz nz"]) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"]]:
     """Return K = S⁻¹(BᵀPA + Mᵀ) and the L of S = R + BᵀPB = L Lᵀ."""
+    A, B, M = stage.A, stage.B, stage.M
     BP = B.T @ P
-    S = R + BP @ B
+    S = stage.R + BP @ B
     L, info = dpotrf(S, lower=1)
     if info:
         least = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
@@ -200,14 +207,29 @@ def solved(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> F
     return np.ascontiguousarray(dpotrs(L, right, lower=1)[0])
 
 
-def leap(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    M: Float[np.ndarray, "nz nu"] | None,
-    most: int,
-) -> tuple[Float[np.ndarray, "nz nz"], int]:
+def stationary(stage: Stage, most: int) -> Gain:
+    """Iterate P ← Q + AᵀPA − KᵀSK from P = Q until K rests, at most `most` steps, all of them `stage`.
+
+    K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
+    weight may take that long to reach an input. The steps before that are taken by doubling, as far as it is safe.
+    A Constant, or any other mode that u cannot move, only makes its own entries of P grow. Where P has grown by 1e12,
+    such a mode is unstable and has taken over; the iteration then runs on the controllable part alone.
+    """
+    try:
+        start, taken = leap(stage, most)
+        found, bounded = iterate(stage, start, most - taken)
+        if bounded:
+            return found
+    except DefinitenessError:  # R + BᵀQB is not positive definite, or P has lost its digits
+        pass
+    found, bounded = iterate(stage, stage.Q, most)
+    if not bounded:
+        V = controllable(stage.A, stage.B)
+        found, _ = iterate(stage._replace(A=stage.A @ V @ V.T), stage.Q, most)
+    return found
+
+
+def leap(stage: Stage, most: int) -> tuple[Float[np.ndarray, "nz nz"], int]:
     """Return P after so many steps of the difference equation, a power of two below `most`, by doubling.
 
     P = Q + H after n steps, and after 2n with
@@ -218,7 +240,8 @@ def leap(
     Chu, Fan, Lin & Wang, "Structure-preserving algorithms for periodic discrete-time algebraic Riccati equations",
     Int. J. Control 77, 2004.
     """
-    K, L, P = step(A, B, Q, R, Q, M)
+    A, B, Q = stage.A, stage.B, stage.Q
+    K, L, P = step(stage, Q)
     H, G, Phi, taken = P - Q, B @ solved(L, B.T), A - B @ K, 1
     nz, one = len(A), np.eye(len(A))
     large = LEAPT * max(1.0, float(abs(Phi).max()))
@@ -231,32 +254,39 @@ def leap(
         if info or not abs(Phi).max() <= large:
             break
         H, G, taken = H + new, G + 0.5 * (G_new + G_new.T), 2 * taken
-        K_last, K = K, gain(A, B, R, Q + H, M)[0]
+        K_last, K = K, gain(stage, Q + H)[0]
         if abs(K - K_last).max() <= SETTLED * abs(K).max():
             break
     return Q + H, taken
 
 
-def iterate(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    M: Float[np.ndarray, "nz nu"] | None,
-    P: Float[np.ndarray, "nz nz"],
-    most: int,
-) -> tuple[Gain, bool]:
+def iterate(stage: Stage, P: Float[np.ndarray, "nz nz"], most: int) -> tuple[Gain, bool]:
     """Return the last gain of the iteration from P, and whether P stayed below `LARGEST`."""
-    K = np.zeros((B.shape[1], A.shape[0]))
-    scale = max(float(np.abs(Q).max(initial=0.0)), float(np.abs(R).max(initial=0.0)))
+    n, nu = stage.B.shape
+    K = np.zeros((nu, n))
+    scale = max(float(np.abs(weight).max(initial=0.0)) for weight in (stage.Q, stage.R))
     rested = 0
     for _ in range(most):
-        K_next, _, P_next = step(A, B, Q, R, P, M)
+        K_next, _, P_next = step(stage, P)
         if not P_next.max() <= LARGEST * scale:  # P ⪰ 0: its largest entry is on its diagonal; False for NaN
             return Gain(K, P), False
         moved = abs(K_next - K).max()
         P, K = P_next, K_next
         rested = rested + 1 if moved <= SETTLED * abs(K).max() else 0
-        if rested >= min(len(A), RESTS):
+        if rested >= min(n, RESTS):
             break
     return Gain(K, P), True
+
+
+def controllable(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nc"]:
+    """Return an orthonormal basis of the controllable subspace, the span of [B, AB, A²B, …]."""
+    V = np.empty((len(A), 0))
+    new, least = B, SETTLED * float(np.linalg.norm(B, 2))
+    while new.shape[1] and V.shape[1] < len(A):
+        for _ in range(2):  # twice is enough for orthogonality to rounding
+            new = new - V @ (V.T @ new)
+        left, sigma, _ = np.linalg.svd(new, full_matrices=False)
+        left = left[:, sigma > least]
+        V = np.hstack([V, left])
+        new, least = A @ left, SETTLED * float(np.linalg.norm(A, 2))
+    return V

@@ -1,15 +1,33 @@
-"""Tail: what the steps after a horizon cost, the same tracking problem going on without limits, its signals held."""
+"""The terminal cost: what the state at the end of a horizon costs, by a given Q_N or by a tail of further steps.
+
+The tail is the same tracking problem going on without limits, its signals held.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
-from scipy.linalg import block_diag
 
+from koopmpc import checks
 from koopmpc.checks import HUGE
-from koopmpc.control.riccati import LARGEST, SETTLED, Gain, Stage, gain, iterate, leap, recursion, solved, step
-from koopmpc.errors import DefinitenessError
+from koopmpc.control.cost import Cost
+from koopmpc.control.horizon import Horizon, input_target
+from koopmpc.control.riccati import (
+    LARGEST,
+    SETTLED,
+    Stage,
+    controllable,
+    gain,
+    one_step,
+    recursion,
+    solved,
+    stationary,
+    step,
+)
+from koopmpc.control.target import Targets
+from koopmpc.errors import DefinitenessError, ShapeError
+from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
 ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or not
@@ -19,6 +37,83 @@ APART = 1e6  # entries of the eigenvectors' transform up to which modes can be t
 AHEAD = 10  # horizons within which the gain of a learned model rests, or else its tail is as long as the horizon
 
 
+class Terminal(NamedTuple):
+    """V = ξ_NᵀP ξ_N + 2 ξ_Nᵀ(p f + p_r r_N + p_α α_N + p_u u_N) + const, ξ_N = z_N or [z_N; u_{N−1}].
+
+    f are the horizon's signals, r_N the last reference row, α_N the coordinates of its target and u_N its input target
+    where that is given as numbers.
+    """
+
+    P: Float[np.ndarray, "nx nx"]
+    p: Float[np.ndarray, "nx nf"]
+    reference: Float[np.ndarray, "nx nr"]
+    target: Float[np.ndarray, "nx na"]
+    given: Float[np.ndarray, "nx nu"]
+
+
+def terminal_of(
+    predictor: LinearPredictor,
+    cost: Cost,
+    horizon: Horizon,
+    targets: Targets,
+    inverse: Float[np.ndarray, "nz nz"] | None = None,
+) -> Terminal:
+    """Return the terminal cost that `cost` asks for; `inverse` takes z into the coordinates of the horizon.
+
+    The default tail of a model with a fit report or a scale is no longer than the model is accurate, see
+    `learned_steps`; that of a given model goes on until it rests.
+
+    Raises
+    ------
+    ShapeError
+        Q_N has another size than z or the state, or weighs a state of which there is no reference.
+    """
+    if cost.Q_N is not None:
+        return _given(predictor, cost, horizon, targets)
+    h, signals, size = horizon, horizon.signals, horizon.size
+    last, d = signals.w[h.N - 1], signals.d
+    D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
+    stage, steps = tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), cost.tail
+    if steps is None and not (predictor.report is None and predictor.scale is None):
+        steps = learned_steps(stage, predictor, h.N, inverse)
+    tail = tail_of(stage, steps)
+    n, nr = len(tail.P), len(h.C)
+    P, p_g = np.zeros((size, size)), np.zeros((size, tail.p.shape[1]))
+    P[:n, :n], p_g[:n] = tail.P, tail.p  # u_{N−1} may be there for its limits alone
+    of_e, of_r, of_u = np.split(p_g, [D.shape[1], D.shape[1] + nr], axis=1)
+    p = of_u @ input_target(h, targets)
+    p[:, last] += of_e[:, : signals.nw]
+    p[:, d] += of_e[:, signals.nw :]
+    return Terminal(P, p, of_r, of_u @ targets.W, of_u)
+
+
+def _given(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targets) -> Terminal:
+    """Return ‖x_N − r_N‖² or ‖z_N − z_r‖² in the weight Q_N."""
+    Q_N = np.asarray(cost.Q_N)
+    (nz, nu), nx = h.B.shape, predictor.nx
+    own = len(Q_N) if Q_N.ndim else nx
+    on_state = own == nx and isinstance(cost.of, State) and cost.of.whole
+    if own == nx != nz and not on_state:
+        raise ShapeError(f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})")
+    if own not in (nx, nz):
+        raise ShapeError(f"Q_N has shape {Q_N.shape}, expected ({nx}, {nx}) on the state or ({nz}, {nz}) on z")
+    weight = checks.weight(Q_N, "Q_N", own)
+    P, p = np.zeros((h.size, h.size)), np.zeros((h.size, h.signals.size))
+    reference, target = np.zeros((h.size, len(h.C))), np.zeros((h.size, targets.Z.shape[1]))
+    given = np.zeros((h.size, nu))
+    if on_state:
+        P[:nz, :nz] = h.C.T @ weight @ h.C
+        reference[:nz] = -h.C.T @ weight
+        return Terminal(P, p, reference, target, given)
+    z_r = np.zeros((nz, h.signals.size))
+    z_r[:, -1] = targets.z0
+    moved = h.disturbance(h.N - 1)
+    if moved is not None:
+        z_r += targets.z_disturbance @ moved
+    P[:nz, :nz], p[:nz], target[:nz] = weight, -weight @ z_r, -weight @ targets.Z
+    return Terminal(P, p, reference, target, given)
+
+
 class Tail(NamedTuple):
     """The cost-to-go V(ξ) = ξᵀP ξ + 2 ξᵀp g + const, and the law u = −K ξ + v g of the step before it."""
 
@@ -26,21 +121,6 @@ class Tail(NamedTuple):
     p: Float[np.ndarray, "nx ng"]
     K: Float[np.ndarray, "nu nx"]
     v: Float[np.ndarray, "nu ng"]
-
-
-def one_step(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    R_delta: Float[np.ndarray, "nu nu"] | None,
-) -> Stage:
-    """Return one step with the cost ‖z‖²_Q + ‖u‖²_R, on [z; u_{k−1}] with ‖u − u_{k−1}‖²_{R_delta} where given."""
-    nz, nu = B.shape
-    if R_delta is None:
-        return Stage(A, B, Q, None, R)
-    M = np.vstack([np.zeros((nz, nu)), -R_delta])
-    return Stage(block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)]), block_diag(Q, R_delta), M, R + R_delta)
 
 
 def tail_stage(
@@ -77,15 +157,15 @@ def tail_of(stage: Stage, steps: int | None) -> Tail:
     DefinitenessError
         R + BᵀPB is not positive definite at some step.
     """
-    A, B, Q, M, R, e, q, r = stage
+    A, B, _, _, _, e, q, r = stage
     if e is None or q is None or r is None:
         raise ValueError("a stage of a tail knows its signals")
     if steps is not None:
         last = _last(stage)
         law = recursion([stage] * max(steps, 1), last, q)
         return Tail(law.P, law.p, law.K[0], law.v[0]) if steps else Tail(last, q, law.K[0], law.v[0])
-    P = stationary(A, B, Q, R, ITERATIONS, M).P
-    K, L = gain(A, B, R, P, M)
+    P = stationary(stage, ITERATIONS).P
+    K, L = gain(stage, P)
     p = _resting(A - B @ K, q + (A - B @ K).T @ (P @ e) - K.T @ r, B)
     return Tail(P, p, K, -solved(L, B.T @ (p + P @ e) + r))
 
@@ -115,12 +195,12 @@ def learned_steps(
     enough = max(float(np.sqrt(np.mean(missed**2))) if missed.size else 0.0, SETTLED)
     if inverse is not None:
         spread = spread @ inverse.T
-    A, B, P, M, R = stage.A, stage.B, _last(stage), stage.M, stage.R
+    P = _last(stage)
     (nz, _), needed, rested = scale.shape, len(predictor.lifting.bound or ()), 0
-    K = np.zeros((B.shape[1], len(A)))
+    K = np.zeros(stage.B.T.shape)
     for n in range(1, AHEAD * N + 1):
         try:
-            K_next, L, P = step(A, B, stage.Q, R, P, M)
+            K_next, L, P = step(stage, P)
         except DefinitenessError:  # P has lost its digits
             break
         if not np.abs(P).max() < HUGE:
@@ -206,46 +286,3 @@ def _sizes(T: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
             result[i : i + 2] = np.sqrt(np.linalg.det(T[i : i + 2, i : i + 2]))
         i += 1 + pair
     return result
-
-
-def stationary(
-    A: Float[np.ndarray, "nz nz"],
-    B: Float[np.ndarray, "nz nu"],
-    Q: Float[np.ndarray, "nz nz"],
-    R: Float[np.ndarray, "nu nu"],
-    most: int,
-    M: Float[np.ndarray, "nz nu"] | None = None,
-) -> Gain:
-    """Iterate P ← Q + AᵀPA − KᵀSK from P = Q until K rests, at most `most` steps; the stage cost may hold 2xᵀMu.
-
-    K rests when it moves by less than 1e-9 of its size, for as many steps as z has entries (50 are enough): a
-    weight may take that long to reach an input. The steps before that are taken by doubling, as far as it is safe.
-    A Constant, or any other mode that u cannot move, only makes its own entries of P grow. Where P has grown by 1e12,
-    such a mode is unstable and has taken over; the iteration then runs on the controllable part alone.
-    """
-    try:
-        start, taken = leap(A, B, Q, R, M, most)
-        found, bounded = iterate(A, B, Q, R, M, start, most - taken)
-        if bounded:
-            return found
-    except DefinitenessError:  # R + BᵀQB is not positive definite, or P has lost its digits
-        pass
-    found, bounded = iterate(A, B, Q, R, M, Q, most)
-    if not bounded:
-        V = controllable(A, B)
-        found, _ = iterate(A @ V @ V.T, B, Q, R, M, Q, most)
-    return found
-
-
-def controllable(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nc"]:
-    """Return an orthonormal basis of the controllable subspace, the span of [B, AB, A²B, …]."""
-    V = np.empty((len(A), 0))
-    new, least = B, SETTLED * float(np.linalg.norm(B, 2))
-    while new.shape[1] and V.shape[1] < len(A):
-        for _ in range(2):  # twice is enough for orthogonality to rounding
-            new = new - V @ (V.T @ new)
-        left, sigma, _ = np.linalg.svd(new, full_matrices=False)
-        left = left[:, sigma > least]
-        V = np.hstack([V, left])
-        new, least = A @ left, SETTLED * float(np.linalg.norm(A, 2))
-    return V

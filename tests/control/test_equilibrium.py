@@ -10,7 +10,7 @@ import koopmpc as km
 from koopmpc.control.cost import state_tracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria, TerminalTargets
 from koopmpc.control.nonlinear.problem import learned_map
-from koopmpc.control.terminal_cost import stationary
+from koopmpc.control.riccati import one_step, stationary
 from tests.closed_loop.tasks import TASKS
 from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
 from tests.control.test_nonlinear_mpc import pendulum as hinge
@@ -120,7 +120,7 @@ def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_target() 
     far = np.array([1.0, 0.5])
     assert end(far + np.array([2 * np.pi, 0])) == pytest.approx(end(far), rel=1e-9)
     affine = plant.linearize(target.equilibrium.x, target.u)
-    P = stationary(affine.A, affine.B, np.diag([1.0, 0.1]), read.R, 300).P
+    P = stationary(one_step(affine.A, affine.B, np.diag([1.0, 0.1]), read.R), 300).P
     for d in np.array([[1e-3, 0], [0, 1e-3], [1e-3, -2e-3]]):
         assert end(target.equilibrium.x + d) == pytest.approx(d @ P @ d, rel=1e-2)
     assert end(target.equilibrium.x + np.array([np.pi, 0])) > end(

@@ -6,8 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import Stage, iterate, leap, recursion
-from koopmpc.control.terminal_cost import one_step, stationary
+from koopmpc.control.riccati import Stage, iterate, leap, one_step, recursion, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,7 +39,7 @@ def test_dare_residual_and_stability(seed, nx, nu):
     residual = Q + A.T @ P @ (A - B @ K) - P
     assert np.abs(residual).max() <= 1e-8 * (1 + np.abs(P).max()) ** 2
     assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
-    limit = stationary(A, B, Q, R, 10_000)
+    limit = stationary(one_step(A, B, Q, R), 10_000)
     np.testing.assert_allclose(limit.K, K, atol=1e-5 * (1 + np.abs(K).max()))
 
 
@@ -153,7 +152,7 @@ def test_the_difference_equation_is_never_refused(seed, nc, nu, kind):
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     modes = {"one": np.eye(1), "turning": rotation, "unstable": rng.uniform(1.01, 2.0) * rotation}[kind]
     Ac, Bc, T, A, B = with_uncontrollable(rng, nc, nu, modes)
-    K, P = stationary(A, B, np.eye(len(A)), np.eye(nu), 10_000)
+    K, P = stationary(one_step(A, B, np.eye(len(A)), np.eye(nu)), 10_000)
     assert np.isfinite(P).all()
     Kc = (K @ T)[:, :nc]
     assert np.abs(np.linalg.eigvals(Ac - Bc @ Kc)).max() < 1
@@ -177,20 +176,19 @@ def test_a_leap_is_as_many_steps_of_the_difference_equation(seed, nc, nu, kind, 
     _, _, _, A, B = with_uncontrollable(rng, nc, nu, modes)
     Q, R = weights(rng, len(A), nu)
     step = one_step(A, B, Q, 0.0 * R if free == "inputs" else R, R if free == "changes" else None)
-    given = step.A, step.B, step.Q, step.R, step.M
-    P, taken = leap(*given, 400)
+    P, taken = leap(step, 400)
     assert 1 <= taken < 400
     assert taken & (taken - 1) == 0
-    plain, _ = iterate(*given, step.Q, taken)
+    plain, _ = iterate(step, step.Q, taken)
     np.testing.assert_allclose(P, P.T, rtol=0, atol=0)
     np.testing.assert_allclose(
-        iterate(*given, P, 1)[0].K,
-        iterate(*given, plain.P, 1)[0].K,
+        iterate(step, P, 1)[0].K,
+        iterate(step, plain.P, 1)[0].K,
         atol=1e-8 * (1 + np.abs(plain.K).max()),
     )
     if kind == "none":
-        found = stationary(*given[:4], 10_000, step.M).K
-        slow = iterate(*given, step.Q, 10_000)[0].K
+        found = stationary(step, 10_000).K
+        slow = iterate(step, step.Q, 10_000)[0].K
         np.testing.assert_allclose(found, slow, atol=1e-6 * (1 + np.abs(slow).max()))
 
 
@@ -200,13 +198,13 @@ def test_a_weight_may_take_long_to_reach_an_input():
     A = np.diag(np.ones(n - 1), 1)
     A[0, 0] = 1.2
     B = np.eye(n, 1, -n + 1)
-    K = stationary(A, B, np.diag([1.0] + [0.0] * (n - 1)), np.eye(1), 10_000).K
+    K = stationary(one_step(A, B, np.diag([1.0] + [0.0] * (n - 1)), np.eye(1)), 10_000).K
     assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
 
 
 def test_an_input_may_cost_nothing():
     A, B = np.array([[1.1, 0.1], [0, 0.9]]), np.array([[0.0], [1]])
-    K, P = stationary(A, B, np.eye(2), np.zeros((1, 1)), 10_000)
+    K, P = stationary(one_step(A, B, np.eye(2), np.zeros((1, 1))), 10_000)
     np.testing.assert_allclose(np.eye(2) + A.T @ P @ (A - B @ K), P, atol=1e-6)
     assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
 
@@ -234,7 +232,7 @@ def test_the_recursion_is_a_bellman_equation(seed, nx, nu, N):
 def test_messages():
     A, B = np.array([[1.1, 0], [0, 0.5]]), np.array([[1.0], [0]])
     with pytest.raises(km.errors.DefinitenessError, match=r"R \+ BᵀPB is not positive definite: .* is 0; raise R"):
-        stationary(A, B, np.diag([0.0, 1]), np.zeros((1, 1)), 10)
+        stationary(one_step(A, B, np.diag([0.0, 1]), np.zeros((1, 1))), 10)
     with pytest.raises(km.errors.DefinitenessError, match=r"R is not positive definite: .* is 0; raise it"):
         km.lqr(A, B, 1, 0)
     with pytest.raises(

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.riccati import Stage, recursion, rooted
-from koopmpc.control.terminal_cost import one_step
+from koopmpc.control.riccati import Stage, one_step, recursion, rooted
 
 
 def stage_of(rng, nx, nu, rate=False):

@@ -14,11 +14,12 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
-from koopmpc.control.limits import Interval
-from koopmpc.control.linear.horizon import Horizon, Terminal
+from koopmpc.control.horizon import Horizon, Units
 from koopmpc.control.riccati import Law
 from koopmpc.control.target import Targets
+from koopmpc.control.terminal_cost import Terminal
 
 Coordinates = Literal["auto", "riccati", "plain"]
 # cond(H) up to which OSQP in plain coordinates is no slower. Measured on random plants: limits on inputs alone take
@@ -52,9 +53,9 @@ class Condensed:
 
 
 def condense(
-    horizon: Horizon, law: Law, terminal: Terminal, targets: Targets, coordinates: Coordinates = "riccati"
+    horizon: Horizon, law: Law, terminal: Terminal, targets: Targets, units: Units, coordinates: Coordinates
 ) -> Condensed:
-    """Return the maps of a horizon whose blocks follow `law`; "auto" chooses the coordinates by cond(H)."""
+    """Return the maps of a horizon in these units whose blocks follow `law`; "auto" chooses coordinates by cond(H)."""
     h, signals = horizon, horizon.signals
     moves, nu, nx = law.K.shape
     nz, ng, nf = len(h.A), len(h.G), signals.size
@@ -93,7 +94,7 @@ def condense(
     reference, target, given = _asked(h, terminal, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
     most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
     chosen, deviation, hessian = _coordinates(W, n, coordinates, most)
-    return Condensed(
+    maps = Condensed(
         v[:, :nx],
         W @ (reference / unit),
         W @ (target / unit),
@@ -105,25 +106,28 @@ def condense(
         unit,
         chosen,
     )
+    return _of_model(maps, h, units)
 
 
-def scaled(maps: Condensed, inputs: Interval, stages: int) -> Condensed:
-    """Return the same maps for a w of which 1 moves the input with the most room, of its span, to its limit."""
-    D, n = maps.deviation, len(maps.hessian)
-    curvature = np.diag(maps.hessian).reshape(stages, -1).mean(axis=0)
-    columns = np.tile(1 / np.sqrt(curvature), stages)
-    reach = 0.5 * (inputs.high - inputs.low) / row_sizes(D[:n] * columns, stages)
-    known = reach[np.isfinite(reach) & (reach > 0)]
-    size = float(known.max()) if known.size else 1.0
-    columns, share = size * columns, size**2
-    hessian = maps.hessian * np.outer(columns, columns) / share
-    return replace(maps, deviation=D * columns, hessian=hessian, unit=maps.unit * share)
-
-
-def row_sizes(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray, " n"]:
-    """Return the norm of the rows of a stage, root mean square of all stages; 1 for rows that nothing moves."""
-    squares = (rows**2).sum(axis=1).reshape(stages, -1).mean(axis=0)
-    return np.sqrt(np.where(squares > 0, squares, 1.0))
+def _of_model(maps: Condensed, h: Horizon, units: Units) -> Condensed:
+    """Return the maps of a horizon in these units, in those of the model."""
+    moves = len(h.blocks) * (1 + h.bounded)
+    rows = np.concatenate([np.tile(units.inputs, moves), np.tile(units.limited, h.N)])[:, None]
+    back = units.inverse if h.size == len(units.inverse) else block_diag(units.inverse, np.diag(1 / units.inputs))
+    drive, nd = maps.from_drive.copy(), h.signals.nd
+    if nd:
+        drive[:, -nd:] = drive[:, -nd:] @ units.inverse
+    return replace(
+        maps,
+        from_state=rows * (maps.from_state @ back),
+        from_reference=rows * maps.from_reference / np.tile(units.tracked, h.N + 1),
+        from_target=rows * maps.from_target,
+        from_given=rows * maps.from_given / np.tile(units.inputs, h.N + 1),
+        from_drive=rows * drive,
+        offset=rows[:, 0] * maps.offset,
+        deviation=rows * maps.deviation,
+        unit=units.scale * maps.unit,
+    )
 
 
 def _asked(

@@ -25,8 +25,6 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, started
 from koopmpc.predict.predictors import LinearPredictor
 
-_VIEWS = ("_met", "_met_low", "_met_high")
-
 
 class KoopmanMPC(MPCBase):
     """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
@@ -133,24 +131,6 @@ class KoopmanMPC(MPCBase):
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
         self._given_row, self._rows_left = 0, False  # if u_target has rows: that of step k, and if another follows
-        self._see()
-
-    def _see(self) -> None:
-        """Allocate one byte for each limit, met or not, with one numpy view of the lower limits and one of the upper.
-
-        A copy must have its own.
-        """
-        rows = len(self._plan)
-        self._met = bytearray(2 * rows)
-        met = np.frombuffer(self._met, dtype=np.bool_)
-        self._met_low, self._met_high = met[:rows], met[rows:]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._see()
 
     def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:
         return "KoopmanMPC", self.predictor, self._options
@@ -230,12 +210,12 @@ class KoopmanMPC(MPCBase):
             origin.take(y, self._given, applied, w)
             if self._rows_left:  # the next call has its own row of a given u_target
                 self._given_row, self._reference_key = self._given_row + 1, None
-            t = self._spare
-            self._map.matrix.dot(origin.known, t)
-            np.greater_equal(t, self._map.low, out=self._met_low)
-            np.less_equal(t, self._map.high, out=self._met_high)
+            plan, t = self._map, self._spare
+            plan.matrix.dot(origin.known, t)
+            np.greater_equal(t, plan.low, out=plan.met_low)
+            np.less_equal(t, plan.high, out=plan.met_high)
             # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
-            move = self._limited(t, applied, start) if 0 in self._met else self._unconstrained(t, start)
+            move = self._limited(t, applied, start) if 0 in plan.met else self._unconstrained(t, start)
             watch = self._watch
             return move if watch is None else self._watched(watch, move, applied, start)
         finally:

@@ -1,19 +1,20 @@
 """The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.horizon import Horizon, Units, horizon_of, stages
 from koopmpc.control.limits import Interval, Softness, ahead
-from koopmpc.control.linear.condense import Condensed, Coordinates, condense, row_sizes, scaled
-from koopmpc.control.linear.horizon import Horizon, horizon_of, stages, terminal_of
+from koopmpc.control.linear.condense import Condensed, Coordinates, condense
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.qp import StepQP
 from koopmpc.control.target import ROUNDING, Targets, targets_of
-from koopmpc.control.units import Units
+from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
 
 
@@ -60,7 +61,11 @@ class PlanMap:
         Whether a target enters the plan.
     qp
         The QP of w.
+    met
+        A byte for each limit, met or not; `met_low` and `met_high` are views of the lower and of the upper ones.
     """
+
+    _VIEWS = ("met", "met_low", "met_high")
 
     def __init__(self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed) -> None:
         self.track, self.targets, self.maps = track, targets, maps
@@ -93,6 +98,21 @@ class PlanMap:
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
+        self._see()
+
+    def _see(self) -> None:
+        """Make the bytes and their views; a copy makes its own."""
+        rows = len(self.low)
+        self.met = bytearray(2 * rows)
+        met = np.frombuffer(self.met, dtype=np.bool_)
+        self.met_low, self.met_high = met[:rows], met[rows:]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
 
 
 def plan_map(
@@ -108,10 +128,30 @@ def plan_map(
     horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
     units = Units.of(predictor, track)
     own, aims = units.horizon(horizon), units.targets(targets)
-    end = terminal_of(predictor, units.cost(track.cost), own, aims, units.inverse)
-    law = recursion(stages(own, aims), end.P, end.p)
-    maps = units.maps(condense(own, law, end, aims, coordinates), horizon)
-    return PlanMap(track, targets, horizon, scaled(maps, track.inputs, len(blocks)))
+    cost, moves = units.cost(track.cost), stages(own, aims)
+    end = terminal_of(predictor, cost, own, aims, units.inverse)
+    law = recursion(moves, end.P, end.p)
+    maps = condense(own, law, end, aims, units, coordinates)
+    return PlanMap(track, targets, horizon, _scaled(maps, track.inputs, len(blocks)))
+
+
+def _scaled(maps: Condensed, inputs: Interval, stages: int) -> Condensed:
+    """Return the same maps for a w of which 1 moves the input with the most room, of its span, to its limit."""
+    D, n = maps.deviation, len(maps.hessian)
+    curvature = np.diag(maps.hessian).reshape(stages, -1).mean(axis=0)
+    columns = np.tile(1 / np.sqrt(curvature), stages)
+    reach = 0.5 * (inputs.high - inputs.low) / _row_sizes(D[:n] * columns, stages)
+    known = reach[np.isfinite(reach) & (reach > 0)]
+    size = float(known.max()) if known.size else 1.0
+    columns, share = size * columns, size**2
+    hessian = maps.hessian * np.outer(columns, columns) / share
+    return replace(maps, deviation=D * columns, hessian=hessian, unit=maps.unit * share)
+
+
+def _row_sizes(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray, " n"]:
+    """Return the norm of the rows of a stage, root mean square of all stages; 1 for rows that nothing moves."""
+    squares = (rows**2).sum(axis=1).reshape(stages, -1).mean(axis=0)
+    return np.sqrt(np.where(squares > 0, squares, 1.0))
 
 
 def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "nv nw"]) -> PlanLimits:
@@ -128,7 +168,7 @@ def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "
     first = 0
     for bounds, softness, following in groups:
         stages, width = len(following), len(bounds.low)
-        size = row_sizes(D[first : first + stages * width], stages)
+        size = _row_sizes(D[first : first + stages * width], stages)
         place = first + width * following[:, None] + np.arange(width)
         place[following >= stages] = len(D)
         parts.append([*(np.tile(each, stages) for each in (*bounds, *softness, size)), place.ravel()])

@@ -13,8 +13,8 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.nonlinear.problem import LearnedMap, point_sizes
-from koopmpc.control.riccati import root
-from koopmpc.control.terminal_cost import one_step, stationary, tail_of, tail_stage
+from koopmpc.control.riccati import one_step, root, stationary
+from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.interrupts import listening
 from koopmpc.lifting.state import State
@@ -398,8 +398,7 @@ class TerminalTargets:
             R_delta = R_delta * np.outer(su, su) / scale
         seen = J.T @ Q_s @ J
         back, inverse = (np.linalg.pinv(each, rcond=1e-9) for each in (J, seen))
-        step = one_step(A, B, seen, R, R_delta)
-        P = stationary(step.A, step.B, step.Q, step.R, self._most, step.M).P
+        P = stationary(one_step(A, B, seen, R, R_delta), self._most).P
         if self._cost.tail:
             P = tail_of(tail_stage(A, B, np.eye(nx), J, Q_s, R, R_delta), self._cost.tail).P
         n, S = len(P), np.sqrt(scale) * root(P)

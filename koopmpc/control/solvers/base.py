@@ -222,20 +222,21 @@ class StepSolver:
         np.multiply(plan[self._rows], qp.scale, out=moved)
         if room is not None:
             limits, conflict = self._widened(room)
-        found, answers = self._ask(self._turn, moved, limits, deadline)
-        if not answers:
-            found, answers = self._ask_others(found, moved, limits, deadline)
+        found, answers = self._ask_all(moved, limits, deadline)
         if not answers or found.status is not Status.OPTIMAL:
             self._last = None
             return found, conflict
         self._last = found
         return found, max(conflict, self._gave_way(found, moved, limits)) if self._soft else conflict
 
-    def _ask_others(
-        self, found: QPSolution, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
+    def _ask_all(
+        self, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
     ) -> tuple[QPSolution, bool]:
-        """Ask all other solvers one after the other; return what the last one finds, and whether it is the answer."""
-        iterations, answers = found.iterations, False
+        """Ask the solver whose turn it is, then all others; return what the last one finds, and if it is the answer."""
+        found, answers = self._ask(self._turn, moved, limits, deadline)
+        if answers:
+            return found, True
+        iterations = found.iterations
         for i in [i for i in range(len(self._solvers)) if i != self._turn]:
             if deadline is not None and perf_counter() >= deadline:
                 found.status = Status.TIME_LIMIT

@@ -2,48 +2,35 @@
 
 The stages are written in f = [w_0 … w_{N−1}; d; 1], the preview of measured disturbances and a constant disturbance of
 z: what moves the state. What is only tracked, references and the coordinates of targets, comes in when the horizon is
-condensed. What the state at the end of the horizon costs, by the tail of the tracking problem or by a given Q_N, stands
-below the stages.
+condensed.
+
+Recursions and rank decisions lose digits where entries differ by many powers of ten, and where observables are almost
+dependent. So a linear problem is solved in units in which those of a model and of its user mean nothing: z = L q,
+u = D_u ũ, r = D_r r̃, limited outputs D_g g̃, and a cost of `scale` times its own unit.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 
-from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking
 from koopmpc.control.riccati import Stage
-from koopmpc.control.target import Targets
-from koopmpc.control.terminal_cost import learned_steps, tail_of, tail_stage
-from koopmpc.errors import ShapeError
-from koopmpc.lifting.state import State
+from koopmpc.control.target import Targets, observable_sizes
 from koopmpc.predict.predictors import LinearPredictor
 
 
 class SignalLayout(NamedTuple):
-    """Where the entries of f stand, for N steps and the sizes of w and d."""
+    """Where w_0 … w_{N−1} and d stand in f, how many entries these have, and f; the last entry of f is 1."""
 
-    N: int
+    w: tuple[slice, ...]
+    d: slice
     nw: int
     nd: int
-
-    @property
-    def size(self) -> int:
-        """Entries of f."""
-        return self.N * self.nw + self.nd + 1
-
-    def w(self, k: int) -> slice:
-        """w_k."""
-        return slice(k * self.nw, (k + 1) * self.nw)
-
-    @property
-    def d(self) -> slice:
-        """All of d."""
-        return slice(self.N * self.nw, self.N * self.nw + self.nd)
+    size: int
 
 
 @dataclass(frozen=True)
@@ -67,20 +54,16 @@ class Horizon:
     bounded: bool
     disturbed: bool
 
-    @property
-    def N(self) -> int:
-        """Steps."""
-        return sum(self.blocks)
+    N: int = field(init=False)  # steps
+    size: int = field(init=False)  # entries of ξ
+    signals: SignalLayout = field(init=False)
 
-    @property
-    def size(self) -> int:
-        """Entries of ξ."""
-        return len(self.A) + self.B.shape[1] * self.with_rates
-
-    @property
-    def signals(self) -> SignalLayout:
-        """The places in f."""
-        return SignalLayout(self.N, self.E.shape[1], len(self.A) if self.disturbed else 0)
+    def __post_init__(self) -> None:
+        N, nw, (nz, nu) = sum(self.blocks), self.E.shape[1], self.B.shape
+        steps, nd = tuple(slice(k * nw, (k + 1) * nw) for k in range(N)), nz if self.disturbed else 0
+        layout = SignalLayout(steps, slice(N * nw, N * nw + nd), nw, nd, N * nw + nd + 1)
+        for name, value in (("N", N), ("size", nz + nu * self.with_rates), ("signals", layout)):
+            object.__setattr__(self, name, value)
 
     def disturbance(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
         """Return E w_k + d as a matrix on f; None where there is neither."""
@@ -88,7 +71,7 @@ class Horizon:
             return None
         signals = self.signals
         e = np.zeros((len(self.A), signals.size))
-        e[:, signals.w(k)] = self.E
+        e[:, signals.w[k]] = self.E
         e[:, signals.d] = np.eye(len(self.A), signals.nd)
         return e
 
@@ -178,78 +161,77 @@ def horizon_of(
     )
 
 
-class Terminal(NamedTuple):
-    """V = ξ_NᵀP ξ_N + 2 ξ_Nᵀ(p f + p_r r_N + p_α α_N + p_u u_N) + const, ξ_N = z_N or [z_N; u_{N−1}].
+class Units(NamedTuple):
+    """L, its inverse, and the diagonals of D_u, D_r and D_g; see the file."""
 
-    f are the horizon's signals, r_N the last reference row, α_N the coordinates of its target and u_N its input target
-    where that is given as numbers.
-    """
+    L: Float[np.ndarray, "nz nz"]
+    inverse: Float[np.ndarray, "nz nz"]
+    inputs: Float[np.ndarray, " nu"]
+    tracked: Float[np.ndarray, " nr"]
+    limited: Float[np.ndarray, " ng"]
+    scale: float
 
-    P: Float[np.ndarray, "nx nx"]
-    p: Float[np.ndarray, "nx nf"]
-    reference: Float[np.ndarray, "nx nr"]
-    target: Float[np.ndarray, "nx na"]
-    given: Float[np.ndarray, "nx nu"]
+    @staticmethod
+    def of(predictor: LinearPredictor, track: LiftedTracking) -> "Units":
+        """Return the units of a predictor under a cost and limits.
+
+        L is the transposed factor of the lifted data, in which q has root-mean-square 1 in every direction; for a model
+        that was not fitted the sizes of its observables.
+        """
+        known = predictor.scale
+        L = np.diag(observable_sizes(predictor, track.sizes)) if known is None else known.T.copy()
+        inverse = np.asarray(solve_triangular(L, np.eye(len(L)), lower=True))
+        C, G = (_norms(rows @ L) for rows in (track.tracked, track.limited))
+        return Units(L, inverse, track.sizes.inputs, C, G, track.sizes.scale)
+
+    def horizon(self, h: Horizon) -> Horizon:
+        """Return a horizon in these units."""
+        A, B, E = self.inverse @ h.A @ self.L, self.inverse @ h.B * self.inputs, self.inverse @ h.E
+        C, G = h.C @ self.L / self.tracked[:, None], h.G @ self.L / self.limited[:, None]
+        R_delta = None if h.R_delta is None else self._weight(h.R_delta, self.inputs)
+        Q, R = self._weight(h.Q, self.tracked), self._weight(h.R, self.inputs)
+        return replace(h, A=A, B=B, E=E, C=C, G=G, Q=Q, R=R, R_delta=R_delta)
+
+    def targets(self, targets: Targets) -> Targets:
+        """Return targets, as far as a horizon reads them, in these units."""
+        return replace(
+            targets,
+            z0=self.inverse @ targets.z0,
+            Z=self.inverse @ targets.Z,
+            u0=targets.u0 / self.inputs,
+            W=targets.W / self.inputs[:, None],
+            z_disturbance=self.inverse @ targets.z_disturbance @ self.L,
+            u_disturbance=targets.u_disturbance @ self.L / self.inputs[:, None],
+        )
+
+    def cost(self, cost: Cost) -> Cost:
+        """Return a cost with its Q_N in these units."""
+        if cost.Q_N is None:
+            return cost
+        Q_N = np.asarray(cost.Q_N)
+        if Q_N.ndim < 2:
+            Q_N = np.diag(np.broadcast_to(Q_N, Q_N.shape or (len(self.tracked),)))
+        if len(Q_N) == len(self.L) and len(Q_N) != len(self.tracked):
+            return replace(cost, Q_N=self.L.T @ Q_N @ self.L / self.scale)
+        return replace(cost, Q_N=self._weight(Q_N, self.tracked)) if len(Q_N) == len(self.tracked) else cost
+
+    def gain(self, K: Float[np.ndarray, "nu nx"]) -> Float[np.ndarray, "nu nx"]:
+        """Return the gain of [z; u_{k−1}], or of z, of one in these units."""
+        return self.inputs[:, None] * K @ self._back(K.shape[1])
+
+    def value(self, P: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx nx"]:
+        """Return the P of a value of [z; u_{k−1}], or of z, of one in these units."""
+        back = self._back(len(P))
+        return self.scale * back.T @ P @ back
+
+    def _back(self, size: int) -> Float[np.ndarray, "nx nx"]:
+        """Return what takes [z; u_{k−1}], or z, into these units."""
+        return self.inverse if size == len(self.inverse) else block_diag(self.inverse, np.diag(1 / self.inputs))
+
+    def _weight(self, Q: Float[np.ndarray, "n n"], size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+        return Q * np.outer(size, size) / self.scale
 
 
-def terminal_of(
-    predictor: LinearPredictor,
-    cost: Cost,
-    horizon: Horizon,
-    targets: Targets,
-    inverse: Float[np.ndarray, "nz nz"] | None = None,
-) -> Terminal:
-    """Return the terminal cost that `cost` asks for; `inverse` takes z into the coordinates of the horizon.
-
-    The default tail of a model with a fit report or a scale is no longer than the model is accurate, see
-    `learned_steps`; that of a given model goes on until it rests.
-
-    Raises
-    ------
-    ShapeError
-        Q_N has another size than z or the state, or weighs a state of which there is no reference.
-    """
-    if cost.Q_N is not None:
-        return _given(predictor, cost, horizon, targets)
-    h, signals, size = horizon, horizon.signals, horizon.size
-    last, d = signals.w(h.N - 1), signals.d
-    D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
-    stage, steps = tail_stage(h.A, h.B, D, h.C, h.Q, h.R, h.R_delta), cost.tail
-    if steps is None and not (predictor.report is None and predictor.scale is None):
-        steps = learned_steps(stage, predictor, h.N, inverse)
-    tail = tail_of(stage, steps)
-    n, nr = len(tail.P), len(h.C)
-    P, p_g = np.zeros((size, size)), np.zeros((size, tail.p.shape[1]))
-    P[:n, :n], p_g[:n] = tail.P, tail.p  # u_{N−1} may be there for its limits alone
-    of_e, of_r, of_u = np.split(p_g, [D.shape[1], D.shape[1] + nr], axis=1)
-    p = of_u @ input_target(h, targets)
-    p[:, last] += of_e[:, : signals.nw]
-    p[:, d] += of_e[:, signals.nw :]
-    return Terminal(P, p, of_r, of_u @ targets.W, of_u)
-
-
-def _given(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targets) -> Terminal:
-    """Return ‖x_N − r_N‖² or ‖z_N − z_r‖² in the weight Q_N."""
-    Q_N = np.asarray(cost.Q_N)
-    (nz, nu), nx = h.B.shape, predictor.nx
-    own = len(Q_N) if Q_N.ndim else nx
-    on_state = own == nx and isinstance(cost.of, State) and cost.of.whole
-    if own == nx != nz and not on_state:
-        raise ShapeError(f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})")
-    if own not in (nx, nz):
-        raise ShapeError(f"Q_N has shape {Q_N.shape}, expected ({nx}, {nx}) on the state or ({nz}, {nz}) on z")
-    weight = checks.weight(Q_N, "Q_N", own)
-    P, p = np.zeros((h.size, h.size)), np.zeros((h.size, h.signals.size))
-    reference, target = np.zeros((h.size, len(h.C))), np.zeros((h.size, targets.Z.shape[1]))
-    given = np.zeros((h.size, nu))
-    if on_state:
-        P[:nz, :nz] = h.C.T @ weight @ h.C
-        reference[:nz] = -h.C.T @ weight
-        return Terminal(P, p, reference, target, given)
-    z_r = np.zeros((nz, h.signals.size))
-    z_r[:, -1] = targets.z0
-    moved = h.disturbance(h.N - 1)
-    if moved is not None:
-        z_r += targets.z_disturbance @ moved
-    P[:nz, :nz], p[:nz], target[:nz] = weight, -weight @ z_r, -weight @ targets.Z
-    return Terminal(P, p, reference, target, given)
+def _norms(rows: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, " n"]:
+    size = np.linalg.norm(rows, axis=1)
+    return np.where(size > 0, size, 1.0)
