@@ -1,18 +1,20 @@
-"""listening: a Ctrl-C that a library swallows is raised all the same.
+"""listening, deferred: a Ctrl-C that a library or Python itself swallows is raised all the same.
 
 CasADi asks Python for signals while a solver or an integrator runs, but takes the KeyboardInterrupt that comes of it
-for a failed evaluation: ipopt then reports a failure, CVODES no next state, fatrop nothing at all.
+for a failed evaluation: ipopt then reports a failure, CVODES no next state, fatrop nothing at all. Python drops one
+that comes while an object is deleted.
 """
 
 import signal
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from functools import wraps
+from functools import partial, wraps
 from types import FrameType
 from typing import Any, TypeVar, cast
 
 Call = TypeVar("Call", bound=Callable[..., Any])
+Handler = Callable[[int, FrameType | None], Any]
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -22,29 +24,50 @@ def listening() -> Generator[None]:
 
     Handlers belong to the main thread; in any other one this does nothing. It costs about 5 µs.
     """
+    came: list[int] = []
+
+    def called(handler: Handler, number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        handler(number, frame)
+
+    try:
+        with _handled(called):
+            yield
+    finally:
+        if came:
+            raise KeyboardInterrupt from None
+
+
+@contextmanager
+def deferred() -> Generator[None]:
+    """Call the handlers of Ctrl-C and SIGTERM at the end of the block: what stands in it is done as a whole.
+
+    Handlers belong to the main thread; in any other one this does nothing.
+    """
+    came: list[tuple[int, Handler]] = []
+    try:
+        with _handled(lambda handler, number, _: came.append((number, handler))):
+            yield
+    finally:
+        for number, handler in came:
+            handler(number, None)
+
+
+@contextmanager
+def _handled(call: Callable[[Handler, int, FrameType | None], None]) -> Generator[None]:
+    """Let call(handler, signal, frame) take the place of each handler in this block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came: list[int] = []
     before = {int(number): signal.getsignal(number) for number in _SIGNALS}
-
-    def note(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-        handler = before[number]
-        if callable(handler):
-            handler(number, frame)
-
-    for number, handler in before.items():
-        if callable(handler):
-            signal.signal(number, note)
+    handlers = {number: handler for number, handler in before.items() if callable(handler)}
+    for number, handler in handlers.items():
+        signal.signal(number, partial(call, handler))
     try:
         yield
     finally:
-        for number, handler in before.items():
-            if callable(handler):
-                signal.signal(number, handler)
-        if came:
-            raise KeyboardInterrupt from None
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def heard(call: Call) -> Call:

@@ -13,6 +13,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.figures.plane import Axes, Plane, plane_through
+from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable
 from koopmpc.recording.format.writer import file_recording, times
@@ -35,6 +36,7 @@ Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], on
 Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
 
 
+@heard  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_model(
     predictor: AnyPredictor,
     episodes: Episodes,

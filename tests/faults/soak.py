@@ -86,6 +86,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=int(time.time()))
     asked = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a job in the background ignores
     end, rounds, settled, lost = time.monotonic() + 60 * asked.minutes, 0, 0.0, 0
     with tempfile.TemporaryDirectory() as folder:
         while time.monotonic() < end:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import rerun as rr
 
 import koopmpc as km
 from koopmpc.cli.ending import kept
@@ -93,6 +94,59 @@ def test_an_interrupt_is_never_swallowed_in_python(tmp_path: Path, name: str, co
             _until(end, busy)
         timer.join()
     assert not list(tmp_path.glob(".*.part"))
+
+
+@pytest.fixture(autouse=True)
+def _ctrl_c_is_heard():
+    """Listen to Ctrl-C, which a shell lets its jobs in the background ignore, and with them all that they start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_in_the_last_iteration_of_a_solve_is_raised() -> None:
+    """OSQP takes the signal for itself, and its status says nothing of one that comes after its last look."""
+    from ctypes import CDLL
+
+    from osqp import ext_builtin
+
+    from koopmpc.control.solvers.osqp import _uninterrupted
+
+    library = CDLL(ext_builtin.__file__)
+
+    def solve() -> None:
+        library.osqp_start_interrupt_listener()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # as in another thread, which receives it
+        os.kill(os.getpid(), signal.SIGINT)
+        library.osqp_end_interrupt_listener()
+
+    with pytest.raises(KeyboardInterrupt):
+        _uninterrupted(solve)
+    _uninterrupted(lambda: (library.osqp_start_interrupt_listener(), library.osqp_end_interrupt_listener()))
+
+
+@pytest.mark.parametrize(("kind", "method"), [(threading.Thread, "start"), (rr.RecordingStream, "set_sinks")])
+@pytest.mark.parametrize("begun", [False, True])
+def test_an_interrupt_while_a_log_is_opened_leaves_nothing_and_waits_for_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, method: str, begun: bool
+) -> None:
+    record, done = _record(tmp_path), getattr(kind, method)
+
+    def interrupted(self, *arguments, **options):
+        if begun:
+            done(self, *arguments, **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(kind, method, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            record()
+    assert list(tmp_path.iterdir()) == []
+    for thread in (each for each in threading.enumerate() if each.name == "koopmpc-log"):
+        thread.join(SECONDS)
+        assert not thread.is_alive()
+    record()
+    assert km.load_run(tmp_path / "run.rrd").steps == 50
 
 
 def moments(what: str, count: int) -> list[float]:

@@ -45,7 +45,6 @@ _STRICT = 1e-12  # eps_prim_inf where a first certificate was rounding
 # residual, that one 23 times, and of 1489 true ones all reach 6600 times.
 _CERTAIN, _ROUNDING = 1000.0, 1e-9
 _SHORTEST = 1e-6  # seconds that a solve gets at least
-_INTERRUPTED = 10  # the status of a solve that Ctrl-C ended: OSQP takes the signal for itself
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
 
@@ -195,8 +194,6 @@ class OSQP(QPSolver):
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
         _uninterrupted(self._solver.solve)
         info, solution = self._solver.info, self._solver.solution
-        if int(info.status_val) == _INTERRUPTED:
-            raise KeyboardInterrupt
         status = self._status.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
             status = Status.TIME_LIMIT
@@ -213,17 +210,28 @@ class OSQP(QPSolver):
             self._solver.update_settings(options)
 
 
+@cache
+def _interrupted() -> Callable[[], int]:
+    """Return OSQP's own function that says whether a SIGINT came during the last solve."""
+    from ctypes import CDLL
+
+    from osqp import ext_builtin
+
+    return getattr(CDLL(ext_builtin.__file__), "osqp_is_interrupted", lambda: 0)  # Windows exports no such name
+
+
 def _uninterrupted(solve: Callable[[], object]) -> None:
     """Solve while SIGINT waits: Python raises KeyboardInterrupt right after, some milliseconds later.
 
-    OSQP takes the signal for itself and forgets one that comes in its last iteration. In a program with threads another
-    thread may still receive it; OSQP then ends with the status that says so.
+    OSQP takes the signal for itself. In a program with threads another thread may still receive it; OSQP then ends
+    with a status that says so, or forgets it in its last iteration. It is therefore sent once more.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        solve()
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGINT)
+    mask = getattr(signal, "pthread_sigmask", None)  # Windows has none
+    before = None if mask is None else mask(signal.SIG_BLOCK, _SIGINT)
     try:
         solve()
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if mask is not None:
+            mask(signal.SIG_SETMASK, before)
+    if _interrupted()():
+        signal.raise_signal(signal.SIGINT)

@@ -7,6 +7,7 @@ A group of rows is read without the rest of the file, so that a fit never holds 
 import json
 import zlib
 from dataclasses import dataclass
+from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -92,9 +93,18 @@ def described(path: Path) -> bool:
     Raises
     ------
     LogError
-        It is no .parquet file.
+        It is no .parquet file, or one of ours whose metadata are damaged.
     """
-    return any(key in (_schema(path).metadata or {}) for key in (_KEY, _CHECK))
+    if any(key in (_schema(path).metadata or {}) for key in (_KEY, _CHECK)):
+        return True
+    with path.open("rb") as stream:  # the footer, whose length stands in the eight bytes at the end
+        stream.seek(-8, SEEK_END)
+        length = int.from_bytes(stream.read(4), "little")
+        stream.seek(-8 - length, SEEK_END)
+        footer = stream.read(length)
+    if _KEY in footer or _CHECK in footer:
+        raise LogError(f"{path} holds no episodes that can be read: its metadata are damaged; take another copy")
+    return False
 
 
 def names(path: Path) -> list[str]:

@@ -70,10 +70,13 @@ class LogFile:
             rec.set_sinks(rr.FileSink(self.part), *more, **blueprint)
             return
         end, begin = os.pipe()
-        self._thread = Thread(target=self._pump, args=(end,), name="koopmpc-log", daemon=True)
-        self._thread.start()
-        rec.set_sinks(rr.FileSink(f"{_PIPES}/{begin}"), *more, **blueprint)
-        os.close(begin)  # Rerun holds one of its own
+        try:
+            thread = Thread(target=self._pump, args=(end,), name="koopmpc-log", daemon=True)
+            thread.start()
+            self._thread = thread  # which is waited for only where it runs: an interrupt may come while it starts
+            rec.set_sinks(rr.FileSink(f"{_PIPES}/{begin}"), *more, **blueprint)
+        finally:
+            os.close(begin)  # Rerun holds one of its own
 
     def check(self) -> None:
         """Raise LogError where something could not be written."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
+from koopmpc.interrupts import deferred
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import About, Run
 from koopmpc.predict.base import Predictor
@@ -106,7 +107,7 @@ class Writer:
         self._about, self._scene, self._model = about, scene, model
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._viewer, self._steps = viewer, steps
-        self._rec = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
+        self._rec: Any = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
         self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
@@ -206,15 +207,22 @@ class Writer:
         if self._extent.ranges() != self._shown:
             self._rec.send_blueprint(self._blueprint(), make_active=False)
         self.flush()
-        self._rec.disconnect()
+        self._release()
         if self._file is not None:
             self._file.close()
 
     def discard(self) -> None:
         """Close without an end: of a growing log what was written stays, any other file is removed."""
-        self._rec.disconnect()
+        self._release()
         if self._file is not None:
             self._file.discard()
+
+    def _release(self) -> None:
+        """Close the recording and let go of it; a Ctrl-C waits, for Python drops one that comes in a deletion."""
+        with deferred():
+            if self._rec is not None:
+                self._rec.disconnect()
+            self._rec = None
 
     def _open(self) -> None:
         """Open the sinks, once the first drawings say how large the animation is, and write what is static."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc.errors import KoopmpcError, LogError
+from koopmpc.interrupts import heard
 from koopmpc.loop.metrics import metrics, running_cost
 from koopmpc.loop.run import About, Run
 from koopmpc.recording.description import drawable, table_figures, title_of
@@ -28,6 +29,7 @@ from koopmpc.validate.text import markdown_table
 _MOST = 8  # plots of states and inputs in one column
 
 
+@heard  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     """Write the runs of several logs as one .rrd, with a colour each run in every plot.
 

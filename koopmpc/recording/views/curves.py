@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.interrupts import heard
 from koopmpc.recording.description import drawable
 from koopmpc.recording.format.writer import file_recording, times
 from koopmpc.recording.views.blueprint import color, framed
@@ -39,6 +40,7 @@ class Curves:
     values: Mapping[str, ArrayLike]
 
 
+@heard  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str, page: str) -> None:
     """Write all tabs and the page, as Markdown, to one .rrd.
 
