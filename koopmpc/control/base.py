@@ -2,7 +2,6 @@
 
 import copy
 from collections import deque
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -16,13 +15,10 @@ from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import admitted
 from koopmpc.control.monitor import Monitor, Watch
 from koopmpc.control.move import Fallback, Move, Status
-from koopmpc.control.saved import Kind, SavedController
+from koopmpc.control.saved import Savable
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
-from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import save_value
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Value
+from koopmpc.predict.predictors import LinearPredictor
 
 
 class InitialCondition:
@@ -163,7 +159,7 @@ class InitialCondition:
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
 
-class MPCBase:
+class MPCBase(Savable):
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
     A subclass calls `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step returns the
@@ -231,51 +227,6 @@ class MPCBase:
     def watch(self) -> Watch | None:
         """What is known of the last step; None without a monitor."""
         return self._watch
-
-    def as_data(self) -> SavedController:
-        """Return what the controller was made of.
-
-        Raises
-        ------
-        DataError
-            Its model is a StepMap, whose equations are code, or its estimator is no class of koopmpc.
-        """
-        kind, model, options = self._made_of()
-        if isinstance(model, StepMap):
-            raise DataError("the controller's model is a StepMap, which is code and cannot be saved; fit a predictor")
-        if not isinstance(self._estimator, Value | None):
-            raise DataError(
-                f"a {type(self._estimator).__name__} is no estimator of koopmpc and cannot be saved as data"
-            )
-        return SavedController(
-            kind,
-            model,
-            self.cost,
-            self.limits,
-            self._N,
-            self._estimator,
-            self._latency,
-            self._blocks,
-            self._time_limit,
-            options,
-            None if self._watch is None else self._watch.monitor,
-        )
-
-    def _made_of(self) -> tuple[Kind, LinearPredictor | BilinearPredictor | StepMap, dict[str, Any]]:
-        """Return the class, the model, and the arguments that only this class has."""
-        raise NotImplementedError
-
-    def save(self, path: str | Path) -> None:
-        """Write the controller as data (.npz: arrays and one JSON text); `km.load_controller` reads it.
-
-        Raises
-        ------
-        DataError
-            A part of it is code: a StepMap, an estimator of one's own.
-        LogError
-            The path cannot be written.
-        """
-        save_value(self.as_data(), path)
 
     def __copy__(self) -> "MPCBase":
         """Return a copy that shares nothing with this one that moves in a step."""
