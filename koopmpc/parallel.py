@@ -73,8 +73,42 @@ def map_tasks(
     elif workers == 1:
         results = map(function, tasks)
     else:
-        results = _on_processes(function, iter(tasks), workers or 1)
+        results = _on_own_processes(function, iter(tasks), workers or 1)
     return results if progress is None else _told(results, progress, total)
+
+
+class Workers:
+    """Processes that do one `map_tasks` after the other, so that they start and import once; use it with ``with``.
+
+    A worker is sent the function of a call with each of its tasks, and keeps the last one. On a Dask cluster every
+    call is one of `map_tasks`.
+
+    Parameters
+    ----------
+    workers, scheduler
+        As in `map_tasks`.
+    """
+
+    def __init__(self, workers: int | None = None, scheduler: str | None = None) -> None:
+        workers = 1 if workers is None and scheduler is None else workers
+        self._workers = None if workers is None else checks.count(workers, "workers")
+        self._scheduler, self._held = scheduler, _HeldPool(self._workers or 1)
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
+
+    def map(
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], progress: Progress | None = None
+    ) -> Iterator[Result]:
+        """Yield function(task) for each task, in the order of the tasks; progress as in `map_tasks`."""
+        if self._scheduler is not None or self._workers == 1:
+            return map_tasks(function, tasks, workers=self._workers, scheduler=self._scheduler, progress=progress)
+        total = len(tasks) if isinstance(tasks, Sized) else None
+        results = _on_processes(function, iter(tasks), self._held)
+        return results if progress is None else _told(results, progress, total)
 
 
 def _told(results: Iterator[Result], progress: Progress, total: int | None) -> Iterator[Result]:
@@ -87,14 +121,29 @@ def _told(results: Iterator[Result], progress: Progress, total: int | None) -> I
 class _Pool:
     """Processes that begin afresh, with one BLAS thread each, and do `function` of what they are sent.
 
-    A worker gets `function` once, when it starts. Tasks and results are pickled here rather than by the executor, so
-    that an error names what does not pickle and an exception that does not unpickle breaks nothing.
+    A worker gets `function` once, when it starts; another one comes with each of its tasks. Tasks and results are
+    pickled here rather than by the executor, so that an error names what does not pickle and an exception that does not
+    unpickle breaks nothing.
     """
 
     def __init__(self, function: Callable[[Any], Any], workers: int) -> None:
         self.workers = workers
+        self._function, self._other, self._number, self._code = function, function, 0, b""
         _quiet_tracker()
         self._executor = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (function,))
+
+    def turn_to(self, function: Callable[[Any], Any]) -> None:
+        """Send this function with all tasks from now on.
+
+        Raises
+        ------
+        DataError
+            It does not pickle.
+        """
+        if function is self._other:
+            return
+        self._other, self._number = function, self._number + 1
+        self._code = b"" if function is self._function else _pickled(function, "the function")
 
     def submit(self, job: QueuedTask[Any]) -> "Future[bytes]":
         """Send the job to the next worker that is free.
@@ -106,14 +155,9 @@ class _Pool:
         BrokenProcessPool
             A worker has died; the pool is of no use any more.
         """
-        try:
-            sent = pickle.dumps(job.task)
-        except _UNSENDABLE as error:
-            raise DataError(
-                f"{job} cannot be sent to a worker: {error}; run with workers=1, or define its parts in a module"
-            ) from error
+        sent = _pickled(job.task, str(job))
         with _one_thread(), _undisturbed():  # `submit` starts the processes
-            return self._executor.submit(_work, sent)
+            return self._executor.submit(_work, sent, self._number, self._code)
 
     def close(self) -> None:
         """End the processes, those that work too; Python 3.14 calls this `kill_workers`."""
@@ -127,27 +171,53 @@ class _Pool:
                 process.kill()
 
 
-def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], workers: int) -> Generator[Any]:
-    """Yield the results of `workers` processes in order.
+class _HeldPool:
+    """A pool that is made when it is first asked for, and made anew where it broke."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers, self._pool = workers, cast("_Pool | None", None)
+
+    def of(self, function: Callable[[Any], Any]) -> _Pool:
+        """Return the pool, at work on this function."""
+        if self._pool is None:
+            self._pool = _Pool(function, self.workers)
+        self._pool.turn_to(function)
+        return self._pool
+
+    def close(self) -> None:
+        """End the processes; the next `of` begins others."""
+        if self._pool is not None:
+            self._pool.close()
+        self._pool = None
+
+
+def _on_own_processes(function: Callable[[Task], Any], tasks: Iterator[Task], workers: int) -> Generator[Any]:
+    held = _HeldPool(workers)
+    try:
+        yield from _on_processes(function, tasks, held)
+    finally:
+        held.close()
+
+
+def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], held: _HeldPool) -> Generator[Any]:
+    """Yield the results of a pool's processes in order.
 
     A worker that dies breaks the pool, and nobody knows which task it was. The first task that is due is therefore
     done alone, where a death is its own, and the others go to a new pool.
     """
     jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
-    pool = _Pool(function, workers)
     queue: deque[tuple[QueuedTask[Task], Future[bytes] | None]] = deque()
     try:
         while True:
-            queue.extend((job, None) for job in islice(jobs, AHEAD * workers - len(queue)))
+            queue.extend((job, None) for job in islice(jobs, AHEAD * held.workers - len(queue)))
             if not queue:
                 return
             try:
                 for i, (job, future) in enumerate(queue):
-                    queue[i] = job, future or pool.submit(job)
+                    queue[i] = job, future or held.of(function).submit(job)
                 answer = cast("Future[bytes]", queue[0][1]).result()
             except BrokenProcessPool:
-                pool.close()
-                pool = _Pool(function, workers)
+                held.close()
                 queue = deque((job, future if _is_done(future) else None) for job, future in queue)
                 done = queue[0][1]
                 answer = _alone(function, queue[0][0]) if done is None else done.result()
@@ -157,7 +227,8 @@ def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], worker
                 raise value
             yield value
     finally:
-        pool.close()
+        if queue:  # what is under way is of no use to anyone
+            held.close()
 
 
 def _is_done(future: "Future[bytes] | None") -> bool:
@@ -238,13 +309,28 @@ def _undisturbed() -> Generator[None]:
         block(signal.SIG_SETMASK, before)
 
 
-_function: Callable[[Any], Any] | None = None  # the function that this worker calls; None in the parent
+def _pickled(value: object, name: str) -> bytes:
+    """Return the bytes of what is sent to a worker.
+
+    Raises
+    ------
+    DataError
+        It does not pickle.
+    """
+    try:
+        return pickle.dumps(value)
+    except _UNSENDABLE as error:
+        raise DataError(
+            f"{name} cannot be sent to a worker: {error}; run with workers=1, or define its parts in a module"
+        ) from error
+
+
+_functions: dict[int, Callable[[Any], Any]] = {}  # of this worker: 0 is what it began with, others have come later
 
 
 def _begin(function: Callable[[Any], Any]) -> None:
     """Take the function; this runs in the worker when it starts."""
-    global _function
-    _function = function
+    _functions[0] = function
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -257,12 +343,19 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _work(sent: bytes) -> bytes:
-    """Return (True, the function of the task) or (False, what it raised); this runs in the worker."""
-    assert _function is not None, "_begin has run"
+def _work(sent: bytes, number: int, code: bytes) -> bytes:
+    """Return (True, the function of the task) or (False, what it raised); this runs in the worker.
+
+    `number` names the function, and `code` is its pickle where it is another than that of the start.
+    """
+    number = number if code else 0
+    if number not in _functions:
+        for old in [key for key in _functions if key]:
+            del _functions[old]
+        _functions[number] = pickle.loads(code)
     task = pickle.loads(sent)
     try:
-        answer = (True, _function(task))
+        answer = (True, _functions[number](task))
     except Exception as error:  # whatever it is, it is raised again in the parent
         answer = (False, _portable(error))
     try:

@@ -216,10 +216,18 @@ int koopmpc_call(const double** arg, double** res, casadi_int* iw, double* w) {
 class Routine:
     """`function` that reads `arguments` and writes `results`, float64 arrays that hold matrices column by column.
 
-    Machine code and the interpreter give the same numbers. Implicit integrators run in the interpreter.
+    Machine code and the interpreter give the same numbers. Implicit integrators run in the interpreter, and so does all
+    where `compiles` is False.
     """
 
-    def __init__(self, function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+    def __init__(
+        self,
+        function: ca.Function,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+        *,
+        compiles: bool = True,
+    ) -> None:
         sizes = [function.nnz_in(i) for i in range(function.n_in())]
         sizes += [function.nnz_out(i) for i in range(function.n_out())]
         for size, array in zip(sizes, [*arguments, *results], strict=True):
@@ -227,7 +235,7 @@ class Routine:
             assert array.flags.c_contiguous, "machine code reads contiguous arrays"
             assert array.size == size, f"an array has {array.size} entries, the function {size}"
         self._kept: list[Any] = [*arguments, *results]  # both routes hold pointers, and no reference to the arrays
-        call = _machine(function, arguments, results, self._kept)
+        call = _machine(function, arguments, results, self._kept) if compiles else None
         self.compiled = call is not None
         if call is None:
             call, buffer = interpreter(function, arguments, results)

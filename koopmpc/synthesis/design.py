@@ -19,7 +19,7 @@ from koopmpc.errors import DataError, FitWarning
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
-from koopmpc.parallel import StageProgress, map_tasks
+from koopmpc.parallel import Progress, StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, outside_data, unweighted
 from koopmpc.synthesis.candidates import Candidate, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
@@ -144,24 +144,14 @@ def design(
             f"{len(held)} episodes give {folds.number} folds, and a design needs {FOLDS}: one to judge on and two to "
             f"learn from; pass more episodes of {forecast + first} steps or more, or a shorter horizon"
         )
-    spread = partial(map_tasks, workers=workers, scheduler=scheduler)
     trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
-    told = None if progress is None else partial(progress, "models")
-    results = list(spread(tried, trials, progress=told))
-    floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-    test, doubts, holds = _test(folds, asked, results, floor, tighten)
-    for sentence in doubts:
-        warnings.warn(sentence, FitWarning, stacklevel=2)
-
-    run = partial(judged, test)
-    screened = _screened(results, floor)
-    told = None if progress is None else partial(progress, "closed loops")
-    first_round = list(spread(run, [Job(one, test.nominal) for one in screened], progress=told))
-    chosen = _finalists(screened, first_round)
-    told = None if progress is None else partial(progress, "closed loops of the best")
-    every = tuple(range(len(test.conditions)))
-    last_round = list(spread(run, [Job(one, every) for one in chosen], progress=told))
-    rows, outcomes = _leaderboard((screened, first_round), (chosen, last_round))
+    with Workers(workers, scheduler) as pool:
+        results = list(pool.map(tried, trials, _stage(progress, "models")))
+        floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
+        test, doubts, holds = _test(folds, asked, results, floor, tighten)
+        for sentence in doubts:
+            warnings.warn(sentence, FitWarning, stacklevel=2)
+        rows, outcomes = _rounds(test, _screened(results, floor), pool, progress)
     best, linear = place_of(rows), place_of(rows, "linear")
     assert best is not None, "the last round is never empty"
 
@@ -310,27 +300,60 @@ def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
     return found + [Recipe(results[i].candidate, results[i].ridges[places[i]], tail=0) for i in plain]
 
 
-def _finalists(recipes: Sequence[Recipe], outcomes: Sequence[Outcome]) -> list[Recipe]:
-    """Return the recipes of the last round: the best models with every estimator and end, and one with weights."""
-    score = scores(ratios(outcomes))
-    ranked = [recipes[i] for i in sorted(range(len(recipes)), key=lambda i: (score[i], i))]
-    estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
-    found: list[Recipe] = []
+Judged = tuple[Sequence[Recipe], Sequence[Outcome]]  # the recipes of a round, and what came of each
+
+
+def _rounds(
+    test: LoopTest, screened: Sequence[Recipe], pool: Workers, progress: StageProgress | None
+) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
+    """Return the leaderboard and the outcome of each row.
+
+    First all models, in the conditions of the data. Then in all conditions the best bilinear one with every estimator,
+    and the two best linear ones with every estimator and end. Last the next bilinear ones, and the best with weights,
+    with the estimator that was best.
+    """
+    run, every = partial(judged, test), tuple(range(len(test.conditions)))
+    first = list(pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops")))
+    score = scores(ratios(first))
+    ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
+    estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
+    second = [replace(one, estimator=each) for one in bilinear[:1] for each in estimators]
     for one in linear:
         ends = (None, 0) if one.tail is None else (0,)
-        found += [replace(one, estimator=estimator, tail=tail) for tail in ends for estimator in estimators]
-    for one in bilinear:
-        found += [replace(one, estimator=estimator) for estimator in estimators]
+        second += [replace(one, estimator=each, tail=tail) for tail in ends for each in estimators]
+    jobs = _jobs(second, screened, first, every)
+    outcomes = list(pool.map(run, jobs, _stage(progress, "closed loops of the best")))
     if bilinear:
-        found += [replace(bilinear[0], estimator=estimators[i], weighted=True) for i in (0, 2)]
-    return found
+        tried_ones = scores(ratios(outcomes[: len(estimators)]))
+        best = estimators[int(np.argmin(tried_ones))]
+        others = [replace(bilinear[0], estimator=best, weighted=True)]
+        others += [replace(one, estimator=best) for one in bilinear[1:]]
+        jobs = _jobs(others, screened, first, every)
+        second += others
+        outcomes += list(pool.map(run, jobs, _stage(progress, "closed loops of the last")))
+    return _leaderboard((screened, first), (second, outcomes))
 
 
-def _leaderboard(
-    screened: tuple[Sequence[Recipe], Sequence[Outcome]], last: tuple[Sequence[Recipe], Sequence[Outcome]]
-) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
+def _stage(progress: StageProgress | None, name: str) -> Progress | None:
+    return None if progress is None else partial(progress, name)
+
+
+def _jobs(
+    chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: tuple[int, ...]
+) -> list[Job]:
+    """Return the jobs of a later round, with the models of the first and what is known of the same controllers."""
+    jobs: list[Job] = []
+    for one in chosen:
+        same = [i for i, other in enumerate(screened) if other == one]
+        alike = [i for i, other in enumerate(screened) if other.candidate == one.candidate and other.ridge == one.ridge]
+        known = next((outcomes[i] for i in (*same, *alike) if outcomes[i].models), None)
+        jobs.append(Job(one, every, known, known_runs=bool(same) and known is outcomes[same[0]]))
+    return jobs
+
+
+def _leaderboard(screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
     """Return the rows, the best first, those of the last round before the others, and the outcome of each."""
     both: list[tuple[DesignRow, Outcome]] = []
     for off, (recipes, outcomes) in ((True, last), (False, screened)):

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.control.limits import Limits
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.metrics import metrics
@@ -85,16 +88,16 @@ class LoopTest:
         """The conditions in which the inputs act as in the data."""
         return tuple(i for i, condition in enumerate(self.conditions) if condition.gain == 1.0)
 
+    def plant(self, condition: Condition) -> StepMap:
+        """Return the plant that is driven; each is built once in a process."""
+        key = condition.surrogate, condition.gain
+        if key not in self._plants:
+            self._plants[key] = self.surrogates[condition.surrogate].plant(condition.gain)
+        return self._plants[key]
 
-@dataclass(frozen=True, eq=False)
-class Job:
-    """A recipe, and the conditions that it is judged in."""
-
-    recipe: Recipe
-    conditions: tuple[int, ...]
-
-    def __str__(self) -> str:
-        return str(self.recipe)
+    @cached_property
+    def _plants(self) -> dict[tuple[int, float], StepMap]:
+        return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +116,8 @@ class Outcome:
         (n, nx) states of the runs in which the inputs act as in the data.
     band
         (h, nx) half-width of the errors 1 … h steps ahead on the folds that the models do not know: 90 % are inside.
+    models
+        Of each fold the model that does not know it.
     failure
         Why there is no controller; empty where there is one.
     """
@@ -122,7 +127,24 @@ class Outcome:
     broken: Float[np.ndarray, " runs"]
     visited: Float[np.ndarray, "n nx"]
     band: Float[np.ndarray, "h nx"]
+    models: tuple[AnyPredictor, ...] = ()
     failure: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A recipe, the conditions that it is judged in, and what is known of its model from an earlier job.
+
+    Where `known_runs` is True that job was of the same controller, and its runs are the first of these conditions.
+    """
+
+    recipe: Recipe
+    conditions: tuple[int, ...]
+    known: Outcome | None = None
+    known_runs: bool = False
+
+    def __str__(self) -> str:
+        return str(self.recipe)
 
 
 class LostError(Exception):
@@ -144,53 +166,83 @@ class Fenced(SimulatedPlant):
         return y
 
 
+class _Models(NamedTuple):
+    """Of each fold the model that does not know it, and the largest error band of all."""
+
+    each: tuple[AnyPredictor, ...]
+    band: Float[np.ndarray, "h nx"]
+
+
 def judged(test: LoopTest, job: Job) -> Outcome:
     """Return what came of a job, run by run.
 
-    The model of a weighted recipe is first fitted without weights, and its runs on the same surrogates with unchanged
-    inputs show which states to weigh; then again.
+    The model of a weighted recipe is fitted to the data around what its runs on the same surrogates with unchanged
+    inputs visit; then again.
     """
-    recipe = job.recipe
-    near: Nearness | None = None
+    recipe, known = job.recipe, job.known
     try:
-        for _ in range(2 * recipe.weighted):
-            seen = _outcome(test, replace(recipe, weighted=False), test.nominal, near)
-            near = Nearness.of(seen.visited, test.episodes) if len(seen.visited) else near
-        return _outcome(test, recipe, job.conditions, near)
+        models = _fitted(test, recipe) if known is None else _Models(known.models, known.band)
+        if recipe.weighted:
+            visited = None if known is None else known.visited
+            for _ in range(2):
+                if visited is None:
+                    visited = _outcome(test, recipe, models, test.nominal).visited
+                if len(visited):
+                    models = _fitted(test, recipe, Nearness.of(visited, test.episodes))
+                visited = None
+        if known is None or not job.known_runs:
+            return _outcome(test, recipe, models, job.conditions)
+        return _joined(known, _outcome(test, recipe, models, job.conditions[len(known.cost) :]))
     except (KoopmpcError, ArithmeticError, np.linalg.LinAlgError) as error:
         nothing, none = np.full(len(job.conditions), np.inf), np.zeros((0, test.episodes.nx))
-        return Outcome(nothing, nothing, np.ones(len(nothing)), none, none, f"{type(error).__name__}: {error}")
+        return Outcome(nothing, nothing, np.ones(len(nothing)), none, none, (), f"{type(error).__name__}: {error}")
 
 
-def _outcome(test: LoopTest, recipe: Recipe, conditions: Sequence[int], near: Nearness | None) -> Outcome:
-    controllers: dict[int, Designed] = {}
-    plants: dict[tuple[int, float], StepMap] = {}
-    n, asked = len(conditions), test.asked
+def _fitted(test: LoopTest, recipe: Recipe, near: Nearness | None = None) -> _Models:
+    folds = range(max(test.fold) + 1)
+    models = [recipe.fit(without(test.episodes, test.fold, k), near) for k in folds]
+    bands = [error_band(model, only(test.episodes, test.fold, k)) for k, model in enumerate(models)]
+    return _Models(tuple(models), np.max(bands, axis=0))
+
+
+def _joined(first: Outcome, rest: Outcome) -> Outcome:
+    """Return the runs of both; `rest` is of the same models."""
+    cost, violation, broken, visited = (
+        np.concatenate([getattr(each, name) for each in (first, rest)])
+        for name in ("cost", "violation", "broken", "visited")
+    )
+    return Outcome(cost, violation, broken, visited, first.band, first.models)
+
+
+def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequence[int]) -> Outcome:
+    """Return what comes of controllers of these models; all have the limits that the controller of all data gets."""
+    n, asked, limits = len(conditions), test.asked, test.limits(models.band)
     cost, violation, broken = np.full(n, np.inf), np.full(n, np.inf), np.ones(n)
-    visited = [np.zeros((0, test.episodes.nx))]
-    bands: list[Float[np.ndarray, "h nx"]] = []
-    for j, place in enumerate(conditions):
-        one = test.conditions[place]
-        if one.fold not in controllers:
-            model = recipe.fit(without(test.episodes, test.fold, one.fold), near)
-            bands.append(error_band(model, only(test.episodes, test.fold, one.fold)))
-            limits = test.limits(bands[-1])
-            controllers[one.fold] = recipe.controller(model, asked.cost, limits, asked.horizon)
-        key = one.surrogate, one.gain
-        if key not in plants:
-            plants[key] = test.surrogates[one.surrogate].plant(one.gain)
-        try:
-            run = _run(test, one, plants[key], controllers[one.fold], place)
-        except LostError:
+    visited: dict[int, Float[np.ndarray, "T1 nx"]] = {}
+    controller: Designed | None = None
+    for k, model in enumerate(models.each):
+        mine = [j for j, place in enumerate(conditions) if test.conditions[place].fold == k]
+        if not mine:
             continue
-        total = metrics(run).cost
-        if not np.isfinite(total):
-            continue
-        over = asked.beyond(run.X[1:], run.states)
-        cost[j], violation[j], broken[j] = total, over.max(), np.mean(over > BROKEN)
-        if one.gain == 1.0:
-            visited.append(run.X)
-    return Outcome(cost, violation, broken, np.concatenate(visited), np.max(bands, axis=0))
+        if isinstance(controller, BilinearMPC):
+            controller.update(model)  # its functions are those of the lifting, whatever the model
+        else:
+            controller = recipe.controller(model, asked.cost, limits, asked.horizon, brief=True)
+        for j in mine:
+            one = test.conditions[conditions[j]]
+            try:
+                run = _run(test, one, controller, conditions[j])
+            except LostError:
+                continue
+            total = metrics(run).cost
+            if not np.isfinite(total):
+                continue
+            over = asked.beyond(run.X[1:], run.states)
+            cost[j], violation[j], broken[j] = total, over.max(), np.mean(over > BROKEN)
+            if one.gain == 1.0:
+                visited[j] = run.X
+    states = np.concatenate([np.zeros((0, test.episodes.nx)), *(visited[j] for j in sorted(visited))])
+    return Outcome(cost, violation, broken, states, models.band, models.each)
 
 
 def error_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h nx"]:
@@ -208,13 +260,9 @@ def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
     data: its observables are not invariant, and what it says of many steps ahead rests on small numbers.
     """
     cost = np.full(len(outcome.cost), np.inf)
-    plants: dict[tuple[int, float], StepMap] = {}
     for j, one in enumerate(test.conditions):
-        key = one.surrogate, one.gain
-        if key not in plants:
-            plants[key] = test.surrogates[one.surrogate].plant(one.gain)
         try:
-            total = metrics(_run(test, one, plants[key], controller, j)).cost
+            total = metrics(_run(test, one, controller, j)).cost
         except LostError:
             continue
         cost[j] = total if np.isfinite(total) else np.inf
@@ -226,11 +274,11 @@ def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
     return not both.any() or bool(change.mean() <= np.log(CONFIRMED))
 
 
-def _run(test: LoopTest, one: Condition, plant: StepMap, controller: Designed, seed: int) -> Run:
+def _run(test: LoopTest, one: Condition, controller: Designed, seed: int) -> Run:
     """Return the closed loop, with the states without their past."""
     asked, surrogate = test.asked, test.surrogates[one.surrogate]
     run = simulate(
-        Fenced(plant, test.low, test.high),
+        Fenced(test.plant(one), test.low, test.high),
         controller,
         x0=surrogate.start(one.x0),
         reference=asked.reference[one.first : one.first + asked.steps + 1],

@@ -123,8 +123,10 @@ class Recipe(Value):
                 data, one.lifting, embedding=one.embedding, ridge=self.ridge, difference=True, **options
             )
 
-    def controller(self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int) -> Designed:
-        """Return the controller of a model.
+    def controller(
+        self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False
+    ) -> Designed:
+        """Return the controller of a model, without machine code of the model where it is used briefly.
 
         Raises
         ------
@@ -134,5 +136,16 @@ class Recipe(Value):
         if self.tail is not None and cost.Q_N is None and cost.tail is None:
             cost = replace(cost, tail=self.tail)
         if isinstance(model, BilinearPredictor):
-            return BilinearMPC(model, cost, limits, horizon, estimator=self.estimator)
+            kind = BriefMPC if brief else BilinearMPC
+            return kind(model, cost, limits, horizon, estimator=self.estimator)
         return KoopmanMPC(model, cost, limits, horizon, estimator=self.estimator)
+
+
+class BriefMPC(BilinearMPC):
+    """A BilinearMPC whose model the interpreter evaluates: in some hundred steps a compiler costs more than it wins.
+
+    What does not depend on the model is machine code as ever, which later controllers find in the cache. The numbers
+    are the same.
+    """
+
+    _compiles_model = False

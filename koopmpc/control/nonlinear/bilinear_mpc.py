@@ -99,6 +99,8 @@ class BilinearMPC(StagedMPC):
     SIAM J. Control Optim. 43, 2005.
     """
 
+    _compiles_model = True  # a subclass that is used briefly leaves it to the interpreter
+
     @heard  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
@@ -116,7 +118,7 @@ class BilinearMPC(StagedMPC):
     ) -> None:
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
-        self._iteration = RealTimeIteration(self._problem)
+        self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
         self._iteration.theta[:] = self._map.theta
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))

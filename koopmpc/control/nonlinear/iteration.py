@@ -55,9 +55,11 @@ class RealTimeIteration:
     ----------
     problem
         F, what is tracked and limited, and the stages.
+    compiles_model
+        Whether F and its derivatives become machine code, as all else does.
     """
 
-    def __init__(self, problem: StagedProblem) -> None:
+    def __init__(self, problem: StagedProblem, *, compiles_model: bool = True) -> None:
         N, nx, nu = len(problem.free), problem.nx, problem.F.size1_in(1)
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
@@ -92,8 +94,8 @@ class RealTimeIteration:
         plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta]
         self._A = A
         self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
-        self._simulate = Routine(simulate, [*self._ahead, self.theta], [self._trial])
-        self._linearise = Routine(linearise, plan, [A, B, F, Q, q, r, self._g, self._G])
+        self._simulate = Routine(simulate, [*self._ahead, self.theta], [self._trial], compiles=compiles_model)
+        self._linearise = Routine(linearise, plan, [A, B, F, Q, q, r, self._g, self._G], compiles=compiles_model)
         curvature = zeros((N, nu))
         stages = [A, B, self._c, Q, q, r, self._x0]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
