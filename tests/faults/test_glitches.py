@@ -69,6 +69,40 @@ def test_an_outlier_is_not_learned_and_is_counted(size, where):
     assert worst(learner.predictor(), PLANT) == pytest.approx(worst(twin.predictor(), PLANT), rel=0.2)
 
 
+@pytest.mark.parametrize("at", [0, 3, 19, 25, 32, 40, 60])  # memory of 32 pairs a block, forecasts from some 60 on
+@pytest.mark.parametrize("where", ["x", "x_next", "both"])
+def test_an_outlier_before_there_are_forecasts_is_not_learned_either(at, where):
+    learner, twin = online(), online()
+    for k, (x, u, x_next) in enumerate(pairs(PLANT, 300)):
+        if k == at:
+            learner.learn(x + 1e5 * (where != "x_next"), u, x_next + 1e5 * (where != "x"))
+        else:
+            learner.learn(x, u, x_next)
+            twin.learn(x, u, x_next)
+    assert (learner.outliers, twin.outliers) == (1, 0)
+    assert worst(learner.predictor(), PLANT) == pytest.approx(worst(twin.predictor(), PLANT), rel=0.2)
+
+
+def test_what_a_plant_really_does_is_no_outlier_before_there_are_forecasts():
+    learner, rng = online(), np.random.default_rng(0)
+    for k in range(26):  # a first step of the input after a long rest
+        x, u = np.array([0.3, 0.0]) + 0.005 * rng.standard_normal(2), np.array([5.0 if k == 25 else 1e-5])
+        learner.learn(x, u, PLANT(x, u))
+    for x, u, x_next in pairs(PLANT, 200):
+        learner.learn(x, u, x_next)
+    assert learner.outliers == 0
+
+
+def test_signals_that_grow_for_good_are_learned_before_there_are_forecasts():
+    learner, twin = online(), online()
+    for k, (x, u, x_next) in enumerate(pairs(PLANT, 300)):
+        size = 1e-4 if k < 30 else 1.0
+        learner.learn(size * x, size * u, PLANT(size * x, size * u))
+        twin.learn(x, u, x_next)
+    assert learner.outliers < 10
+    assert worst(learner.predictor(), PLANT) < 1.2 * worst(twin.predictor(), PLANT)
+
+
 def test_a_plant_that_has_changed_is_learned_all_the_same():
     heavy = km.discretize(replace(PENDULUM.dynamics, m=8 * PENDULUM.dynamics.m), 0.05)
     learner = online()

@@ -29,8 +29,9 @@ class OnlineEDMD:
 
     With forgetting, a pair whose innovation, ψ(x⁺) less its forecast, is beyond 30 times the spread of innovations so
     far is an outlier: it is not learned, and counted in `outliers`. One reading that is far off would else be
-    remembered for thousands of pairs. A plant that has changed is learned after a few pairs, for spreads grow with
-    outliers. A memory of less than four pairs a regressor knows no outliers.
+    remembered for thousands of pairs. As long as there are no forecasts, a value beyond 1000 times the size of its
+    observable is one. A plant that has changed is learned after a few pairs, for spreads grow with outliers. A memory
+    of less than four pairs a regressor knows no outliers.
 
     It takes no embedding, because it keeps no past steps. A model with delays learns from points ζ as states:
     ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.
@@ -101,7 +102,7 @@ class OnlineEDMD:
         self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
         self._waiting: int = 0
         long = factor < 1 and 1 / (1 - factor) > 4 * self._n  # else forecasts say nothing of outliers
-        self._gate = Gate(width, self._n) if long else None
+        self._gate = Gate(width, self._n, nz) if long else None
         self.pairs = self.outliers = 0
 
     @classmethod
@@ -195,6 +196,9 @@ class OnlineEDMD:
                 learned = self._gate.keep(self._rows[self._waiting - take : self._waiting])
                 self._waiting -= take - learned
                 self.outliers += take - learned
+            if self._waiting == len(self._rows) and self._gate is not None and not self._gate.begun:
+                self._waiting = self._gate.first(self._rows)
+                self.outliers += len(self._rows) - self._waiting
             if self._waiting == len(self._rows):
                 self._memory.push(self._rows)
                 self._waiting = 0

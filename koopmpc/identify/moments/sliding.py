@@ -127,7 +127,8 @@ class Window:
 
 
 BEYOND, LEAST, MEMORY = 30.0, 0.01, 0.01  # of a spread; of a column's size; share that a new row has in both
-FEW = 20  # innovations that say nothing of their spread yet
+FEW = 20  # innovations, or rows, that say nothing of their spread yet
+FAR = 1000.0  # of a column's size: what no signal reaches, where there is no forecast to compare it with
 
 
 class Gate:
@@ -137,16 +138,21 @@ class Gate:
     of the column's own. An innovation beyond the gate counts there as if it stood at the gate: the spread grows
     tenfold with four of them in sequence, so that a plant that has changed is learned after a few rows.
 
+    Until there is a forecast, a row is an outlier where a value is beyond 1000 times the size of its column, the
+    root-mean-square over about 100 rows, or among the first rows beyond 1000 times all others of its column. Inputs are
+    what they are: nothing is said of them.
+
     Parameters
     ----------
-    nd, n
-        Columns of a row, and how many of them are regressors r; the others are t.
+    nd, n, nz
+        Columns of a row; how many of them are regressors r, the others are t; how many of r are observables.
     """
 
-    def __init__(self, nd: int, n: int) -> None:
+    def __init__(self, nd: int, n: int, nz: int) -> None:
         self._n, self._rows, self._seen = n, 0, 0  # _seen: innovations
+        self.begun, self._measured = False, (np.arange(nd) < nz) | (np.arange(nd) >= n)
         self._K: Table | None = None
-        self._spread, self._size = np.zeros(nd - n), np.zeros(nd - n)
+        self._spread, self._size = np.zeros(nd - n), np.zeros(nd)  # mean squares
 
     def learn(self, R: Triangle) -> None:
         """Take over the regression R K = T of all rows so far."""
@@ -155,24 +161,35 @@ class Gate:
         if diagonal.min(initial=np.inf) > 1e-12 * diagonal.max(initial=0.0) and self._rows > 4 * self._n:
             self._K = solve_triangular(A, T, check_finite=False)
 
+    def first(self, rows: Table) -> int:
+        """Look at the first rows as a whole: move those that are no outliers to the front, and return their number."""
+        most = FAR * np.sort(np.abs(rows), axis=0)[-2]  # without the one that may be far off
+        kept = rows[((np.abs(rows) <= most) | (most == 0) | ~self._measured).all(axis=1)]
+        rows[: len(kept)] = kept
+        self._rows, self._size, self.begun = len(kept), np.mean(kept**2, axis=0), True
+        return len(kept)
+
     def keep(self, rows: Table) -> int:
         """Move the rows that are no outliers to the front, and return how many they are."""
         n, kept = self._n, 0
         row: Table
         for row in rows:
-            t = row[n:]
-            if self._K is None:
-                share, good = max(MEMORY, 1.0 / (self._rows + 1)), True
-            else:
-                share, e = MEMORY, np.abs(t - row[:n] @ self._K)
-                gate = BEYOND * np.maximum(np.sqrt(self._spread), LEAST * np.sqrt(self._size))
+            square, good = row**2, True
+            if self._K is not None:
+                e = np.abs(row[n:] - row[:n] @ self._K)
+                gate = BEYOND * np.maximum(np.sqrt(self._spread), LEAST * np.sqrt(self._size[n:]))
                 self._seen += 1
-                known = self._seen > FEW
-                good = not known or bool((e <= gate).all())
-                held = np.minimum(e, gate) if known else e
-                self._spread += max(MEMORY, 1.0 / self._seen) * (held**2 - self._spread)
+                if self._seen > FEW:
+                    good = bool((e <= gate).all())
+                    e = np.minimum(e, gate)
+                self._spread += max(MEMORY, 1.0 / self._seen) * (e**2 - self._spread)
+            if self._seen <= FEW < self._rows:
+                far = np.where(self._measured & (self._size > 0), FAR**2 * self._size, np.inf)
+                good = bool((square <= far).all())
+                square = np.minimum(square, far)
+            if good or self._seen <= FEW:
+                self._size += max(MEMORY, 1.0 / (self._rows + 1)) * (square - self._size)
             if good:
-                self._size += share * (t**2 - self._size)
                 rows[kept] = row
                 kept += 1
                 self._rows += 1
