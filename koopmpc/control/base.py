@@ -14,7 +14,7 @@ from koopmpc.checks import HUGE, numbers
 from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import admitted
 from koopmpc.control.monitor import Monitor, Watch
-from koopmpc.control.move import Fallback, Move, Status
+from koopmpc.control.move import Fallback, Move, Status, Token
 from koopmpc.control.saved import Savable
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
@@ -219,7 +219,8 @@ class MPCBase(Savable):
         self._initial = InitialCondition(
             model, observer, self._N, self._latency, with_rates=with_rates, estimated=estimator is not None
         )
-        self._token, self._inside = [0], 0
+        self._token: Token = [0]
+        self._inside = 0
         self._watch = None if monitor is None else Watch(monitor, model, self._latency)
         MPCBase.reset(self)
 

@@ -13,7 +13,7 @@ from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.horizon import Units, horizon_of
 from koopmpc.control.limits import Limits, admitted
-from koopmpc.control.move import Fallback, Move, Status, alone
+from koopmpc.control.move import Fallback, Move, Status, Token, alone
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
@@ -71,7 +71,8 @@ class LQR:
         self._feedforward = np.zeros(self.nu)
         self._row = 0  # of a given u_target, for the next call
         self._last = np.zeros(self.nu)
-        self._token, self._inside = [0], 0
+        self._token: Token = [0]
+        self._inside = 0
         self.reset()
 
     @property

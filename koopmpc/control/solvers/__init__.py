@@ -1,4 +1,4 @@
-"""The QP solvers by name: a new one is a file of its own here, a subclass of `QPSolver`, and a line below."""
+"""The QP solvers by name. A new one is a subclass of `QPSolver` in its own file here, imported and listed below."""
 
 from typing import Literal
 

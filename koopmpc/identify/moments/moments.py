@@ -51,7 +51,7 @@ class Gram:
     """
 
     def __init__(self, n: int, nz: int) -> None:
-        self._n, self._nz = n, nz
+        self._n = n
         self._now, self._cross, self._next = np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nz, nz))
         self._both, self._beside = np.empty((n, n)), np.empty((n, nz))
 
