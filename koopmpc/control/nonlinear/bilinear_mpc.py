@@ -14,7 +14,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration, StageStep
+from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.saved import Kind
@@ -261,15 +261,9 @@ class BilinearMPC(StagedMPC):
                 return (found.status if iteration.gap < NEAR else Status.FAILED), total
             self._enter(*self._trajectory(iteration.X, iteration.U), u_prev)
             status = Status.SOFTENED if iteration.slack else found.status
-            if k + 1 < most and self._rests(found, settled):
+            if k + 1 < most and iteration.rests(found, settled):
                 break
         return status, total
-
-    def _rests(self, found: StageStep, settled: float) -> bool:
-        """Return whether no input and no state moved by more than this share of its size and the plan's."""
-        p, iteration = self._problem, self._iteration
-        moved = (found.U / p.input_sizes, iteration.U / p.input_sizes), (found.X / p.sizes, iteration.X / p.sizes)
-        return all(bool(np.abs(d).max() <= settled * (1 + np.abs(v).max())) for d, v in moved)
 
     def _enter(
         self,

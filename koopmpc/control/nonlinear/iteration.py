@@ -64,7 +64,7 @@ class RealTimeIteration:
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides, cost, R = sides(problem), plan_cost(problem), weights(problem)
-        self._sizes = problem.sizes
+        self._sizes, self._input_sizes = problem.sizes, problem.input_sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
         free = unconstrained(sweeps, R)
         interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
@@ -165,6 +165,12 @@ class RealTimeIteration:
             self.length, gap = length, error if length == 1 else np.abs(self._trial + self.e - X_new).max(axis=0)
         self._defects = gap
         self.slack = float(found.slacks[found.slacks > self._allowance].max(initial=0.0))
+
+    def rests(self, found: StageStep, settled: float) -> bool:
+        """Return whether no input and no state moved by more than this share of its size and the plan's."""
+        u, x = self._input_sizes, self._sizes
+        moved = (found.U / u, self.U / u), (found.X / x, self.X / x)
+        return all(bool(np.abs(d).max() <= settled * (1 + np.abs(v).max())) for d, v in moved)
 
     @property
     def gap(self) -> float:
