@@ -1,6 +1,6 @@
 """Run: everything that happened in one closed loop, and the steps and rows that it is made of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -19,7 +19,8 @@ from koopmpc.values import Value
 class Step:
     """One step of a closed loop as an observer sees it: x_k, y_k, the Move, and where it led.
 
-    `simulate` fills every field; in a loop of your own k, y, u and reference are enough.
+    `simulate` fills every field; in a loop of your own k, y, u and reference are enough. `look_ahead` is the `plan` of
+    the controller: it is asked when `plan` is read, which an observer does while it is called, or never.
     """
 
     k: int
@@ -28,11 +29,22 @@ class Step:
     reference: Float[np.ndarray, " nr"]
     move: Move | None = None
     x: Float[np.ndarray, " nx"] | None = None
-    plan: Plan | None = None
     x_next: Float[np.ndarray, " nx"] | None = None
     y_next: Float[np.ndarray, " ny"] | None = None
     reference_next: Float[np.ndarray, " nr"] | None = None
     u_reference: Float[np.ndarray, " nu"] | None = None
+    look_ahead: Callable[[], Plan | None] | None = None
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan behind the move; None where the controller has none.
+
+        Raises
+        ------
+        DataError
+            It is read when the controller has gone on, and `simulate` does not keep the plans.
+        """
+        return None if self.look_ahead is None else self.look_ahead()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,20 +110,14 @@ class StepRows(Value):
             X.append(hidden if last.x_next is None else last.x_next)
             Y.append(last.y_next)
             reference.append(last.reference if last.reference_next is None else last.reference_next)
-        moves = [s.move for s in steps]
         held = [np.zeros(len(s.u)) if s.u_reference is None else s.u_reference for s in steps]
         return StepRows(
             X=np.array(X, dtype=np.float64),
             Y=np.array(Y, dtype=np.float64),
             U=np.array([s.u for s in steps], dtype=np.float64),
             reference=np.array(reference, dtype=np.float64),
-            status=tuple(Status.OPTIMAL if m is None else m.status for m in moves),
-            fallback=tuple(Fallback.NONE if m is None else m.fallback for m in moves),
-            solve_time=np.array([0.0 if m is None else m.solve_time for m in moves]),
-            iterations=np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
+            **_columns_of([s.move for s in steps]),
             u_reference=np.array(held, dtype=np.float64),
-            slack=np.array([0.0 if m is None else m.slack for m in moves]),
-            known=np.array([_looked(m) for m in moves], dtype=np.int64),
         )
 
     @staticmethod
@@ -134,10 +140,17 @@ class StepRows(Value):
         return StepRows(**{name: values[first:last] for name, values in self.columns().items()})
 
 
-def _looked(move: Move | None) -> int:
-    """Return 1 or 0 as the move is known or not, −1 where nobody looked; a Move of one's own need not say."""
-    known = getattr(move, "known", None)
-    return -1 if known is None else int(known)
+def _columns_of(moves: Sequence[Move | None]) -> dict[str, Any]:
+    """Return the columns of `StepRows` that moves fill; a step without a Move counts as solved, in no time."""
+    known = [getattr(m, "known", None) for m in moves]  # a Move of one's own need not say
+    return {
+        "status": tuple([Status.OPTIMAL if m is None else m.status for m in moves]),
+        "fallback": tuple([Fallback.NONE if m is None else m.fallback for m in moves]),
+        "solve_time": np.array([0.0 if m is None else m.solve_time for m in moves], dtype=np.float64),
+        "iterations": np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
+        "slack": np.array([0.0 if m is None else m.slack for m in moves], dtype=np.float64),
+        "known": np.array([-1 if looked is None else int(looked) for looked in known], dtype=np.int64),
+    }
 
 
 _OF_STATES = ("X", "Y", "reference")  # the columns with a row for each state; the others have one for each move

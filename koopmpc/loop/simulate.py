@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.move import Controller, Fallible, Move
+from koopmpc.control.move import Controller, Fallback, Fallible, Move, Plan, Status
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
-from koopmpc.loop.run import Plans, Run, Step, StepRows
+from koopmpc.loop.run import Plans, Run, Step
 from koopmpc.plants.dynamics import Plant, require_plant
 from koopmpc.plants.step_map import SimulatedPlant, StepMap
 from koopmpc.predict.base import Predictor
@@ -110,18 +110,12 @@ def simulate(
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
-    if isinstance(plant, StepMap):
-        plant = SimulatedPlant(plant)
-    else:
+    if not isinstance(plant, StepMap):
         require_plant(plant)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
         raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
-    first = plant.reset(x0, rng)
-    states, inputs, outputs, state = tuple(plant.states), tuple(plant.inputs), tuple(plant.outputs), plant.state
-    nx, ny, nu, N = len(states), len(_reading(first, None, 0)), controller.nu, controller.horizon
-    if state is not None and np.shape(state) != (nx,):
-        raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
-    scene, model = getattr(plant, "scene", None), predictor_of(controller)
+    states, inputs, outputs = tuple(plant.states), tuple(plant.inputs), tuple(plant.outputs)
+    nx, nu, N = len(states), controller.nu, controller.horizon
     if nu != len(inputs):
         raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(inputs)} ({inputs})")
     rows = _rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
@@ -132,86 +126,146 @@ def simulate(
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
     disturbed = _signal(disturbance, "disturbance", steps, nx)
-    if disturbed is not None and not isinstance(plant, SimulatedPlant):
+    if disturbed is not None and not isinstance(plant, StepMap | SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
-    noisy = _noise(noise, steps, ny)
     held = _held(u_reference, cost, steps, nu)
     metadata = {"controller": type(controller).__name__, **(metadata or {})}
     W = None
     if measured is not None:
         W = _rows_ahead(measured, "measured", "nw", steps, N, "steps")
         metadata["measured"] = W[:steps].tolist()
+    if isinstance(plant, StepMap):
+        if x0 is None:
+            raise DataError("a simulated plant has no state of its own to begin in; pass x0")
+        state = checks.array(x0, "x0", (nx,))
+        first = plant.measure(state)
+    else:
+        first, state = _reading(plant.reset(x0, rng), None, 0), plant.state
+    ny, model = len(first), predictor_of(controller)
+    noisy = _noise(noise, steps, ny)
+    if state is not None and np.shape(state) != (nx,):
+        raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
     broken = None
     if faults:
         broken = Injections(faults, Wiring(ny, (limits or Limits()).inputs(nu)), rng)
         metadata["faults"] = [str(fault) for fault in faults]
+    spoilt = noisy is not None or broken is not None
+    seen = isinstance(plant, StepMap) and plant.measures_all and not spoilt  # y_k is x_k
 
-    def sensed(k: int, measurement: ArrayLike) -> Float[np.ndarray, " ny"]:
-        y = _reading(measurement, ny, k)  # NaN passes: the controller then says BAD_MEASUREMENT
+    def sensed(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        """Return what the controller gets of what the plant measured: NaN passes, and it says BAD_MEASUREMENT."""
         if noisy is not None:
             y += noisy(k, rng)
         return y if broken is None else np.array(broken.measured(k, y), dtype=np.float64)
 
-    def known() -> Float[np.ndarray, " nx"]:
-        state = plant.state
-        return hidden if state is None else np.array(state, dtype=np.float64)
-
     rows.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
-    taken: list[Step] = []
-    hidden = np.full(nx, np.nan)
-    look_ahead = getattr(controller, "plan", None) if plans or observers else None
-    x, y, applied = known(), sensed(0, first), None
+    Y, U = np.empty((steps + 1, ny)), np.empty((steps, nu))
+    X = Y if seen else np.full((steps + 1, nx), np.nan)
+    status: list[Status] = []
+    fallback: list[Fallback] = []
+    solve_time: list[float] = []
+    iterations: list[int] = []
+    slack, known = np.zeros(steps), np.full(steps, -1)
+    found, plan, ended = None, None, ""
+    fallible = controller if isinstance(controller, Fallible) else None
+    look_ahead: Callable[[], Plan | None] | None = getattr(controller, "plan", None)
+    shape, applied, end = (nu,), None, steps
+    if state is not None:
+        X[0] = state
+    Y[0] = y = sensed(0, first) if spoilt else first
     controller.reset(x0)
     for k in range(steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, nr))
-        more = {} if W is None else {"w": W[k : k + max(N, 1)] if preview else W[k]}
-        failing = controller if broken is not None and broken.solver_fails(k) else None
-        if isinstance(failing, Fallible):
+        failing = fallible if broken is not None and broken.solver_fails(k) else None
+        if failing is not None:
             failing.solver_fails = True
         try:
-            move = controller(y.copy(), ahead, applied, **more)
+            if W is None:
+                move = controller(y, ahead, applied)
+            else:
+                move = controller(y, ahead, applied, w=W[k : k + max(N, 1)] if preview else W[k])
         except ValueError as error:
             if "read-only" not in str(error):
                 raise
             raise DataError("the controller wrote into the reference, which is the Run's own; copy it first") from error
         finally:
-            if isinstance(failing, Fallible):
+            if failing is not None:
                 failing.solver_fails = False
-        if k == 0 or type(move) is not Move:
+        if type(move) is not Move:
             checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
-        u = np.array(move.u, dtype=np.float64)
-        if u.shape != (nu,):
+        u = np.asarray(move.u, dtype=np.float64)
+        if u.shape != shape:
             raise ShapeError(f"the controller returned u of shape {u.shape} at step {k}, expected ({nu},)")
-        if not all(map(isfinite, u.tolist())):  # for a few inputs four times as fast as numpy
-            raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
-        u = u if broken is None else np.array(broken.applied(k, u), dtype=np.float64)
-        plan = None if look_ahead is None else look_ahead()
-        if disturbed is not None and isinstance(plant, SimulatedPlant):
-            y_next = plant.step(u.copy(), disturbed(k, rng))
+        for value in u.tolist():  # for a few inputs four times as fast as numpy
+            if not isfinite(value):
+                raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
+        if broken is not None:
+            u = np.array(broken.applied(k, u), dtype=np.float64)
+        U[k] = u
+        if plans and look_ahead is not None and (plan := look_ahead()) is not None:
+            if found is None:
+                found = Plans(*(np.full((steps, *part.shape), np.nan) for part in (plan.X, plan.U)))
+            found.X[k], found.U[k] = plan.X, plan.U
+        push = None if disturbed is None else disturbed(k, rng)
+        if isinstance(plant, StepMap):
+            x = X[k + 1]
+            plant.advance(X[k], u, x)
+            if push is not None:
+                x += push
+            y = x.copy() if seen else plant.measure(x)
         else:
-            y_next = plant.step(u.copy())
-        x_next, y_next = known(), sensed(k + 1, y_next)
-        step = Step(k, y, u, rows[k], move, x, plan, x_next, y_next, rows[k + 1], held[k])
+            pushed = () if push is None else (push,)  # of a SimulatedPlant alone
+            y = _reading(plant.step(u.copy(), *pushed), ny, k + 1)
+            u = U[k].copy()  # the controller may keep the other one
+            if (state := plant.state) is not None:
+                X[k + 1] = state
+            ended = str(getattr(plant, "ended", ""))
+        if spoilt:
+            y = sensed(k + 1, y)
+        if not seen:
+            Y[k + 1] = y
+        status.append(move.status)  # not the Move itself: thousands of objects keep the garbage collector busy
+        fallback.append(move.fallback)
+        solve_time.append(move.solve_time)
+        iterations.append(move.iterations)
+        if move.slack:
+            slack[k] = move.slack
+        looked = move.known if type(move) is Move else getattr(move, "known", None)  # a Move of one's own need not say
+        if looked is not None:
+            known[k] = looked
         for observer in observers:
+            ask = look_ahead if plan is None else partial(_same, plan)
+            step = Step(k, Y[k], U[k], rows[k], move, X[k], X[k + 1], Y[k + 1], rows[k + 1], held[k], ask)
             observer(step)
-        taken.append(step if plans or plan is None else replace(step, plan=None))
-        x, y, applied = x_next, y_next, u
-        if (ended := getattr(plant, "ended", "")) and k + 1 < steps:
-            metadata["ended"] = str(ended)
-            warnings.warn(f"the plant ended the run after {k + 1} of {steps} steps: {ended}", UserWarning, stacklevel=2)
+            if ask is not None and plan is None:
+                step.look_ahead = _gone  # the controller goes on to the next step
+        applied = u
+        if ended and k + 1 < steps:
+            end, metadata["ended"] = k + 1, ended
+            warnings.warn(f"the plant ended the run after {end} of {steps} steps: {ended}", UserWarning, stacklevel=2)
             break
     return Run(
-        **StepRows.of(taken, nx, end=True).columns(),
+        X=Y.copy() if seen else X[: end + 1],
+        Y=Y[: end + 1],
+        U=U[:end],
+        reference=rows[: end + 1],
+        u_reference=held[:end],
+        status=tuple(status),
+        fallback=tuple(fallback),
+        solve_time=np.array(solve_time, dtype=np.float64),
+        iterations=np.array(iterations, dtype=np.int64),
+        slack=slack[:end],
+        known=known[:end],
         cost=cost,
         limits=limits,
         dt=plant.dt,
         states=states,
         inputs=inputs,
         outputs=outputs,
-        plans=Plans.of([step.plan for step in taken]),
+        plans=None if found is None else Plans(found.X[:end], found.U[:end]),
         angles=tuple(angles),
         metadata=metadata,
-        scene=scene,
+        scene=getattr(plant, "scene", None),
         model=model,
     )
 
@@ -230,6 +284,15 @@ def _reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
         expected = "(ny,)" if ny is None else f"({ny},), as at reset"
         raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
     return y
+
+
+def _same(plan: Plan) -> Plan:
+    """Return the plan that is kept."""
+    return plan
+
+
+def _gone() -> Plan | None:
+    raise DataError("the controller has gone on: read step.plan while the observer is called, or pass plans=True")
 
 
 def predictor_of(controller: object) -> Predictor | None:

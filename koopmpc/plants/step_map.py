@@ -105,6 +105,14 @@ class StepMap(Named):
         NaN passes through; where an implicit method finds no x⁺ the answer is NaN, with a RuntimeWarning.
         """
         x, u = _vector(x, "x", len(self.states)), _vector(u, "u", len(self.inputs))
+        x_next = np.empty(self.nx)
+        self.advance(x, u, x_next)
+        return x_next
+
+    def advance(
+        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], x_next: Float[np.ndarray, " nx"]
+    ) -> None:
+        """Write F(x, u) into `x_next`, as a call returns it, but without looking at the arguments."""
         step = self._step
         x_place, u_place = step.arguments
         x_place[:], u_place[:] = x, u
@@ -112,12 +120,13 @@ class StepMap(Named):
             step.evaluate()
         except RuntimeError as error:
             warn_of(error, x, u)
-            return np.full(self.nx, np.nan)
-        return step.results[0].copy()
+            x_next[:] = np.nan
+        else:
+            x_next[:] = step.results[0]
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return y = h(x): (ny,) from x (nx,)."""
-        if self._measures_all:
+        if self.measures_all:
             return _vector(x, "x", len(self.states)).copy()
         output = self._output
         output.arguments[0][:] = _vector(x, "x", len(self.states))
@@ -159,7 +168,7 @@ class StepMap(Named):
         return Batch(self._step)
 
     @cached_property
-    def _measures_all(self) -> bool:
+    def measures_all(self) -> bool:
         """Whether y = x."""
         x = ca.SX.sym("x", self.nx)
         return self.ny == self.nx and self.h.is_a("SXFunction") and ca.is_equal(self.h(x), x, 1)

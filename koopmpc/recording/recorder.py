@@ -229,6 +229,8 @@ class Recorder:
 
 def _copied(step: Step) -> Step:
     """Return `step` with arrays of its own: a loop may write into its arrays again."""
+    plan = step.plan
+    kept = None if plan is None else Plan(_floats(plan.X), _floats(plan.U))
     return Step(
         k=step.k,
         y=_floats(step.y),
@@ -236,11 +238,11 @@ def _copied(step: Step) -> Step:
         reference=_floats(step.reference),
         move=step.move,
         x=_floats(step.x),
-        plan=None if step.plan is None else Plan(_floats(step.plan.X), _floats(step.plan.U)),
         x_next=_floats(step.x_next),
         y_next=_floats(step.y_next),
         reference_next=_floats(step.reference_next),
         u_reference=_floats(step.u_reference),
+        look_ahead=None if kept is None else lambda: kept,
     )
 
 

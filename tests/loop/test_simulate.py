@@ -137,10 +137,10 @@ def test_observers_see_each_step_once():
         reference=reference,
         steps=6,
         noise=0.01,
-        observers=[seen.append],
+        observers=[lambda step: seen.append((step, step.plan))],
     )
-    assert [step.k for step in seen] == list(range(6))
-    for k, step in enumerate(seen):
+    assert [step.k for step, _ in seen] == list(range(6))
+    for k, (step, plan) in enumerate(seen):
         for got, row in (
             (step.x, run.X[k]),
             (step.y, run.Y[k]),
@@ -149,7 +149,7 @@ def test_observers_see_each_step_once():
             (step.x_next, run.X[k + 1]),
             (step.y_next, run.Y[k + 1]),
             (step.reference_next, run.reference[k + 1]),
-            (step.plan.U[0], run.U[k]),
+            (plan.U[0], run.U[k]),
             (step.move.u, run.U[k]),
         ):
             np.testing.assert_array_equal(got, row)
@@ -171,6 +171,73 @@ def test_the_inputs_that_hold_the_reference_are_kept_and_shown(given):
     expected = np.broadcast_to(0.0 if given is None else given, (6, 1))
     np.testing.assert_array_equal(run.u_reference, expected)
     np.testing.assert_array_equal([step.u_reference for step in seen], expected)
+
+
+class Counted(km.KoopmanMPC):
+    """A controller that counts how often its plan is asked for."""
+
+    asked = 0
+
+    def plan(self):
+        self.asked += 1
+        return super().plan()
+
+
+def test_a_plan_is_found_where_somebody_asks_for_it():
+    loop = {"x0": [0.5, 0], "reference": [0, 0], "steps": 6}
+    controller = Counted(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6)
+    km.simulate(step_map(A, B), controller, **loop, observers=[lambda step: None])
+    assert controller.asked == 0
+    km.simulate(step_map(A, B), controller, **loop, observers=[lambda step: step.plan if step.k == 3 else None])
+    assert controller.asked == 1
+    run = km.simulate(step_map(A, B), controller, **loop, plans=True, observers=[lambda step: step.plan])
+    assert controller.asked == 7
+    assert run.plans.X.shape == (6, 7, 2)
+
+
+def test_a_plan_that_nobody_asked_for_in_time_is_refused_and_not_another():
+    late, kept = [], []
+    loop = {"x0": [0.5, 0], "reference": [0, 0], "steps": 4}
+    km.simulate(step_map(A, B), mpc(), **loop, observers=[late.append])
+    with pytest.raises(km.errors.DataError, match="the controller has gone on: read"):
+        late[0].plan.U  # noqa: B018
+    run = km.simulate(step_map(A, B), mpc(), **loop, observers=[kept.append], plans=True)
+    for k, step in enumerate(kept):
+        np.testing.assert_array_equal(step.plan.X, run.plans.X[k])
+    km.simulate(step_map(A, B), Recorded(), **loop, observers=[late.append])
+    assert late[-1].plan is None
+
+
+def test_a_step_map_runs_as_the_plant_that_remembers_its_state():
+    loop = {"x0": [0.5, 0], "reference": [0, 0], "steps": 9, "rng": 3}
+    more = {"noise": 0.01, "disturbance": lambda k, rng: 0.01 * rng.standard_normal(2)}
+    for own in ({}, more, {**more, "faults": [km.faults.NaNSensor(probability=0.2)]}):
+        one = km.simulate(step_map(A, B), Recorded(), **loop, **own)
+        other = km.simulate(km.plants.SimulatedPlant(step_map(A, B)), Recorded(), **loop, **own)
+        assert one == other
+        assert np.array_equal(one.X, one.Y) == (not own)
+
+
+class Careless(Recorded):
+    """A controller that writes into what it is given."""
+
+    def __call__(self, y, reference, applied=None):
+        move = super().__call__(y, reference, applied)
+        y[:] = 1e9
+        if applied is not None:
+            applied[:] = 1e9
+        return move
+
+
+def test_a_controller_that_writes_into_its_arguments_moves_neither_plant_nor_record():
+    for noise in (None, 0.01):
+        careful, careless = (
+            km.simulate(step_map(A, B), each, x0=[0.5, 0], reference=[0, 0], steps=6, noise=noise)
+            for each in (Recorded(), Careless())
+        )
+        np.testing.assert_array_equal(careless.X, careful.X)
+        np.testing.assert_array_equal(careless.Y, careful.Y)
+        np.testing.assert_array_equal(careless.U, careful.U)
 
 
 class Outside:

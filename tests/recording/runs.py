@@ -1,5 +1,7 @@
 """Runs to record: random ones of every form that a Run can take."""
 
+from collections.abc import Callable
+
 import numpy as np
 from hypothesis import strategies as st
 
@@ -86,6 +88,11 @@ def make_run(
     )
 
 
+def _planned(run: km.Run, k: int) -> Callable[[], km.control.Plan]:
+    """Return what answers with the plan of step k, as a controller does."""
+    return lambda: km.control.Plan(run.plans.X[k], run.plans.U[k])
+
+
 def steps_of(run: km.Run) -> list[km.loop.Step]:
     """Return what an observer of `run` sees."""
     return [
@@ -103,7 +110,7 @@ def steps_of(run: km.Run) -> list[km.loop.Step]:
                 float(run.slack[k]),
             ),
             x=run.X[k],
-            plan=None if run.plans is None else km.control.Plan(run.plans.X[k], run.plans.U[k]),
+            look_ahead=None if run.plans is None else _planned(run, k),
             x_next=run.X[k + 1],
             y_next=run.Y[k + 1],
             reference_next=run.reference[k + 1],

@@ -37,7 +37,7 @@ def test_steps_without_a_plan_leave_a_gap_in_the_plans(tmp_path: Path) -> None:
     run.plans.X[[0, 3]], run.plans.U[[0, 3]] = np.nan, np.nan
     with km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
         for step in steps_of(run):
-            recorder(replace(step, plan=None) if step.k in (0, 3) else step)
+            recorder(replace(step, look_ahead=None) if step.k in (0, 3) else step)
     assert km.load_run(tmp_path / "run.rrd") == run
 
 

@@ -14,7 +14,7 @@ from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
-from koopmpc.control.linear.plan import plan_map
+from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, alone, blocked, busy
 from koopmpc.control.saved import Kind
@@ -131,6 +131,7 @@ class KoopmanMPC(MPCBase):
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
         self._given_row, self._rows_left = 0, False  # if u_target has rows: that of step k, and if another follows
+        self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
     def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:
         return "KoopmanMPC", self.predictor, self._options
@@ -167,7 +168,7 @@ class KoopmanMPC(MPCBase):
         track = lifted_tracking(predictor, self.cost, self.limits)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
         self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=self._disturbed)
-        self.predictor = predictor
+        self.predictor, self._states = predictor, None
         self._qps.update(self._map.qp)
         self._reference_key = None
         self._initial.update(predictor)
@@ -225,14 +226,12 @@ class KoopmanMPC(MPCBase):
         """Return the plan of the last call; None where it had none."""
         if not self._planned:
             return None
-        A, B, E, C = self.predictor.A, self.predictor.B, self.predictor.E, self.predictor.C
-        U = self._plan[: len(self._blocks) * self.nu].reshape(-1, self.nu)[self._move_of]
-        push = self._initial.W @ E.T + (self._initial.d if self._disturbed else 0.0)
-        Z = np.empty((self._N + 1, self.predictor.nz))
-        Z[0] = self._initial.z
-        for k in range(self._N):
-            Z[k + 1] = A @ Z[k] + B @ U[k] + push[k]
-        return Plan(Z @ C.T, U)
+        if self._states is None:
+            rates = self._with_rates
+            self._states = planned_states(self.predictor, self._move_of, with_rates=rates, disturbed=self._disturbed)
+        moves = self._plan[: len(self._blocks) * self.nu]
+        X = self._states.dot(np.concatenate((moves, self._initial.known)))
+        return Plan(X.reshape(self._N + 1, -1), moves.reshape(-1, self.nu)[self._move_of])
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the matrix's last column: all NaN if a row is not finite."""

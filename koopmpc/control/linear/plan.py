@@ -154,6 +154,31 @@ def _row_sizes(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray
     return np.sqrt(np.where(squares > 0, squares, 1.0))
 
 
+def planned_states(
+    predictor: LinearPredictor, move_of: Int[np.ndarray, " N"], *, with_rates: bool, disturbed: bool
+) -> Float[np.ndarray, "N1nx nvk"]:
+    """Return the matrix that takes [moves; z; u_{−1}; w_0 … w_{N−1}; d; 1] to C z_0 … C z_N, one below the other.
+
+    z_{k+1} = A z_k + B u_k + E w_k + d; u_{−1} is there `with_rates`, d where it is estimated. Move move_of[k] is u_k.
+    """
+    A, B, E, C, N = predictor.A, predictor.B, predictor.E, predictor.C, len(move_of)
+    nx, nz, nu, nw = len(C), len(A), B.shape[1], E.shape[1]
+    from_z = np.empty((N + 1, nx, nz))  # C Aᵏ
+    from_z[0] = C
+    for k in range(N):
+        from_z[k + 1] = from_z[k] @ A
+    from_u, from_w = np.zeros((N + 1, nx, int(move_of[-1]) + 1, nu)), np.zeros((N + 1, nx, N, nw))
+    through_B, through_E = from_z @ B, from_z @ E
+    for j in range(N):  # what acts at step j moves all states after it
+        from_u[j + 1 :, :, move_of[j]] += through_B[: N - j]
+        from_w[j + 1 :, :, j] = through_E[: N - j]
+    parts = [from_u, from_z, np.zeros((N + 1, nx, nu * with_rates)), from_w]
+    if disturbed:
+        parts.append(np.concatenate([np.zeros((1, nx, nz)), np.cumsum(from_z[:-1], axis=0)]))
+    parts.append(np.zeros((N + 1, nx, 1)))
+    return np.concatenate([part.reshape((N + 1) * nx, -1) for part in parts], axis=1)
+
+
 def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "nv nw"]) -> PlanLimits:
     """Return the limits of a plan whose entries move by D w."""
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
