@@ -2,12 +2,14 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.control.cost import Cost, Sizes
+from koopmpc.control.limits import SOFTENED
 from koopmpc.errors import ShapeError
 from koopmpc.loop.run import Run
 from koopmpc.values import Value
@@ -31,6 +33,9 @@ class Metrics(Value):
         (nr,) each tracked output's error at T, in its unit.
     violation
         Largest violation of any state, output or rate limit, in the unit of that limit.
+    violation_share
+        Largest violation of any state, output or rate limit as a share of the limit's size, by which the default slack
+        counts, too: half the width between two finite ends, else see `Sizes`.
     input_violation
         Largest violation of any input limit, in its unit; every controller of this library keeps it at zero.
     effort
@@ -53,6 +58,8 @@ class Metrics(Value):
         (the last input again), OTHER_CONTROLLER (that which stands by).
     unknown
         Number of steps that the controller's monitor did not know; None where it has none.
+    solver
+        Number of steps that each QP solver made, by its name: "osqp", or "daqp" where it was asked first or took over.
     """
 
     cost: float
@@ -69,6 +76,8 @@ class Metrics(Value):
     status: Mapping[str, int]
     fallback: Mapping[str, int]
     unknown: int | None = None
+    violation_share: float = 0.0
+    solver: Mapping[str, int] = field(default_factory=dict[str, int])
 
     def __str__(self) -> str:
         """Return a line a figure."""
@@ -83,7 +92,8 @@ class Metrics(Value):
             "cost": f"{self.cost:.6g}" if given else "none was given",
             **_by_output("tracking rmse", self.tracking_rmse, tracked),
             **_by_output("final error", self.final_error, tracked),
-            "violation": f"{self.violation:.3g}",
+            "violation": f"{self.violation:.3g}"
+            + (f" ({self.violation_share:.3g} of the size)" if self.violation else ""),
             "input violation": f"{self.input_violation:.3g}",
             "effort": f"{self.effort:.6g}",
             "settling time": settles,
@@ -91,6 +101,7 @@ class Metrics(Value):
             "steps later than dt": str(self.late),
             "status": _counts(self.status),
             "fallback": _counts(self.fallback),
+            **({"solver": _counts(self.solver)} if self.solver else {}),
             **({} if self.unknown is None else {"unknown steps": str(self.unknown)}),
         }
 
@@ -137,6 +148,7 @@ def metrics(run: Run) -> Metrics:
     moved, changed = run.U - run.u_reference, np.diff(run.U, axis=0)
     R_delta = None if run.cost is None else run.cost.rate(nu)
     rates = 0.0 if R_delta is None else float(np.einsum("ki,ij,kj->", changed, R_delta, changed))
+    violation, share = _violation(run)
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
     return Metrics(
         cost=float("nan")
@@ -144,8 +156,9 @@ def metrics(run: Run) -> Metrics:
         else float(stage[1:].sum() + np.einsum("ki,ij,kj->", moved, R, moved)) + rates,
         tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
         final_error=error[-1].copy(),
-        violation=_violation(run),
-        input_violation=0.0 if run.limits is None else _excess(run.U, *run.limits.inputs(nu)),
+        violation=violation,
+        violation_share=share,
+        input_violation=0.0 if run.limits is None else float(_excess(run.U, *run.limits.inputs(nu)).max(initial=0.0)),
         effort=float((run.U**2).sum() * run.dt),
         settling_time=_settling_time(stage, run.dt),
         solve_time_p50=float(p50),
@@ -155,6 +168,7 @@ def metrics(run: Run) -> Metrics:
         status=dict(Counter(s.name for s in run.status)),
         fallback=dict(Counter(f.name for f in run.fallback)),
         unknown=int((run.known == 0).sum()) if (run.known >= 0).any() else None,
+        solver=dict(Counter(name for name in run.solver if name)),
     )
 
 
@@ -198,24 +212,34 @@ def _states(run: Run) -> Float[np.ndarray, "T1 nx"]:
     return run.X
 
 
-def _violation(run: Run) -> float:
+def _violation(run: Run) -> tuple[float, float]:
+    """Return the largest violation of a limit in its unit, and the largest as a share of the limit's size."""
     if run.limits is None:
-        return 0.0
-    X = _states(run)[1:]
-    rates = run.limits.rates(run.U.shape[1])
-    worst = _excess(X, *run.limits.states(X.shape[1]))
+        return 0.0, 0.0
+    limits, nu, values = run.limits, run.U.shape[1], _states(run)[1:]
+    nx, ny, cost = values.shape[1], 0, run.cost or Cost(1, 1)
+    if limits.of is not None:
+        outputs = limits.of.bind(run.states)(values)
+        ny, values = outputs.shape[1], np.hstack([values, outputs])
+    tracked = cost.of.bind(run.states)
+    size = Sizes.of(tracked, *cost.matrices(tracked.nz, nu), limits, run.states, None).rows
+    beyond = _excess(values, *limits.ends(nx, ny))
+    rates = limits.rates(nu)
     if rates is not None:
-        worst = max(worst, _excess(np.diff(run.U, axis=0), *rates))
-    if run.limits.of is not None:
-        outputs = run.limits.of.bind(run.states)(X)
-        worst = max(worst, _excess(outputs, *run.limits.outputs(outputs.shape[1])))
-    return worst
+        beyond = np.concatenate([beyond, _excess(np.diff(run.U, axis=0), *rates)])
+        size = np.concatenate([size, limits.rate_softness(nu).allowance / SOFTENED])
+    return float(beyond.max(initial=0.0)), float((beyond / size).max(initial=0.0))
 
 
-def _excess(values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]) -> float:
-    under, over = np.isfinite(low), np.isfinite(high)  # where there is no limit, not even inf is beyond it
-    beyond = np.hstack([low[under] - values[:, under], values[:, over] - high[over]])
-    return float(np.maximum(beyond, 0.0).max(initial=0.0))
+def _excess(
+    values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Return by how much each column is beyond its limits at most; where there is no limit, not even inf is beyond."""
+    beyond = np.zeros(len(low))
+    for end, sign in ((low, -1.0), (high, 1.0)):
+        known = np.isfinite(end)
+        beyond[known] = np.maximum(beyond[known], (sign * (values[:, known] - end[known])).max(axis=0, initial=0.0))
+    return beyond
 
 
 def _by_output(name: str, values: Float[np.ndarray, " nr"], tracked: Sequence[str] | None) -> dict[str, str]:

@@ -75,6 +75,8 @@ class StepRows(Value):
         (m, nu) inputs that hold the reference: the cost charges an input's distance from them; zeros by default.
     known
         (m,) 1 where the controller's monitor knew the step, 0 where it did not, −1 where nobody looked, by default.
+    solver
+        m entries: which solver made the move, "osqp" or "daqp", "" where none was asked or nobody says, by default.
     """
 
     X: Float[np.ndarray, "n nx"]
@@ -88,6 +90,7 @@ class StepRows(Value):
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
     slack: Float[np.ndarray, " ms"] = field(default_factory=lambda: np.empty(0))
     known: Int[np.ndarray, " mk"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    solver: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.u_reference.size:
@@ -96,6 +99,8 @@ class StepRows(Value):
             object.__setattr__(self, "slack", np.zeros(len(self.U)))
         if not self.known.size:
             object.__setattr__(self, "known", np.full(len(self.U), -1, dtype=np.int64))
+        if not self.solver:
+            object.__setattr__(self, "solver", ("",) * len(self.U))
 
     @staticmethod
     def of(steps: Sequence[Step], nx: int, *, end: bool) -> "StepRows":
@@ -150,6 +155,7 @@ def _columns_of(moves: Sequence[Move | None]) -> dict[str, Any]:
         "iterations": np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
         "slack": np.array([0.0 if m is None else m.slack for m in moves], dtype=np.float64),
         "known": np.array([-1 if looked is None else int(looked) for looked in known], dtype=np.int64),
+        "solver": tuple([str(getattr(m, "solver", "")) for m in moves]),
     }
 
 
@@ -223,8 +229,9 @@ class Run(About, StepRows):
         (T+1, nx) true states, (T+1, ny) measurements, (T+1, nr) references.
     U, u_reference
         (T, nu) inputs as applied, and the inputs that hold the reference.
-    status, fallback, solve_time, iterations, slack, known
-        T entries each: how each step ended, how long it took [s], what its solver did, and whether its model knew.
+    status, fallback, solve_time, iterations, slack, known, solver
+        T entries each: how each step ended, how long it took [s], what its solver did, whether its model knew, and
+        which solver it was.
     plans
         The plan of each step, where asked for.
     cost, limits, dt, states, inputs, outputs, angles, metadata

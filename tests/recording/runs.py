@@ -72,6 +72,7 @@ def make_run(
         fallback=tuple(rng.choice(list(km.control.Fallback), T)),
         solve_time=rng.random(T) * 1e-3,
         iterations=rng.integers(0, 4000, T),
+        solver=tuple(rng.choice(["", "osqp", "daqp"], T).tolist()),
         cost=km.Cost(Q=rng.random(nx), R=np.eye(nu) / 3) if cost else None,
         limits=km.Limits(u_min=-np.inf, u_max=rng.random(nu), of=km.Fourier(2, [0]), y_max=1.0, slack=None)
         if limits
@@ -108,6 +109,7 @@ def steps_of(run: km.Run) -> list[km.loop.Step]:
                 float(run.solve_time[k]),
                 int(run.iterations[k]),
                 float(run.slack[k]),
+                run.solver[k],
             ),
             x=run.X[k],
             look_ahead=None if run.plans is None else _planned(run, k),

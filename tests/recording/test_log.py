@@ -28,6 +28,15 @@ def test_a_log_reads_back_to_the_bit(some: dict[str, Any], tmp_path: Path) -> No
     assert km.load_run(tmp_path / "run.rrd") == run
 
 
+def test_a_log_without_the_solvers_of_its_steps_reads_as_before(tmp_path: Path) -> None:
+    """Logs of before have no such column, and neither has one whose steps asked no solver."""
+    run = replace(make_run(), solver=())
+    km.record(run, tmp_path / "run.rrd")
+    assert "/solver/qp" not in read_columns(tmp_path / "run.rrd", ("/solver/qp", "/state")).entities()
+    assert km.load_run(tmp_path / "run.rrd") == run
+    assert km.metrics(run).solver == {}
+
+
 @pytest.mark.slow
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(some=options)

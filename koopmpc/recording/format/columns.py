@@ -20,6 +20,7 @@ class Entity(StrEnum):
     SLACK = "solver/slack"  # how far the plan breaks a soft limit, in the rows where it does
     KNOWN = "solver/known"  # 1 where the model knows and 0 where it does not, in the rows where a monitor looked
     SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" and "iterations" hold time and iterations to the bit
+    QP = "solver/qp"  # "state": which solver made the move, or "none", in the rows where it changes; "none" before all
     DEADLINE = "solver/deadline_ms"  # dt [ms], at the first and the last step of a block
     STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes
     PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
@@ -29,3 +30,4 @@ class Entity(StrEnum):
 
 
 DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
+NO_SOLVER = "none"  # the solver of a step that asked none

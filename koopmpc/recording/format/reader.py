@@ -12,7 +12,7 @@ from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
-from koopmpc.recording.format.columns import DRAWN, Entity
+from koopmpc.recording.format.columns import DRAWN, NO_SOLVER, Entity
 from koopmpc.recording.format.rrd import LogColumns, read_columns
 
 
@@ -74,6 +74,7 @@ def _run(log: LogColumns, path: Path) -> Run:
         u_reference=_sparse(log, Entity.INPUT_REFERENCE, steps, len(about.inputs)),
         slack=_sparse(log, Entity.SLACK, steps, 1)[:, 0],
         known=_sparse(log, Entity.KNOWN, steps, 1, absent=-1.0)[:, 0].astype(np.int64),
+        solver=_solvers(log, steps),
         **about.about(),
     )
 
@@ -121,6 +122,14 @@ def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ..
         raise LogError(f"{path} holds the status {error}, which this version of koopmpc does not know") from error
     held = [pairs[i] for i in np.searchsorted(k, np.arange(steps), side="right") - 1]
     return tuple(s for s, _ in held), tuple(f for _, f in held)
+
+
+def _solvers(log: LogColumns, steps: int) -> tuple[str, ...]:
+    """Return the solver of each step: the last change at or before it; logs of before have none."""
+    k, _, words = log.rows(Entity.QP, "state")
+    names = [NO_SOLVER, *(words.to_pylist() if len(k) else [])]
+    held = np.searchsorted(k, np.arange(steps), side="right")
+    return tuple("" if names[i] == NO_SOLVER else names[i] for i in held)
 
 
 def _pair(word: str) -> tuple[Status, Fallback]:

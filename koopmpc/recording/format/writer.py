@@ -26,7 +26,7 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
-from koopmpc.recording.format.columns import Entity
+from koopmpc.recording.format.columns import NO_SOLVER, Entity
 from koopmpc.recording.format.logfile import CHECK, LogFile
 from koopmpc.recording.format.rrd import LogBlock, blocks
 from koopmpc.recording.views.blueprint import ahead, blueprint, input_limits, panels, state_limits, status_value, styles
@@ -113,6 +113,7 @@ class Writer:
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
         self._extent, self._shown = Extent(), Extent().ranges()
         self._status: tuple[Status, Fallback] | None = None
+        self._solver = NO_SOLVER
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
         self._places: dict[str, int] = {}  # a checksum of the steps of its rows
@@ -330,7 +331,7 @@ class Writer:
             self._rec.log(entity, style, static=True)
 
     def _statuses(self, rows: LogBlock) -> None:
-        """Write the status where it changes, and a line of text for every fallback that sets in."""
+        """Write the status and the solver where they change, and a line of text for every fallback that sets in."""
         import rerun as rr
 
         pairs = list(zip(rows.status, rows.fallback, strict=True))
@@ -341,6 +342,13 @@ class Writer:
             self._sum(f"/{Entity.STATUS}:state", "".join(words).encode(), rows.k + np.array(changed))
             at = times(rows.k + np.array(changed), self._about.dt)
             self._rec.send_columns(Entity.STATUS, at, rr.StateChange.columns(state=words))
+        solvers = [name or NO_SOLVER for name in rows.solver]
+        turns = [i for i, name in enumerate(solvers) if name != (solvers[i - 1] if i else self._solver)]
+        self._solver = solvers[-1]
+        if turns:
+            words, k = [solvers[i] for i in turns], rows.k + np.array(turns)
+            self._sum(f"/{Entity.QP}:state", "".join(words).encode(), k)
+            self._rec.send_columns(Entity.QP, times(k, self._about.dt), rr.StateChange.columns(state=words))
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
         if fallen:
             texts = [f"step {rows.k + i}: {status_words(*pairs[i])}" for i in fallen]
