@@ -163,6 +163,7 @@ def simulate(
     X = Y if seen else np.full((steps + 1, nx), np.nan)
     status: list[Status] = []
     fallback: list[Fallback] = []
+    solver: list[str] = []
     solve_time: list[float] = []
     iterations: list[int] = []
     slack, known = np.zeros(steps), np.full(steps, -1)
@@ -226,6 +227,7 @@ def simulate(
             Y[k + 1] = y
         status.append(move.status)  # not the Move itself: thousands of objects keep the garbage collector busy
         fallback.append(move.fallback)
+        solver.append(move.solver if type(move) is Move else str(getattr(move, "solver", "")))
         solve_time.append(move.solve_time)
         iterations.append(move.iterations)
         if move.slack:
@@ -256,6 +258,7 @@ def simulate(
         iterations=np.array(iterations, dtype=np.int64),
         slack=slack[:end],
         known=known[:end],
+        solver=tuple(solver),
         cost=cost,
         limits=limits,
         dt=plant.dt,

@@ -82,3 +82,43 @@ def test_a_state_that_never_moved_in_the_data_may_have_a_limit():
     mpc = km.KoopmanMPC(model, km.Cost([0, 1], 0.1), km.Limits(-1, 1, x_max=[2, 1]), 5)
     assert mpc([1, 0.5], [1, 0]).status is km.Status.UNCONSTRAINED
     assert mpc([3, 0.5], [1, 0]).status is km.Status.SOFTENED
+
+
+def episodes(count, steps, still=None):
+    """Return episodes of a driven first-order lag v and its integral p; the column `still` is constant."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(count):
+        U, X = rng.uniform(-1, 1, (steps, 1)), np.zeros((steps + 1, 2))
+        if still == "u":
+            U[:] = 0.5
+        X[0] = rng.uniform(-1, 1, 2)
+        for k in range(steps):
+            X[k + 1] = X[k, 0] + 0.1 * X[k, 1], 0.9 * X[k, 1] + 0.2 * U[k, 0] + 0.01 * rng.standard_normal()
+        if still == "p":
+            X[:, 0] = 3.0
+        found.append(km.Episode(X=X, U=U))
+    return km.Episodes(found, 0.1, ["p", "v"], ["u"])
+
+
+FEW = {"candidates": [km.State() + km.Constant()], "horizon": 10, "delays": [0], "ridges": [1e-6], "bilinear": False}
+
+
+def test_select_cuts_one_episode_into_blocks_says_so_and_its_model_controls():
+    found = km.select(episodes(1, 200), **FEW)
+    assert "1 episode is too few for 5 folds: cut into" in str(found)
+    mpc = km.KoopmanMPC(found.predictor, COST, km.Limits(-1, 1), 10)
+    assert mpc([0.5, 0.0], [0.0, 0.0]).status in (km.Status.UNCONSTRAINED, km.Status.OPTIMAL)
+
+
+def test_select_refuses_one_episode_that_is_too_short():
+    with pytest.raises(km.errors.DataError, match=r"choice needs 2: pass a shorter horizon, or longer episodes"):
+        km.select(episodes(1, 15), **FEW)
+
+
+@pytest.mark.parametrize("still", ["p", "u"])
+@pytest.mark.filterwarnings("ignore:feedback made A and B inseparable")
+def test_select_says_which_column_is_constant_and_its_model_controls(still):
+    with pytest.warns(km.FitWarning, match=f"{still} is constant in these data, so what it does cannot be learned"):
+        found = km.select(episodes(8, 40, still), **FEW)
+    mpc = km.KoopmanMPC(found.predictor, COST, km.Limits(-1, 1, x_max=[4, 1]), 10)
+    assert np.abs(mpc([3.0, 0.5], [3.0, 0.0]).u).max() <= 1.0
