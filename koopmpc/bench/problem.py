@@ -105,7 +105,7 @@ class Problem:
     lifting, ridge
         z = ψ(x), and the weight of the regularisation of `edmd`.
     cost, limits, horizon
-        The same for all controllers.
+        What every controller gets.
     cases
         Cases by name, at least one.
     integrator

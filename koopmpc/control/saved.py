@@ -27,7 +27,7 @@ class SavedController(Value):
     name
         The class of the controller.
     model
-        Its predictor.
+        The predictor of the controller.
     cost, limits, horizon, estimator, latency, moves, time_limit
         Its arguments; `moves` are the lengths of the blocks of held inputs.
     options

@@ -168,7 +168,7 @@ def targets(
     R_root
         S with SᵀS = R, by default the identity.
     sizes
-        Of z and u, by default 1.
+        Sizes of the entries of [z; u], by default 1.
     """
     nz, nu = len(A), B.shape[1]
     measure = checks.array(1.0 if sizes is None else sizes, "sizes") * np.ones(nz + nu)

@@ -149,7 +149,7 @@ class History:
     Parameters
     ----------
     embedding
-        Bound.
+        The `Delay`, bound to the plant's names.
     """
 
     def __init__(self, embedding: Delay) -> None:

@@ -30,7 +30,7 @@ def spectrum(predictor: AnyPredictor, residuals: ResidualDMD | ArrayLike | None 
     Parameters
     ----------
     predictor
-        Its `eigenvalues` are drawn.
+        The model whose `eigenvalues` are drawn.
     residuals
         A `ResidualDMD`, as `trust` and `residual_dmd` return, with its tolerance; or (nz,) in the order of
         ``predictor.eigenvalues``, with a tolerance of 0.05. Without them all points look alike.

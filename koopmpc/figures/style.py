@@ -100,7 +100,7 @@ def figure(
     width
         "one column" or "two columns" of a page.
     height
-        Of the figure [in].
+        Height of the figure [in].
     more
         For `Figure.subplots`: ``sharex``, ``height_ratios``, …
 
@@ -123,9 +123,9 @@ def line(i: int, points: int = 0) -> dict[str, Any]:
     Parameters
     ----------
     i
-        From 0 on.
+        Number of the curve in the panel, from 0 on.
     points
-        Of the curve: about eight of them get the marker, none if it is 0.
+        How many points the curve has: about eight of them get the marker; 0 for no markers.
     """
     look: dict[str, Any] = {"color": _COLORS[i % len(_COLORS)], "linestyle": _DASHES[i % len(_DASHES)]}
     if points:

@@ -90,7 +90,7 @@ class Checked:
     reasons
         Why not, in sentences; or what was not asked.
     figures
-        Of each kind of run.
+        What was measured in each kind of run.
     cold, hot
         Time of the first step of a fresh controller, and the 99 % quantile of all others [s].
     dt
@@ -156,7 +156,7 @@ def check_controller(
     folder
         Where check.md is written.
     runs
-        Of each kind.
+        How many runs there are of each kind.
     progress
         Called with what is done, how many of it are, and how many there are.
     rng

@@ -32,7 +32,7 @@ class Goal:
     Attributes
     ----------
     cost, limits, horizon
-        Of the controller.
+        What the controller gets.
     reference
         (nr,) or rows (T+1, nr) of the states that the cost weighs.
     angles

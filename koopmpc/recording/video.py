@@ -51,7 +51,7 @@ def export_video(
     fps
         Pictures a second.
     width
-        Of the picture [pixels].
+        Width of the picture [pixels].
     speed
         Seconds of the run in one second of the video.
     until

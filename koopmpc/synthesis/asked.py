@@ -29,21 +29,22 @@ class Asked(Value):
     Attributes
     ----------
     cost, limits, horizon
-        Of every controller.
+        What every controller gets.
     reference
         (T+1, nr) rows, T at least `steps`.
     starts
-        (n, nx).
+        (n, nx) states from which runs begin.
     first_states
-        (m, nx) of all episodes, those inside the limits where there are enough; random starts are drawn from these.
+        (m, nx) first states of all episodes, of those inside the limits where there are enough; random starts are
+        drawn from these.
     steps
-        Of a run: three horizons, or what the reference has.
+        Length of a run: three horizons, or the steps of the reference.
     angles
         Indices of states whose errors wrap.
     low, high
         (nx,) range of the data.
     limit_sizes
-        (nx + ny,) what violations are shares of: the range between two limits, else that of the data.
+        (nx + ny,) range of each limited row, of which violations are shares: between its two limits, else of the data.
     """
 
     cost: Cost
@@ -69,7 +70,7 @@ class Asked(Value):
         return len(self.reference) - 1 - self.steps
 
     def beyond(self, X: Float[np.ndarray, "T nx"], states: Sequence[str]) -> Float[np.ndarray, " T"]:
-        """Return by what share of its size the limit that each state breaks most is broken."""
+        """Return for each state its largest violation of a limit, as a share of that limit's size."""
         values, (low, high) = X, self.limits.states(X.shape[1])
         if self.limits.of is not None:
             Y = self.limits.of.bind(states)(X)
@@ -80,7 +81,8 @@ class Asked(Value):
     def hull(self, free: Sequence[int], tracked: Sequence[int]) -> tuple[Float[np.ndarray, " nx"], ...]:
         """Return the box that a run must not leave: data, starts and reference with half of the data's range around.
 
-        The states `free` are free; the columns of the reference are of the states `tracked`, of none where it is empty.
+        The states `free` are not limited. The columns of the reference belong to the states `tracked`; where that is
+        empty, they belong to none.
         """
         low, high = np.minimum(self.low, self.starts.min(axis=0)), np.maximum(self.high, self.starts.max(axis=0))
         for column, i in enumerate(tracked):

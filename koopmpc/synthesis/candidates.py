@@ -1,4 +1,4 @@
-"""What a selection tries where nobody says: liftings for a plant of which nothing is known but its data."""
+"""The candidates of a selection by default: liftings for a plant of which nothing is known but its data."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -37,7 +37,7 @@ class Candidate(Value):
     lifting
         ψ.
     embedding
-        ψ acts on the state and its past.
+        The delays, where ψ acts on the state and its past.
     bilinear
         z⁺ = A z + B u + Σ uᵢ Nᵢ z instead of z⁺ = A z + B u.
     """
@@ -75,7 +75,7 @@ def expanded(
 ) -> list[Candidate]:
     """Return the candidates bound to the data; a plain lifting becomes one for each number of delays and each kind.
 
-    A lifting that is made for the states alone, as one with centres is, is tried without delays only.
+    A lifting that can be of the states alone, one with centres for example, is tried only without delays.
     """
     found: list[Candidate] = []
     for i, one in enumerate(given):
@@ -100,8 +100,9 @@ def expanded(
 def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.random.Generator) -> list[Candidate]:
     """Return the candidates for an unknown plant: linear, polynomial, trigonometric, radial and random ones.
 
-    Those with more observables than 120, more regressors than 260, or fewer than 10 snapshot pairs for each of
-    these are left out. With delays the nonlinear observables are those of the present state, the past enters linearly.
+    A candidate is left out if it has more than 120 observables, more than 260 regressors, or fewer than 10 snapshot
+    pairs for each regressor. With delays the nonlinear observables are those of the present state; the past enters
+    linearly.
     """
     pairs = sum(len(episode) for episode in episodes)
     room = min(_REGRESSORS, max(pairs // _EACH, 2 * (episodes.nx + episodes.nu)))
@@ -123,16 +124,16 @@ def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.ran
 
 
 def angles(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> list[int]:
-    """Return the states that look like angles in rad: by unit, else by name, and not confined to a speck.
+    """Return the states that look like angles, by their unit rad, else by their name, and that move by 0.2 rad or more.
 
-    A state in rad that moves by less than 0.2 rad is its own sine.
+    The sine of an angle that moves less is the angle itself.
     """
     moving = np.ptp(X, axis=0) > 0.2
     return [i for i, name in enumerate(states) if moving[i] and _angle(name)]
 
 
 def jumps(episodes: Episodes) -> dict[int, int]:
-    """Return for each angle that was wrapped how often it jumps by 2π."""
+    """Return how often each angle jumps by 2π, for the angles that were wrapped."""
     X = np.concatenate([episode.X for episode in episodes])
     found: dict[int, int] = {}
     for i in angles(episodes.states, X):
@@ -158,7 +159,7 @@ def _angle(name: str) -> bool:
 
 
 def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Iterator[tuple[str, Lifting]]:
-    """Yield sines and cosines of the angles, alone and times the other states; of all where none looks like one."""
+    """Yield sines and cosines of the angles, alone and times the other states; without angles, those of all states."""
     found, base = angles(states, X), State() + Constant()
     if found:
         which, where = found, ", ".join(short(states[i]) for i in found)

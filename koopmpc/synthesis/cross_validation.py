@@ -33,7 +33,7 @@ _LOST = 100.0  # a prediction that is so many spreads off is no prediction
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What one task does: a bound candidate, the episodes with their folds, the horizon and the ridges.
+    """One task: a bound candidate, the episodes with their folds, the horizon and the ridges.
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class Trial:
     horizon
         Steps ahead.
     first
-        The step of an episode at which forecasts start at the earliest: the longest embedding of all candidates,
-        so that every one is judged on the same forecasts.
+        The earliest step of an episode at which forecasts start: the length of the longest embedding of all
+        candidates, so that all are judged on the same forecasts.
     ridges
         Weights to try, the least first.
     relift
@@ -66,21 +66,21 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Tried(Value):
-    """What came of a trial, for each ridge.
+    """The result of a trial, for each ridge.
 
     Attributes
     ----------
     candidate
-        What was tried.
+        The candidate that was tried.
     ridges
         Weights on unit-norm columns.
     errors
         (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
         spread; infinite from where the forecasts of a fold run away.
     inputs
-        Columns of B, with those of measured disturbances.
+        Number of columns of B and E.
     A
-        (ridges, nz, nz), fitted to all folds.
+        (ridges, nz, nz) matrices A, fitted to all folds.
     misfit
         Mean over the states of (one-step residual / root-mean-square)², of all folds with the least ridge.
     seconds
@@ -101,9 +101,9 @@ class Tried(Value):
         return np.sqrt(np.mean(self.errors**2, axis=2))
 
     def best(self, floor: float) -> int:
-        """Return the place of the largest ridge whose worst fold is within 2 % of the least, of those from `floor` on.
+        """Return the index of the largest ridge from `floor` on whose worst fold is within 2 % of the best ridge's.
 
-        The largest ridge counts whatever the floor.
+        Where every ridge is below the floor, the largest one stands for it.
         """
         worst, first = self.scores.max(axis=1), np.searchsorted(self.ridges[:-1], floor)
         alike = max(_ALIKE * worst[first:].min(), EXACT)
@@ -113,8 +113,8 @@ class Tried(Value):
 def tried(trial: Trial) -> Tried:
     """Cross-validate one candidate.
 
-    The moments of each fold are read once; those of the data without it are the sum of the others', for moments add.
-    A ridge costs neither a pass over the data nor a decomposition.
+    The moments of each fold are read once. Moments add, so those of all data but a fold are the sum of the other
+    folds'. A further ridge costs neither a pass over the data nor a decomposition.
     """
     begun = perf_counter()
     count = max(trial.fold) + 1
@@ -167,7 +167,7 @@ def _misfit(candidate: Candidate, total: Moments) -> float:
 
 
 def _solutions(candidate: Candidate, task: Regression, ridges: Sequence[float]) -> list[Float[np.ndarray, "n nz"]]:
-    """Return K of each ridge; a bilinear model is drawn to z⁺ = z, as its refit is."""
+    """Return K of each ridge. The ridge of a bilinear model pulls it towards z⁺ = z, as in the final fit."""
     P, nz = task.rows.P, task.lifting.nz
     start = np.eye(P.shape[1], nz) * candidate.bilinear
     rows = RegressionRows(P, task.rows.T[:, :nz] - P @ start, task.rows.rest[:nz], task.rows.samples)
@@ -175,7 +175,7 @@ def _solutions(candidate: Candidate, task: Regression, ridges: Sequence[float]) 
 
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
-    """Return triangular factors, whatever the condition: which route a fold takes must not depend on the fold."""
+    """Return moments as triangular factors whatever the condition, so that all folds are solved in the same way."""
     return second_moments(
         episodes if candidate.bilinear else episodes.driven(),
         candidate.lifting,

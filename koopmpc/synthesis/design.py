@@ -66,8 +66,8 @@ def design(
        over the horizon, a bilinear one lifted anew at every step, as its controller does. This chooses ridges, the
        five models of each kind that go on, and the two that stand in for the plant.
     2. Surrogates: the bilinear model of the least error and the best one of another family of observables, each
-       fitted to each two folds. They measure with the noise that their one-step errors show.
-    3. Controllers: each model, fitted to two folds, controls surrogates that know the fold which it does not, for three
+       fitted to every two folds. Their measurements have the noise that their one-step errors show.
+    3. Controllers: each model, fitted to two folds, controls surrogates that know the third fold, for three
        horizons from several starts: BilinearMPC, KoopmanMPC, and plain KoopmanMPC with Q_N = Q.
     4. The best go on with every estimator and end of the horizon, one with weights around what its loops visit, and are
        also judged on surrogates whose inputs act 20 % more and 20 % less: a plant is never quite the one of its logs.
@@ -92,7 +92,7 @@ def design(
         (nx,) or (n, nx) states from which runs begin; by default first states of four episodes, inside the limits.
     angles
         Indices of states whose errors wrap at ±π. They may leave the data; so may angles that made whole turns in the
-        data, and positions that nothing depends on.
+        data, and positions on which nothing depends.
     candidates
         Models to try, as for `select`.
     delays
@@ -197,7 +197,7 @@ def design(
 def _first(
     made: Callable[[int], Designed | None], rows: Sequence[DesignRow], place: int | None
 ) -> tuple[Designed | None, int | None]:
-    """Return the first controller that is confirmed, and its place: of the choice, or of the next best of its kind."""
+    """Return the first controller that is confirmed, the chosen one or the next best of its kind, and its place."""
     if place is None:
         return None, None
     kind = None if rows[place].recipe.candidate.bilinear else "linear"
@@ -265,7 +265,7 @@ def _test(
 
 
 class _FreeInputs:
-    """The inputs that cost nothing in a run: those that hold the reference on its surrogate, or those of the cost."""
+    """The inputs that cost nothing in a run: those that hold the reference on its surrogate, or the cost's u_target."""
 
     def __init__(self, asked: Asked, surrogates: Sequence[Surrogate]) -> None:
         self._asked, self._surrogates = asked, surrogates
@@ -343,7 +343,7 @@ def _stage(progress: StageProgress | None, name: str) -> Progress | None:
 def _jobs(
     chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: tuple[int, ...]
 ) -> list[Job]:
-    """Return the jobs of a later round, with the models of the first and what is known of the same controllers."""
+    """Return the jobs of a later round; models and runs of earlier rounds are not made again."""
     jobs: list[Job] = []
     for one in chosen:
         same = [i for i, other in enumerate(screened) if other == one]
@@ -354,7 +354,7 @@ def _jobs(
 
 
 def _leaderboard(screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
-    """Return the rows, the best first, those of the last round before the others, and the outcome of each."""
+    """Return the rows and the outcome of each: the last round before the others, and the best first in each."""
     both: list[tuple[DesignRow, Outcome]] = []
     for off, (recipes, outcomes) in ((True, last), (False, screened)):
         part: list[tuple[DesignRow, Outcome]] = []

@@ -1,4 +1,4 @@
-"""Design: the controller chosen by closed loop, what to expect of it, how others did; the file that keeps it."""
+"""Design: the controller chosen by closed loop, what to expect of it, the leaderboard, and the file that keeps it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class DesignRow(Value):
     score
         Mean over its runs of cost × (1 + 10 max(0, violation − 0.5 %)), over the best on the same surrogate and start.
     worst
-        The largest of these; 20 is a lost run.
+        The largest of these ratios; 20 is a lost run.
     violation
         Largest violation of a limit in any run that was not lost, as a share of its range.
     lost
@@ -44,7 +44,7 @@ class DesignRow(Value):
     runs
         How many runs it was judged by.
     off
-        Whether runs with inputs 20 % off are among them; such scores compare with each other, others with others.
+        Whether runs with inputs 20 % off are among them. Only scores of rows that agree in this can be compared.
     """
 
     recipe: Recipe
@@ -63,9 +63,9 @@ class DesignRow(Value):
 
 @dataclass(frozen=True, eq=False)
 class Expected(Value):
-    """What the closed loop of a design is expected to be: runs on surrogates that know data which it does not.
+    """What to expect of a design's closed loop, from runs on surrogates that know data which its model does not know.
 
-    An estimate from data alone, and no promise: what all models have learned wrongly shows on no surrogate.
+    It is an estimate from data alone, and no promise: what all models have learned wrongly shows on no surrogate.
 
     Attributes
     ----------
@@ -80,9 +80,9 @@ class Expected(Value):
     starts
         (runs, nx) where the runs of `cost` began.
     surrogate
-        (runs,) on which surrogate each was.
+        (runs,) the surrogate of each run.
     steps
-        Of a run.
+        Length of a run.
     """
 
     cost: Float[np.ndarray, " runs"]
@@ -113,7 +113,7 @@ class Expected(Value):
 
 @dataclass(frozen=True, eq=False)
 class Evidence(Value):
-    """What a design rests on: the task, the stand-ins of the plant, and what is expected.
+    """What a design rests on: the task, the surrogates, and what is expected.
 
     Attributes
     ----------
@@ -122,9 +122,9 @@ class Evidence(Value):
     surrogates
         Learned stand-ins of the plant.
     low, high
-        (nx,) a run that leaves this box is lost.
+        (nx,) the box of the states; a run that leaves it is lost.
     expected
-        Of the chosen controller.
+        What to expect of the chosen controller.
     goal_can_be_held
         Whether the reference rests, and an input inside the limits holds it.
     """
@@ -154,13 +154,13 @@ class Design:
     controller
         KoopmanMPC or BilinearMPC, fitted to all data.
     linear
-        The best KoopmanMPC; `controller` itself where that is one, None where none came through.
+        The best KoopmanMPC: `controller` itself where that is one; None where no KoopmanMPC was confirmed.
     leaderboard
-        All recipes, the best first; those that were judged in all conditions stand before those that were screened.
+        All recipes, the best first; those that were judged in all conditions stand before those of the first round.
     chosen, chosen_linear
         Places of the two in the leaderboard.
     evidence
-        The task, the stand-ins of the plant, and what to expect of `controller`.
+        The task, the surrogates, and what to expect of `controller`.
     advice
         What limits the closed loop, and which data would help, in sentences.
     notes
@@ -183,7 +183,7 @@ class Design:
 
     @property
     def expected(self) -> Expected:
-        """What to expect of `controller`: an estimate, no promise."""
+        """What to expect of `controller`: an estimate, and no promise."""
         return self.evidence.expected
 
     def save(self, path: str | Path) -> None:
@@ -240,9 +240,10 @@ def _worst(values: Float[np.ndarray, " runs"]) -> str:
 
 
 def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
-    """Return the simplest row within 0.5 % of the best of those that were judged in all conditions.
+    """Return the place of the simplest row within 0.5 % of the best, among those that were judged in all conditions.
 
-    A linear model is simpler than a bilinear one, then come weights, delays, and the number of observables.
+    A linear model is simpler than a bilinear one; of the same kind a row without weights is simpler, then the one with
+    fewer delays, then the one with fewer observables.
     """
     places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
     if not places:
@@ -258,7 +259,7 @@ def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
 
 
 def load_controller(path: str | Path) -> AnyMPC:
-    """Return the controller that `save` of a controller or of a Design wrote, as after `reset`.
+    """Return the controller that `save`, of a controller or of a Design, wrote. It begins as after `reset`.
 
     The file holds numbers and names only; reading it runs no code of it.
 
@@ -271,12 +272,18 @@ def load_controller(path: str | Path) -> AnyMPC:
 
 
 def saved_controller(path: str | Path) -> SavedController | SavedDesign:
-    """Return what the file holds: a controller, or a design."""
+    """Return the content of the file: a controller, or a design."""
     return load_value(path, SavedController, SavedDesign)
 
 
 def made(saved: SavedController | SavedDesign, path: str | Path) -> AnyMPC:
-    """Return the controller; raise LogError where its parts do not go together."""
+    """Return the controller that was saved.
+
+    Raises
+    ------
+    LogError
+        Its parts do not go together.
+    """
     one = saved.controller if isinstance(saved, SavedDesign) else saved
     try:
         return _KINDS[one.name](

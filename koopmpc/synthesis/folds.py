@@ -92,9 +92,9 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
     episodes
         Of any length.
     needed
-        Steps that one must have to be scored.
+        Steps that an episode must have to be scored.
     folds
-        How many, if there are as many episodes.
+        How many folds there are; fewer where there are fewer episodes.
     rng
         Deals out the episodes.
 
@@ -120,7 +120,7 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
         if cut:
             notes.append(
                 f"{number} episode{'s are' if number > 1 else ' is'} too few for {folds} folds: cut into {len(long)} "
-                "blocks, and a fold is one stretch of them; what follows itself is alike, so the errors may flatter"
+                "blocks, and a fold is one stretch of them; neighbouring blocks are alike, so errors may be too small"
             )
     if len(long) < 2:
         raise DataError(
@@ -162,7 +162,7 @@ def blocks(episode: Episode, steps: int) -> list[Episode]:
 
 
 def _thinned(episodes: Episodes, quota: int) -> Episodes:
-    """Return evenly spread episodes of about `quota` steps in all; of one that is longer, its beginning."""
+    """Return evenly spread episodes of about `quota` steps in all; of a longer single one, its beginning."""
     total = sum(len(episode) for episode in episodes)
     if total <= quota:
         return episodes

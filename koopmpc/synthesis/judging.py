@@ -1,4 +1,4 @@
-"""Recipes judged by closed loop: each is made of some folds, and controls surrogates that were made of others."""
+"""Recipes judged by closed loop: a recipe is fitted to some folds, and controls surrogates fitted to others."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,9 +42,9 @@ class Condition:
     fold
         The fold that the model does not know.
     surrogate
-        Which one is driven; it knows that fold.
+        Number of the surrogate that is controlled; it knows that fold.
     gain
-        How much of their action in the data the inputs have.
+        How strongly the inputs act; 1 is as in the data.
     x0
         (nx,) start.
     first
@@ -63,7 +63,7 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class LoopTest:
-    """What all runs share: the task, the data in folds, the surrogates, and the conditions.
+    """The task, the data in folds, the surrogates and the conditions, which all runs share.
 
     A run that leaves the box from `low` to `high` is lost. With `tighten` controllers have margins to the limits.
     """
@@ -78,7 +78,7 @@ class LoopTest:
     tighten: bool
 
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
-        """Return the limits that a controller is given whose model has these errors."""
+        """Return the limits that a controller gets if its model has these errors."""
         if not self.tighten:
             return self.asked.limits
         return self.asked.limits.tightened(np.where(np.isfinite(band), band, self.asked.high - self.asked.low))
@@ -89,7 +89,7 @@ class LoopTest:
         return tuple(i for i, condition in enumerate(self.conditions) if condition.gain == 1.0)
 
     def plant(self, condition: Condition) -> StepMap:
-        """Return the plant that is driven; each is built once in a process."""
+        """Return the plant of a condition; each plant is built once in a process."""
         key = condition.surrogate, condition.gain
         if key not in self._plants:
             self._plants[key] = self.surrogates[condition.surrogate].plant(condition.gain)
@@ -102,12 +102,12 @@ class LoopTest:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came of a job.
+    """The result of a job.
 
     Attributes
     ----------
     cost
-        Of each run; infinite where it was lost.
+        Cost of each run; infinite where it was lost.
     violation
         Largest violation of a limit in each run, as a share of its range.
     broken
@@ -115,9 +115,10 @@ class Outcome:
     visited
         (n, nx) states of the runs in which the inputs act as in the data.
     band
-        (h, nx) half-width of the errors 1 … h steps ahead on the folds that the models do not know: 90 % are inside.
+        (h, nx) half-width of the band that holds 90 % of the errors 1 … h steps ahead, on folds that the models do not
+        know.
     models
-        Of each fold the model that does not know it.
+        For each fold, the model that does not know it.
     failure
         Why there is no controller; empty where there is one.
     """
@@ -148,7 +149,7 @@ class Job:
 
 
 class LostError(Exception):
-    """The run has left what the surrogates were fitted to."""
+    """A run has left the box of states that the surrogates know."""
 
 
 class Fenced(SimulatedPlant):
@@ -167,17 +168,17 @@ class Fenced(SimulatedPlant):
 
 
 class _Models(NamedTuple):
-    """Of each fold the model that does not know it, and the largest error band of all."""
+    """For each fold the model that does not know it, and the largest error band of them all."""
 
     each: tuple[AnyPredictor, ...]
     band: Float[np.ndarray, "h nx"]
 
 
 def judged(test: LoopTest, job: Job) -> Outcome:
-    """Return what came of a job, run by run.
+    """Return the result of a job, run by run.
 
-    The model of a weighted recipe is fitted to the data around what its runs on the same surrogates with unchanged
-    inputs visit; then again.
+    The model of a weighted recipe is fitted with weights around the states that its own runs visit, on the same
+    surrogates with unchanged inputs. This is done twice.
     """
     recipe, known = job.recipe, job.known
     try:
@@ -206,7 +207,7 @@ def _fitted(test: LoopTest, recipe: Recipe, near: Nearness | None = None) -> _Mo
 
 
 def _joined(first: Outcome, rest: Outcome) -> Outcome:
-    """Return the runs of both; `rest` is of the same models."""
+    """Return the runs of both results, which are of the same models."""
     cost, violation, broken, visited = (
         np.concatenate([getattr(each, name) for each in (first, rest)])
         for name in ("cost", "violation", "broken", "visited")
@@ -215,7 +216,7 @@ def _joined(first: Outcome, rest: Outcome) -> Outcome:
 
 
 def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequence[int]) -> Outcome:
-    """Return what comes of controllers of these models; all have the limits that the controller of all data gets."""
+    """Return the result of controllers of these models; all have the limits that the final controller gets."""
     n, asked, limits = len(conditions), test.asked, test.limits(models.band)
     cost, violation, broken = np.full(n, np.inf), np.full(n, np.inf), np.ones(n)
     visited: dict[int, Float[np.ndarray, "T1 nx"]] = {}
@@ -246,7 +247,7 @@ def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequen
 
 
 def error_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h nx"]:
-    """Return half-widths that 90 % of the errors 1 … 5 steps ahead lie within, those of a bilinear model re-lifted."""
+    """Return half-widths of a band that holds 90 % of the errors 1 … 5 steps ahead; bilinear models are re-lifted."""
     past = 0 if model.embedding is None else model.embedding.steps
     horizon = min(_BAND, *(len(episode) - past for episode in episodes))
     errors = score(model, episodes, horizon, relift=isinstance(model, BilinearPredictor))
@@ -254,10 +255,10 @@ def error_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h 
 
 
 def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
-    """Return whether the controller that was fitted to all data does on the surrogates what those of the folds did.
+    """Return whether the controller fitted to all data does as well on the surrogates as those of the folds did.
 
-    It may lose no more runs, and cost a quarter more, as a geometric mean. A lifted model can turn with a few more
-    data: its observables are not invariant, and what it says of many steps ahead rests on small numbers.
+    It may lose no more runs than they, and cost a quarter more, as a geometric mean. A few more data can change a
+    lifted model much: its observables are not invariant, so its forecasts of many steps rest on small numbers.
     """
     cost = np.full(len(outcome.cost), np.inf)
     for j, one in enumerate(test.conditions):
@@ -302,8 +303,8 @@ def _run(test: LoopTest, one: Condition, controller: Designed, seed: int) -> Run
 def ratios(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
     """Return cost × (1 + 10 max(0, violation − 0.5 %)) of each run over the best of its condition, at most 20.
 
-    A violation counts as far as it is beyond the least of that condition: from some starts nobody can keep a limit. A
-    condition in which every run is lost has 20 throughout.
+    Of a violation only what exceeds the least one of that condition counts, for from some starts no controller keeps
+    the limits. Where every run of a condition is lost, all ratios are 20.
     """
     cost, violation = (np.array([getattr(each, name) for each in outcomes]) for name in ("cost", "violation"))
     least = np.where(np.isfinite(violation), violation, np.inf).min(axis=0)

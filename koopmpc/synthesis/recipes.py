@@ -1,4 +1,4 @@
-"""Recipe: a model and a controller of it, which can be made of any episodes of one plant."""
+"""Recipe: how a model and a controller of it are made, from any episodes of one plant."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ class Nearness(Value):
     Attributes
     ----------
     visited
-        (n, nx) states, over `scale`.
+        (n, nx) visited states, divided by `scale`.
     scale
         (nx,) standard deviation of each state in the data.
     width
@@ -77,7 +77,7 @@ class Recipe(Value):
     ridge
         Weight on unit-norm columns.
     estimator
-        Of the controller; None for none.
+        The estimator of the controller, or None.
     tail
         Steps of the cost's tail where the cost names neither a tail nor Q_N; None for the default, 0 is Q_N = Q.
     weighted
@@ -91,7 +91,7 @@ class Recipe(Value):
     weighted: bool = False
 
     def __str__(self) -> str:
-        """Return kind, name and delays of the model, and what is special about the controller."""
+        """Return kind, name and delays of the model, and what the controller has besides the default."""
         one, estimator = self.candidate, self.estimator
         parts = [f"{one.kind}: {one.name}"]
         if one.delays:
@@ -112,7 +112,7 @@ class Recipe(Value):
         workers: int | None = None,
         scheduler: str | None = None,
     ) -> AnyPredictor:
-        """Return the model of these data, with the weights `near`; its report has the doubts."""
+        """Return the model of these data, with the weights `near`. Doubts about the fit stand in its report."""
         one = self.candidate
         options = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
         with warnings.catch_warnings():
@@ -126,7 +126,7 @@ class Recipe(Value):
     def controller(
         self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False
     ) -> Designed:
-        """Return the controller of a model, without machine code of the model where it is used briefly.
+        """Return the controller of a model; one that is used `briefly` compiles no machine code of the model.
 
         Raises
         ------
@@ -142,9 +142,9 @@ class Recipe(Value):
 
 
 class BriefMPC(BilinearMPC):
-    """A BilinearMPC whose model the interpreter evaluates: in some hundred steps a compiler costs more than it wins.
+    """A BilinearMPC whose model runs in the interpreter: for some hundred steps compiling takes longer than it saves.
 
-    What does not depend on the model is machine code as ever, which later controllers find in the cache. The numbers
+    All that does not depend on the model is still machine code, which later controllers find in the cache. The numbers
     are the same.
     """
 

@@ -45,8 +45,8 @@ def select(
 ) -> Selection:
     """Choose the model with min over models of max over folds of the h-step error, h = 1 … horizon, and fit it to all.
 
-    Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon: one-step
-    errors do not choose a model that a controller can look ahead with. An error is relative to the state's standard
+    Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon, for a model
+    with small one-step errors need not predict a horizon well. An error is relative to the state's standard
     deviation, so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such
     model is taken while there is another. The models are ranked by their worst fold, and of all within one standard
     error of the best the smallest is taken (Breiman et al. 1984).
@@ -57,8 +57,8 @@ def select(
     Parameters
     ----------
     episodes
-        Several, since no fold cuts through one. Fewer than twice the folds are cut into blocks first, and the notes
-        say so. A Source that can be read again.
+        Several episodes, for no fold cuts through one, or a Source that can be read again. Fewer than twice the folds
+        are cut into blocks first, and the notes say so.
     candidates
         Liftings, each of which is tried with all `delays` and both kinds; or `Candidate`, each as it stands. By default
         linear, polynomial, trigonometric, radial and random ones, for plants of 2 to 12 states.

@@ -14,7 +14,7 @@ from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.validate.text import table, written
 from koopmpc.values import Value
 
-PLAIN = "linear: x, 1"  # z = [x, 1], the model that others have to beat
+PLAIN = "linear: x, 1"  # z = [x, 1], the model that the others have to beat
 _SHOWN = 15  # rows of the leaderboard that are printed
 
 
@@ -91,7 +91,8 @@ class Selection(Value):
     predictor
         The chosen model, fitted to all data: a LinearPredictor or a BilinearPredictor.
     linear
-        The best linear model, fitted to all data; `predictor` itself where that is linear, None where none was tried.
+        The best linear model, fitted to all data: `predictor` itself where that is linear; None where no linear one was
+        tried.
     leaderboard
         All candidates, the least error in its worst fold first.
     chosen, chosen_linear
@@ -189,8 +190,8 @@ def row_of(trial: Tried, floor: float) -> LeaderboardRow:
 def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None, alike: float = EXACT) -> int:
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
-    Errors below `alike` are all alike, by default those of rounding and the least ridge. Where every forecast ran away
-    it is the smallest of all.
+    Errors below `alike` count as equal; by default these are errors of rounding and of the least ridge. Where every
+    forecast ran away, it is the smallest model of all.
     """
     places = [i for i, row in enumerate(rows) if kind is None or row.kind == kind]
     best = min((rows[i] for i in places), key=lambda row: row.worst)

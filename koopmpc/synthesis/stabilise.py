@@ -34,7 +34,7 @@ class Stabilised(Value):
     feedback
         An excitation for `collect`: the feedback with noise on top, so that its data tell what inputs do.
     data
-        All episodes, those that were lost too, up to where they left.
+        All episodes; those that were lost end where they left `reach`.
     held
         Share of the runs without noise that stayed within `reach` for all their steps.
     start
@@ -94,9 +94,9 @@ def stabilise(
     u_min, u_max
         (nu,) finite bounds of the inputs.
     episodes, steps
-        Of each round; an episode has `steps` steps at most.
+        Episodes of each round, and the most steps of one.
     rounds
-        How many, at most.
+        How many rounds there are, at most.
     rng
         Draws starts and noise.
 
@@ -232,8 +232,8 @@ def _feedback(
 ) -> tuple[Float[np.ndarray, "nu nx"], Float[np.ndarray, " nu"]] | None:
     """Return the LQR gain of the affine model of all steps, and the input that holds x_ref; None where there is none.
 
-    Steps weigh by exp(−d²), d the distance to the equilibrium in units of the reach: what is learned is how the plant
-    leaves it.
+    A step weighs exp(−d²), d its distance to the equilibrium in units of the reach, so that the model tells how the
+    plant leaves the equilibrium.
     """
     room = (high - low) / 2
     X = np.concatenate([episode.X[:-1] for episode in made])

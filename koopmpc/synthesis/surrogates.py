@@ -59,12 +59,12 @@ class Surrogate(Value):
         return StepMap(F, model.dt, h, model.point_names, model.inputs, model.states)
 
     def start(self, x0: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " n"]:
-        """Return the state of the plant that has been at x0."""
+        """Return the state of the plant, its past included, after a rest at x0."""
         embedding = self.model.embedding
         return x0 if embedding is None else embedding.held(x0, self.middle)
 
     def holding(self, cost: Cost, limits: Limits, gain: float = 1.0) -> "Holding":
-        """Return what finds the equilibria of the plant."""
+        """Return the search for equilibria of this plant."""
         given = self._map(gain)
         outputs = state_tracking(self.model.states, self.model.nu, cost, limits, given.nx)
         return Holding(Equilibria(given, cost, outputs), given.E @ self.w)
@@ -84,7 +84,7 @@ class Holding:
     Parameters
     ----------
     equilibria
-        Of its map.
+        The equilibria of the surrogate's map.
     push
         (nx,) what its measured disturbances do to the state.
     """
@@ -106,10 +106,10 @@ class Holding:
 def stand_ins(results: Sequence[Tried], floor: float) -> list[Recipe]:
     """Return the two models that stand in for the plant: the one of the least error, and the best of another family.
 
-    They are bilinear where such were tried. One with delays is taken only where it halves the error, as where the state
-    is not measured as a whole. What both have learned wrongly, no candidate is told of; another family of observables
-    extrapolates otherwise. Where the best of another family errs more than three times as much, the second of the same
-    one is taken, or the best itself.
+    They are bilinear where bilinear models were tried. A model with delays is taken only where it halves the error, as
+    it does where some of the state is not measured. The second model is of another family because that extrapolates
+    otherwise: what both have learned wrongly, no closed loop shows. Where the best of another family errs more than
+    three times as much, the second best of the same family is taken, or the best itself.
     """
     places = [tried.best(floor) for tried in results]
     error = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
@@ -127,7 +127,7 @@ def stand_ins(results: Sequence[Tried], floor: float) -> list[Recipe]:
 
 
 def surrogate(recipe: Recipe, fitted: Episodes, held_out: Episodes) -> Surrogate:
-    """Return the surrogate of a recipe that is fitted to some episodes; others tell its noise."""
+    """Return the surrogate of a recipe that is fitted to some episodes; its noise is measured on others."""
     model = recipe.fit(fitted)
     driven = np.concatenate([np.hstack([episode.U, episode.W]) for episode in fitted]).mean(axis=0)
     error = score(model, held_out, 1, relift=True).rmse[0]
@@ -136,10 +136,11 @@ def surrogate(recipe: Recipe, fitted: Episodes, held_out: Episodes) -> Surrogate
 
 
 def unfelt(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[int]:
-    """Return the states that decide no more than a quarter of any increment x⁺ − x: positions that nothing depends on.
+    """Return the states on which no increment x⁺ − x depends by more than a quarter: positions, mostly.
 
-    A state is exchanged for that of other data, and the change compared with the spread of the increments. On learned
-    models of six plants, positions that nothing depends on changed 1 to 22 %, all other states 83 % and more.
+    Each state is exchanged for that of other data, and the change of the increments compared with their spread. On
+    learned models of six plants, positions on which nothing depends changed them by 1 to 22 %, all other states by 83 %
+    and more.
     """
     plant = one.plant()
     if plant.nx != X.shape[1]:
@@ -170,7 +171,8 @@ def _family(tried: Tried) -> str:
 def unheld(one: Surrogate, asked: Asked) -> list[str]:
     """Return a sentence where no input holds a reference that rests: which limit is in the way, and what can be held.
 
-    Outputs that the cost does not weigh do not count, and an error of 2 % of the data's range is the surrogate's.
+    Outputs without a weight in the cost do not count. Up to 2 % of the data's range are taken for an error of the
+    surrogate.
     """
     if asked.moves:
         return []

@@ -91,7 +91,7 @@ def trust(
         Episodes of the controller at work. The band's promise is for the inputs of the held-out episodes; what it
         is worth under feedback is measured on these.
     level
-        Of the conformal band.
+        Share of the errors that the conformal band holds.
     rng
         Draws the split and the starts of the conformal calibration.
 

@@ -199,7 +199,7 @@ class Invariance(Value):
     errors
         (nz,) the same error for each observable itself; 0 for one that is 0 throughout.
     names
-        Of the observables.
+        Names of the observables.
     """
 
     proximity: float

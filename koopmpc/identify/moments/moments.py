@@ -47,7 +47,7 @@ class Gram:
     n
         Columns of p = [ψ(x) u u⊗ψ(x)].
     nz
-        Those of ψ.
+        Columns of ψ.
     """
 
     def __init__(self, n: int, nz: int) -> None:

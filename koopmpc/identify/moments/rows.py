@@ -25,7 +25,7 @@ class RowColumns:
     products
         The observables in u⊗ψ(x): all but a Constant, for u times it is u; none where the model is not bilinear.
     names
-        Of all columns.
+        Name of each column.
     regressors
         The columns of ψ(x), u and u⊗ψ(x).
     targets
@@ -124,13 +124,13 @@ def lifted_chunks(
     Parameters
     ----------
     episodes
-        With as many inputs as the columns name.
+        They have as many inputs as the columns name.
     columns
         What the rows hold.
     which
         Numbers of chunks, in the order of `chunks`.
     weights
-        Of the steps of each episode.
+        Weight of each step, episode by episode; None weighs all by 1.
     """
     of, lifting, products = episodes.episodes, columns.full, columns.products
     nz, nu = lifting.nz, len(episodes.inputs)

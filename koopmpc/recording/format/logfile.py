@@ -33,7 +33,7 @@ class LogFile:
     Parameters
     ----------
     path
-        Its folders are made.
+        The file; folders on the way to it are made.
     growing
         The file is to be there while it is written: in its place where nothing is there yet, else beside it as
         ``<name>.part``. What is there when a disk is full or the process dies is kept. Otherwise the file is written
