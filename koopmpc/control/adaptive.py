@@ -35,11 +35,11 @@ class LearnedPair(NamedTuple):
 
 
 class Adaptive:
-    """A KoopmanMPC whose z⁺ = A z + B u + E w is learned on while it runs.
+    """A KoopmanMPC that goes on learning its model z⁺ = A z + B u + E w while it runs.
 
     Each step is a pair (x, u, x⁺), from which `online` learns unless it is faulty: a number is NaN, the state stands
     still to the bit, the controller's monitor does not know state and input, or the sample is off by far more than
-    those before it. A sample that is off three times in sequence is no spike but a change of the plant, and counts.
+    those before it. Three such samples in sequence are no spike but a change of the plant, and are learned from.
 
     Where the model in use predicts a short memory of recent pairs worse than the first one did its own data, the fit
     of all pairs so far, with the forgetting or the window of `online`, is compared with it on these pairs every few
@@ -49,16 +49,16 @@ class Adaptive:
     Parameters
     ----------
     controller
-        What controls; its model is where learning begins, and the first to go back to. Its y is the state.
+        The controller; learning begins with its model, which is also the first to go back to. Its y is the state.
     online
-        Learns; of the same lifting. Start it with the data of the controller's model:
+        The fit that learns, of the same lifting. Start it with the data of the controller's model:
         ``OnlineEDMD.start(data, lifting, forgetting=0.98)``.
     every
-        Steps from one comparison to the next.
+        Steps between two comparisons.
     memory
         Recent pairs on which models are compared.
     outlier
-        Times the usual misfit from which on a sample is off.
+        A sample is off where its misfit is this many times the usual one.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Adaptive:
         return self.controller.predictor
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Begin a run with the model that the controller came with; what `online` has learned it keeps."""
+        """Begin a run with the first model of the controller; `online` keeps what it has learned."""
         if self.controller.predictor is not self._first:
             self.controller.update(self._first)
         self._clear()
@@ -220,10 +220,10 @@ class Adaptive:
 
 
 class Guarded:
-    """A controller with a monitor, and a second one that takes over where the first does not know.
+    """A controller with a monitor, and a second one that takes over where the first one's model does not know.
 
     After `patience` unknown steps in sequence the second one's moves are returned, with the fallback OTHER_CONTROLLER,
-    until the first has known as many in sequence. Both are asked at every step, so that either can go on at once.
+    until the first has known as many steps in sequence. Both compute every step, so that either can go on at once.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ class Guarded:
     standby
         Any controller of the same plant that needs no model of where it is: an LQR, a safe feedback.
     patience
-        Steps in sequence; one alone is unknown in about 2 of 100 steps like the data.
+        Unknown steps in sequence after which the second takes over. Of 100 steps like the data about 2 are unknown.
 
     Raises
     ------
@@ -277,7 +277,7 @@ class Guarded:
     def __call__(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
     ) -> Move:
-        """Return the move of the one that is in charge.
+        """Return the move of the controller that is in charge.
 
         Raises
         ------

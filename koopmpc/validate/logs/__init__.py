@@ -1,1 +1,1 @@
-"""What is wrong with logs before a model is fitted to them: one kind of evidence a file, `report` asks them all."""
+"""What is wrong with logs before a model is fitted to them: a kind of evidence a file; `report` runs all checks."""

@@ -1,8 +1,8 @@
-"""Faults in how signals stand to one another: who is late, where an actuator ends, where rows are missing.
+"""Faults between signals: one is late, an actuator ends before its input does, rows are missing.
 
-Each hypothesis changes the log as its fault would be undone, and predicts the next row from the present one. What
-counts is the information on all states together, −½ log det of the residuals in nats a sample: a signal put where it
-belongs raises it, and it cannot be raised by moving what one sensor knows to another.
+Each hypothesis undoes its fault in the log, and predicts the next row from the present one. It is judged by the
+information on all states together, −½ log det of the residuals in nats a sample: a signal that is put where it belongs
+raises it, and moving what one sensor knows to another does not.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,8 @@ _BLOCKS = 8  # parts of the log of which nearly all must agree
 class Shift:
     """State or input `column` (inputs after the states) is read `steps` rows later, or earlier where negative.
 
-    A sensor is never ahead, so a state is only read later: an earlier reading would be told by the others' future.
+    A sensor is never ahead of the plant, so a state is only read later: the future of the other states would predict an
+    earlier reading all too well.
     """
 
     column: int
@@ -45,7 +46,7 @@ class Rows:
     after: Float[np.ndarray, "M nx"]
 
     def regressors(self, log: Log) -> Float[np.ndarray, "M p"]:
-        """Return what the next rows are predicted from."""
+        """Return the regressors of the next rows."""
         return np.hstack([log.stacked(self.X, self.U), (self.before - log.center) / log.size])
 
     def residuals(self, log: Log, more: Float[np.ndarray, "M q"] | None = None) -> Float[np.ndarray, "M nx"]:
@@ -89,7 +90,7 @@ def won(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]
 def better(
     log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN
 ) -> bool:
-    """Return True where `other` predicts better than `E` beyond chance, and nearly everywhere."""
+    """Return True where `other` predicts better than `E` by more than chance, and in nearly all parts of the log."""
     parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
     agree = sum(won(log, a, b) > 0 for a, b in parts)
     return won(log, E, other) > max(least, _SURE / len(E)) and agree >= _BLOCKS - 1
@@ -121,7 +122,7 @@ def late(log: Log) -> Iterator[LogFault]:
 
 
 def _weighed(scores: dict[tuple[Shift, ...], float], nx: int) -> Callable[[tuple[Shift, ...]], float]:
-    """Return the gain of a shift, that of an input made larger: inputs are late more often than sensors."""
+    """Return how a shift counts: by its gain, that of an input raised, for inputs are late more often than sensors."""
 
     def weighed(shift: tuple[Shift, ...]) -> float:
         return scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0)
@@ -130,9 +131,9 @@ def _weighed(scores: dict[tuple[Shift, ...], float], nx: int) -> Callable[[tuple
 
 
 def _least(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"]) -> float:
-    """Return what a shift must win: a sensor the more, the further the errors go below what counts.
+    """Return the nats a sample that a shift must win: more for a sensor, the less noise the log holds.
 
-    There the log holds next to no noise, and the smooth misfit of the regression depends on which row it is read from.
+    Without noise the errors are the smooth misfit of the regression, which depends on the row that it is read from.
     """
     every, fine = information(E, log.fine)
     return _GAIN if shift.column >= log.data.nx else 0.15 * (1 + float(every - fine))
@@ -153,7 +154,7 @@ def _shifts(log: Log, found: tuple[Shift, ...]) -> Iterator[tuple[Shift, ...]]:
 
 
 def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]) -> bool:
-    """Return True where the input of this row adds next to nothing to the one that is late."""
+    """Return True where the input of the present row adds next to nothing to the late one."""
     nx = log.data.nx
     if shift[0].column < nx:
         return True
@@ -190,7 +191,7 @@ _LEFT = 0.1  # share of the gain of a clipped input that what is clipped may add
 
 
 def ending(log: Log) -> Iterator[LogFault]:
-    """Find inputs whose larger values have no more effect than a smaller one: the actuator ends there."""
+    """Find inputs that have no more effect beyond some value, where the actuator ends."""
     plain = rows(log, margin=1)
     if not log.data.nu or len(plain.X) < max(_ENOUGH, 8 * plain.regressors(log).shape[1]):
         return
@@ -237,7 +238,7 @@ def _clipped(of: Rows, j: int, low: float, high: float) -> Rows:
 
 
 def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float, float]:
-    """Return the ends that predict best, each by golden section around what the quantiles gave."""
+    """Return the ends that predict best, each by golden section around the quantile that was best."""
     bottom, top = float(of.U[:, j].min()), float(of.U[:, j].max())
     width = 0.1 * (top - bottom)
     for _ in range(6):
@@ -258,7 +259,7 @@ _OFF = 10.0  # times the largest usual residual
 
 
 def jumps(log: Log) -> Iterator[LogFault]:
-    """Find places where the states go on from elsewhere: rows are missing, or two runs stand in one episode."""
+    """Find places where the states jump, for rows are missing or an episode holds two runs."""
     E = np.concatenate(log.residuals)
     changes = np.concatenate([np.diff(e.X, axis=0) for e in log.data])
     usual = np.maximum(np.quantile(np.abs(E), 0.97, axis=0), 1e-9)

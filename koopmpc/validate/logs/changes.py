@@ -1,4 +1,4 @@
-"""Faults that begin midway: a part of the log follows the law of the rest once a sign, a unit or an order is undone.
+"""Faults that begin midway: a part of the log follows the law of the rest once a sign, a unit or an order is corrected.
 
 The log is cut into segments. A consensus of them, found by least trimmed squares, gives a one-step law. Each segment
 that does not follow it is tried under every change that a recorder may have suffered; one that brings the segment back
@@ -68,7 +68,7 @@ class OneStepLaw:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A hypothesis: what the recorder did to a segment, and how its errors are once that is undone."""
+    """A hypothesis: what the recorder did to a segment, and the errors of the segment once that is undone."""
 
     kind: str
     columns: tuple[str, ...]
@@ -102,7 +102,7 @@ def midway(log: Log) -> Iterator[LogFault]:
                 won += gain * len(pairs[s][1])
                 which.append(s)
         if which and len(log.data) == 1 and len(agreed.intersection(range(which[0], which[-1]))) > 0.2 * len(which):
-            continue  # a recorder that changes within one episode does not change to and fro
+            continue  # within an episode a recorder changes once, not to and fro
         if which and (best is None or won > 1.02 * best[0]):
             best = (won, change, which)
     if best is None:
@@ -135,7 +135,7 @@ def _pair(log: Log, place: Place) -> Pair:
 
 
 def _consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, set[int]]:
-    """Return the law of the 60 % of the segments that agree best, and which they are."""
+    """Return the law of the 60 % of the segments that agree best, and the indices of these."""
     if len(segments) < 5:
         return None, set()
     moments: list[tuple[np.ndarray, np.ndarray, np.ndarray, int]] = []
@@ -207,7 +207,7 @@ def _scaled_state(i: int, factor: float) -> Callable[[OneStepLaw, np.ndarray, np
         X = X.copy()
         X[:, i] *= factor
         found = law.errors(X, U)
-        found[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is made small has small errors whatever it does
+        found[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is scaled down has small errors in any case
         return found
 
     return errors

@@ -1,4 +1,4 @@
-"""Faults that time stamps show: sampling that jitters, a clock that is set back, rows that are missing."""
+"""Faults that time stamps show: uneven steps, a clock that is set back, missing rows."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -18,7 +18,7 @@ _OTHER = 0.1  # share of dt by which the median step of an episode must differ t
 
 
 def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFault]:
-    """Find what the time stamps of the rows tell.
+    """Find the faults that the time stamps of the rows show.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Faults of the inputs: those that do not move enough, do nothing, or follow from the state."""
+"""Faults of the inputs: they do not move enough, have no effect, or follow from the state."""
 
 from collections.abc import Iterator
 
@@ -54,7 +54,7 @@ def excitation(log: Log) -> Iterator[LogFault]:
         long = [e for e in log.data if len(e) > order + 1]
         if not long:
             continue
-        # differences leave out a constant level, which excites to one order more and teaches nothing
+        # differences, for a constant level raises the order by one and excites nothing
         alone = Episodes([Episode(X=e.X[1:], U=np.diff(e.U[:, [j]], axis=0)) for e in long], log.data.dt)
         found = persistency(alone, order)
         good = int((found.conditions < 1e7).sum())
@@ -103,10 +103,10 @@ def _past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
 
 
 def feedback(log: Log) -> Iterator[LogFault]:
-    """Find inputs whose news follow from the state.
+    """Find inputs of which the state tells what their own past does not.
 
-    The past of an input leaves a part of it open. In an open loop the state cannot tell that part, for it has not
-    seen it yet; under feedback u = K x it tells nearly all of it.
+    In an open loop the state tells nothing of that part, which has not acted yet; under feedback u = K x it tells
+    nearly all of it.
     """
     U = [e.U for e in log.data if len(e) > 2 * _PAST]
     X = [e.X for e in log.data if len(e) > 2 * _PAST]

@@ -20,7 +20,7 @@ _SMALLEST = 1e-9  # share of a state's size below which a residual counts as rou
 
 @dataclass(frozen=True)
 class Place:
-    """Rows first … last − 1 of one episode; with `jump` the step from the first to the last is at fault, not they."""
+    """Rows first … last − 1 of one episode are at fault; with `jump`, only the step from the first to the last row."""
 
     episode: int
     first: int
@@ -39,7 +39,7 @@ class LogFault(Value):
     Attributes
     ----------
     name
-        Its name, as docs/identification.md lists them.
+        Kind of the fault, as docs/identification.md lists them.
     says
         What is wrong, with the numbers.
     do
@@ -62,7 +62,7 @@ class LogFault(Value):
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Episodes with what every check of them needs."""
+    """Episodes, and the quantities that every check reads."""
 
     data: Episodes
 
@@ -182,8 +182,8 @@ def information(
 ) -> Float[np.ndarray, " two"]:
     """Return −½ log det of the residuals' mean square, in nats a sample: the larger, the better the prediction.
 
-    The first number counts every digit. In the second, errors below `fine` say nothing: it ignores how far a smooth
-    misfit goes down, and the first ignores what is only moved from one state to another.
+    The first number counts all errors. The second takes errors below `fine` for as large as `fine`, so that it does not
+    reward a smooth misfit for being small; the first does not reward moving information from one state to another.
     """
     S = E.T @ E / len(E)
     floors = (np.full(len(fine), _SMALLEST**2), fine**2)

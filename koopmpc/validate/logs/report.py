@@ -1,4 +1,4 @@
-"""audit: are logs fit to be fitted? All checks in one call, and their report."""
+"""audit: all checks of logs in one call, and their report."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -53,9 +53,9 @@ class AuditReport(Value):
     Attributes
     ----------
     faults
-        What was found; empty where there is nothing to say.
+        The faults that were found.
     episodes, steps
-        How much was looked at.
+        How many episodes and steps were looked at.
     """
 
     faults: tuple[LogFault, ...]
@@ -98,12 +98,12 @@ class AuditReport(Value):
 def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditReport:
     """Look for faults of recorders, sensors and actuators in logs, before a model is fitted to them.
 
-    Values: a live sensor never repeats a number, so repeated ones show a sensor that is stuck, at its limit, coarse or
-    slow, held samples, marks of lost ones, and rows or episodes that stand twice. Inputs: those that do not move, move
-    together, do nothing, excite too little or follow from the state. Order: a one-step regression on the present row
+    Values: a live sensor never repeats a number. Repeated numbers show a sensor that is stuck, at its limit, coarse or
+    slow; samples that were held or lost; rows or episodes that stand twice. Inputs: some do not move, move together,
+    have no effect, excite too little, or follow from the state. Alignment: a one-step regression on the present row
     predicts better once a late input or sensor is put where it belongs, or an input is clipped where its actuator
-    ends. Midway: episodes that follow the law of the others once a sign, unit, offset, order of columns or sample time
-    is undone. What single values show is cut out before the regressions look.
+    ends. Changes: an episode follows the law of the others once a sign, unit, offset, order of columns or sample time
+    is corrected. Rows that single values show to be at fault are cut out before the regressions.
 
     Parameters
     ----------
@@ -160,18 +160,18 @@ def _unwrapped(data: Episodes, whole_turns: dict[int, float]) -> Episodes:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """What is left of episodes once rows are cut out, and where each piece was."""
+    """The pieces that are left of episodes once rows are cut out, and where each piece was."""
 
     data: Episodes
     origins: tuple[Place, ...]
 
     @classmethod
     def of(cls, data: Episodes) -> "Remainder":
-        """Return all of the data."""
+        """Return the data as they are, nothing cut out."""
         return cls(data, tuple(Place(e, 0, len(episode) + 1) for e, episode in enumerate(data)))
 
     def without(self, places: Sequence[Place]) -> "Remainder | None":
-        """Return what is left without these rows: pieces of two rows or more; None where there is none."""
+        """Return the pieces of two rows or more that are left without these rows; None where there is none."""
         pieces: list[Episode] = []
         origins: list[Place] = []
         for e, episode in enumerate(self.data):
@@ -190,7 +190,7 @@ class Remainder:
         return Remainder(self.data.with_episodes(pieces), tuple(origins)) if pieces else None
 
     def original(self, fault: LogFault) -> LogFault:
-        """Return the fault with its places in the data that this was cut from."""
+        """Return the fault with its places in the original data."""
         moved = [
             Place(self.origins[p.episode].episode, p.first + first, p.last + first, p.jump)
             for p in fault.places

@@ -19,7 +19,7 @@ _FAR = 3.0  # times the largest usual step: a jump
 
 
 def repeated_columns(log: Log) -> Iterator[LogFault]:
-    """Find states that are another one times a constant: two names of one signal."""
+    """Find states that equal another one times a constant: one signal under two names."""
     Z = log.X - log.X.mean(axis=0)
     norm = np.linalg.norm(Z, axis=0)
     moves = norm > 1e-12 * (1 + np.abs(log.X).max(axis=0)) * np.sqrt(len(Z))
@@ -83,7 +83,7 @@ def grid(column: Float[np.ndarray, " M"]) -> float:
 
 
 def quantised(log: Log) -> Iterator[LogFault]:
-    """Find sensors whose grid is coarse against a usual step."""
+    """Find sensors whose resolution is coarse against their usual step."""
     for i, step in coarse(log).items():
         name = short(log.data.states[i])
         changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
@@ -258,7 +258,7 @@ def held(log: Log) -> Iterator[LogFault]:
 
 
 def _smoothest(log: Log, among: list[int]) -> int:
-    """Return the state whose steps resemble the step before most."""
+    """Return the state whose steps are most like the step before."""
     likeness: list[float] = []
     for i in among:
         steps = [np.diff(e.X[:, i]) for e in log.data if len(e) > 2]
@@ -330,7 +330,7 @@ def _spikes(log: Log, i: int, changes: np.ndarray) -> Iterator[Place]:
     calm = [np.abs(np.diff(e.X[:, i])) for e in log.data]
     for d, sizes in zip(calm, there, strict=True):
         for k in np.flatnonzero(sizes > far):
-            d[k : k + 2] = 0.0  # the jumps to and fro; the others tell how far a state can move
+            d[k : k + 2] = 0.0  # the jumps to and fro; all other steps tell how far a state can move
     far = max(far, 1.2 * max(float(d.max(initial=0.0)) for d in calm))
     usual = 4 * float(np.quantile(np.concatenate([np.abs(E[:, i]) for E in log.residuals]), 0.97))
     for e, sizes in enumerate(there):
