@@ -86,6 +86,7 @@ class DAQP(QPSolver):
         self._hard: DAQP | None = None  # the hard rows alone, set up when they are asked for
         self._is_steep: bool | None = None  # found out when it is asked
         self.resumes, self._none = False, np.zeros(len(self._f))
+        self._lighter: dict[float, DAQP] = {}  # the solvers of `_approach`, by their weight
         self._far = (
             False  # whether a solution of many active rows had to be approached last, so that the next one is at once
         )
@@ -207,10 +208,13 @@ class DAQP(QPSolver):
         """
         start, qp, metric = perf_counter(), self._qp, self._metric()
         center, rows, weight, least, missed, iterations = np.zeros_like(v), y, _DAMPING, 0.0, np.inf, 0
-        found = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name)
+        found, last = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name), None
         for _ in range(_PASSES):
-            solver = self._eased(qp.P + weight * metric, qp.q - weight * metric @ center)
-            found = solver.solve(center, rows, limit - (perf_counter() - start) if limit else None)
+            solver = self._eased(weight, metric)
+            solver.pull(qp.q - weight * metric @ center)
+            left = limit - (perf_counter() - start) if limit else None
+            again = solver is last and found.status is Status.MAX_ITERATIONS  # the step before led here
+            found, last = solver.resume(left) if again else solver.solve(center, rows, left), solver
             iterations += found.iterations
             if found.status is Status.OPTIMAL:
                 before, missed = missed, weight * float(np.abs(metric @ (found.v - center)).max())
@@ -229,12 +233,20 @@ class DAQP(QPSolver):
         self._far = found.status is Status.OPTIMAL and bool(2 * np.count_nonzero(found.y) > len(v))
         return found
 
-    def _eased(self, P: Float[np.ndarray, "n n"], q: Float[np.ndarray, " n"]) -> "DAQP":
-        """Return the solver of the same rows with another cost, whose INFEASIBLE is believed."""
-        qp = self._qp
-        solver = DAQP(QP(P, q, qp.A, self.low, self.high, qp.softness), self._settings)
+    def _eased(self, weight: float, metric: Float[np.ndarray, "n n"]) -> "DAQP":
+        """Return the solver of the same rows with the cost that this weight eases, whose INFEASIBLE is believed."""
+        qp, solver = self._qp, self._lighter.get(weight)
+        if solver is None:
+            solver = DAQP(QP(qp.P + weight * metric, qp.q, qp.A, self.low, self.high, qp.softness), self._settings)
+            self._lighter[weight] = solver
+        solver.low[:], solver.high[:] = self.low, self.high
         solver._mixed = solver._unmet = solver._is_steep = False
         return solver
+
+    def pull(self, q: Float[np.ndarray, " n"]) -> None:
+        """Go on with another linear cost."""
+        self._f = q * self._columns / self._unit
+        self._model.update(f=self._f)
 
     def _active(self, y: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
         """Return the rows with the ends that y pushes to as DAQP's senses."""
@@ -256,7 +268,7 @@ class DAQP(QPSolver):
             unit, columns, rows = 1.0, np.ones_like(columns), np.ones_like(rows)
         self._H, self._f = P * np.outer(columns, columns) / unit, q * columns / unit
         self._M = A * columns * rows[:, None]
-        self._columns, self._rows, self._multipliers = columns, rows, rows * unit
+        self._columns, self._rows, self._multipliers, self._unit = columns, rows, rows * unit, unit
         softness = self._qp.softness
         none = np.full(len(rows), np.inf)
         linear, quadratic = (none, none) if softness is None else softness[:2]
