@@ -200,7 +200,7 @@ def check(
     runs: Annotated[int, typer.Option("--runs", help="Runs of each kind.")] = 12,
     logs: Logs = Path("logs"),
 ) -> None:
-    """Drive a designed controller from random starts, with noise, models 20 % off and faults; exit 1 where it fails."""
+    """Test a designed controller from random starts, with noise, inputs 20 % off and faults; exit 1 where it fails."""
     from koopmpc.fitting.check import check_controller
 
     out = _console()

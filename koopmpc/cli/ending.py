@@ -1,7 +1,7 @@
-"""Ending: how Ctrl-C and SIGTERM end the program, and what is said of the files of its call.
+"""Ending: how Ctrl-C and SIGTERM end the program, and what it says of the files of the call.
 
-A signal raises KeyboardInterrupt, and what is under way is unwound. Libraries written in C may take long before Python
-comes to that, and some swallow the exception. A thread therefore ends the process where it still runs after a while.
+A signal raises KeyboardInterrupt, which unwinds the call. Inside a library written in C this may take long, and some
+swallow the exception. So a thread ends the process if it still runs after a while.
 """
 
 import os
@@ -23,9 +23,9 @@ _RUNS, _SHOWN = ".rrd", 5
 
 
 class Ending:
-    """A context in which signals end the program; `folder` is where its call writes.
+    """A context in which signals end the program; `folder` is where the call writes.
 
-    It imports nothing but the standard library, so that it stands before anything else is imported.
+    This file imports the standard library alone, so that the context stands before anything else is imported.
     """
 
     folder: Path | None = None
@@ -47,16 +47,16 @@ class Ending:
     ) -> None:
         interrupted = isinstance(error, KeyboardInterrupt)
         if interrupted or (isinstance(error, SystemExit) and error.code == INTERRUPTED):
-            for number in _SIGNALS:  # the process ends, and says so once
+            for number in _SIGNALS:  # the process ends, and one line says so
                 signal.signal(number, signal.SIG_IGN)
             self._say()
-            os._exit(INTERRUPTED)  # to take down all that is loaded would take most of a second
+            os._exit(INTERRUPTED)  # unloading all modules would take most of a second
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     def _watch(self, ends: socket.socket) -> None:
-        """End the process where it still runs a while after a signal, whatever the main thread does."""
+        """End the process if it still runs a while after a signal, whatever the main thread does."""
         while True:
             if set(ends.recv(64)) & set(_SIGNALS):
                 time.sleep(_PATIENCE)
@@ -64,7 +64,7 @@ class Ending:
                 os._exit(INTERRUPTED)
 
     def _say(self) -> None:
-        """Write the one line, and remove what is half written."""
+        """Write the one line, and remove files that are half written."""
         if self._said:
             return
         self._said = True
@@ -75,7 +75,7 @@ class Ending:
 
 
 def kept(folder: Path | None) -> str:
-    """Return which files of a call are whole; the others are removed, and the folder where none is left."""
+    """Return which files of a call are whole; remove the others, and the folder if it is then empty."""
     files: list[Path] = []
     for path in sorted(folder.rglob("*")) if folder is not None and folder.is_dir() else ():
         if path.suffix == _PART and path.name.startswith("."):

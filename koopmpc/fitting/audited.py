@@ -1,4 +1,4 @@
-"""Logs before they are repaired: rows at fault are left out where that is safe, and every fault is said."""
+"""The audit before a fit: rows at fault are left out where enough data remain, and every fault is noted."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Audited:
     Attributes
     ----------
     episodes
-        What is left.
+        The episodes that are left.
     notes
         The faults, and what was done about each, in sentences.
     delay
@@ -42,9 +42,9 @@ def audited(episodes: Episodes, *, cut: bool = True) -> Audited:
     Parameters
     ----------
     episodes
-        As read.
+        The episodes as they were read.
     cut
-        False where the episodes are a sample of what is fitted, so that nothing can be left out.
+        False where the episodes are only a sample of the data, so that nothing can be left out.
     """
     report = audit(episodes)
     rest = episodes
@@ -70,18 +70,18 @@ def audited(episodes: Episodes, *, cut: bool = True) -> Audited:
 
 
 def evenly(paths: Data, told: dict[str, Any], use: Callable[[Files], T], notes: list[str]) -> tuple[Files, T]:
-    """Return the files and use(files); where their sampling is unequal, interpolated to equal steps, which is noted.
+    """Return the files and use(files). Where their steps are unequal they are interpolated, and a note says so.
 
     Parameters
     ----------
     paths
         A folder, or files.
     told
-        Keywords of `load_episodes`; where they hold ``resample`` the user has decided.
+        Keywords of `load_episodes`; with ``resample`` among them nothing is done here.
     use
-        Reads the files.
+        The function that reads the files.
     notes
-        Gets the sentence.
+        The list to which the sentence is added.
     """
     try:
         files = Files(paths, **told)

@@ -1,4 +1,4 @@
-"""check_controller: acceptance of a designed controller on the stand-ins of its plant, and a page with the verdict."""
+"""check_controller: the acceptance test of a designed controller on surrogates of its plant, with a page."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ _GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 @dataclass(frozen=True)
 class RunKind:
-    """A kind of run: how its inputs and noise differ from the data, what breaks, and what violation is allowed."""
+    """A kind of run: how inputs and noise differ from the data, what breaks, and which violation is allowed."""
 
     name: str
     gain: float = 1.0
@@ -62,11 +62,11 @@ def kinds(horizon: int, *, bounded: bool) -> list[RunKind]:
 
 @dataclass(frozen=True)
 class Figures:
-    """What came of the runs of a kind.
+    """The result of the runs of a kind.
 
-    `lost` of `runs` left the data or ended in no number; `violation` is the worst, as a share of the range; `error` the
-    largest over the last tenth of a run, as a share of the data's range; `bad` counts steps without a good status, in
-    runs that nothing breaks.
+    `lost` of `runs` left the data, or their states became NaN or infinite. `violation` is the worst one, as a share of
+    the range; `error` is the largest over the last tenth of a run, as a share of the data's range. `bad` counts steps
+    without a good status, in runs without faults.
     """
 
     kind: RunKind
@@ -88,7 +88,7 @@ class Checked:
     kept
         Whether the goal is kept.
     reasons
-        Why not, in sentences; or what was not asked.
+        Sentences that say why it is not kept, or what was not tested.
     figures
         What was measured in each kind of run.
     cold, hot
@@ -141,13 +141,13 @@ def check_controller(
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
 ) -> Checked:
-    """Drive the surrogates of a saved design from random starts, in every kind of run, and judge what comes of it.
+    """Run a saved design on its surrogates from random starts, in every kind of run, and judge the results.
 
-    The goal is kept where, of the runs that nothing breaks, none is lost, no limit is violated by more than 1 % of its
-    range (5 % with three times the noise, or with inputs 20 % off), every step has a good status, the first and 99 % of
-    all others take less than dt; and where, as in the data, a reference that rests and can be held is reached to 5 %
-    of the data's range. With faults inputs must stay inside their limits, and no run may be lost whose fault
-    ends. The surrogates are learned from the same logs as the controller: they are no plant.
+    The goal is kept if all of this holds. In runs without faults none is lost, no limit is violated by more than 1 % of
+    its range (5 % with three times the noise, or with inputs 20 % off), every step has a good status, and the first
+    step and 99 % of the others take less than dt. Where inputs and noise are as in the data, a constant reference that
+    can be held is reached to 5 % of the data's range. In runs with faults inputs stay inside their limits, and no run
+    is lost whose fault ends. The surrogates are learned from the same logs as the controller: they are no plant.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class _Outcome:
 
 
 class _Timed:
-    """A controller that keeps the statuses of its steps and how long they took."""
+    """A controller that records the status and the time of each step."""
 
     def __init__(self, controller: AnyMPC, times: list[float]) -> None:
         self._controller, self._times = controller, times
@@ -302,7 +302,7 @@ def _reasons(evidence: Evidence, figures: Sequence[Figures], cold: float, hot: f
     for one in figures:
         name = one.kind.name
         if one.lost:
-            said.append(f"{name}: {one.lost} of {one.runs} runs left the data, or ended in no number")
+            said.append(f"{name}: {one.lost} of {one.runs} runs left the data, or their states became NaN")
         if one.kind.faults:
             continue
         if one.lost < one.runs and one.violation > one.kind.allowed:

@@ -22,14 +22,14 @@ from koopmpc.synthesis.designed import Design
 
 @dataclass(frozen=True, eq=False)
 class DesignedData:
-    """The outcome.
+    """The design that was made, and the files that were written.
 
     Attributes
     ----------
     design
         The controller with its evidence.
     goal
-        What was asked.
+        The goal that was read.
     controller, page
         Paths of the controller file, and of the report in Markdown.
     usage
@@ -59,7 +59,7 @@ def design_data(
 ) -> DesignedData:
     """Read data and a goal, design a controller, and write controller.npz and controller.md.
 
-    The data are read and repaired as by `fit_data`, whose other arguments these are.
+    The data are read and repaired as by `fit_data`; the other arguments are the same as there.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def design_data(
     bilinear, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
     reading
-        What `load_episodes` is to be told of plain tables.
+        Keywords of `load_episodes` for plain tables.
 
     Raises
     ------

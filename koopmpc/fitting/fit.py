@@ -38,14 +38,14 @@ LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The outcome of a fit.
+    """The model that was chosen, its report, and the files that were written.
 
     Attributes
     ----------
     selection
         The chosen model, and the leaderboard.
     report
-        Whether to trust it, on episodes that it was not fitted to.
+        The trust report, on episodes that the model was not fitted to.
     plain
         Errors of x⁺ = A x + B u + c on the same episodes.
     held_out
@@ -90,9 +90,9 @@ def fit_data(
     Parameters
     ----------
     data
-        A folder of .npz, .parquet, .csv and .rrd files, or files; of a folder of runs the .rrd logs.
+        A folder of .npz, .parquet, .csv and .rrd files, or files. Of a folder of runs only the .rrd logs are read.
     folder
-        Where all is written; it is made.
+        Where everything is written; it is made if need be.
     horizon
         Steps ahead; `select` says what it is by default.
     bilinear
@@ -106,9 +106,9 @@ def fit_data(
     progress
         As in `select`.
     rng
-        Draws what is held out, and what the choice draws.
+        Draws the held-out episodes, and all that `select` draws.
     reading
-        What `load_episodes` is to be told of plain tables: ``dt=``, ``states=``, ``inputs=``, ``resample=``, ….
+        Keywords of `load_episodes` for plain tables: ``dt=``, ``states=``, ``inputs=``, ``resample=``, ….
 
     Raises
     ------
@@ -244,7 +244,7 @@ def drawn(
 
 
 def logs_of(data: Data) -> Data:
-    """Return the logs of a folder of runs, which holds their table too; all else as it is."""
+    """Return the .rrd logs of a folder of runs, which also holds their table; anything else is returned as it is."""
     if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
         return sorted(Path(data).glob("*.rrd"))
     return data

@@ -1,4 +1,4 @@
-"""Goal: what a controller shall do with the plant of some logs, as a file that a person writes."""
+"""Goal: what a controller shall do, in a file that a person writes for the plant of some logs."""
 
 import math
 import tomllib
@@ -27,7 +27,7 @@ _INPUT = {"weight", "limits", "change", "change_weight"}
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What a design is asked for.
+    """The task of a controller that is to be designed.
 
     Attributes
     ----------
@@ -47,9 +47,10 @@ class Goal:
 
 
 def goal_template(data: Episodes) -> str:
-    """Return a goal file for the plant of these data: it rests at the last states' medians, inputs stay in their range.
+    """Return the text of a goal file for these data: hold the medians of the last states, with inputs in their range.
 
-    A weight is 1 / (half the range)², a tenth of it for inputs, so that errors of the size of the data weigh alike.
+    The weight of a state is 1 / (half its range)², so that errors as large as the data weigh alike; that of an input is
+    a tenth of this.
     """
     X = np.concatenate([episode.X for episode in data])
     U = np.concatenate([episode.U for episode in data])
@@ -78,8 +79,8 @@ def goal_template(data: Episodes) -> str:
         lines += [
             "",
             f'[inputs."{_escaped(name)}"]  # in the data from {low:.4g} to {high:.4g}',
-            f"weight = {_number(0.4 / max(high - low, 1e-12) ** 2)}  # of its squared distance from what holds the "
-            f"reference, per [{unit}]²",
+            f"weight = {_number(0.4 / max(high - low, 1e-12) ** 2)}  # of its squared distance from the input that "
+            f"holds the reference, per [{unit}]²",
             f"limits = [{_number(low)}, {_number(high)}]  # [{unit}] always kept",
             f"change = inf  # [{unit}] most change from step to step",
             f"change_weight = 0.0  # of its squared change, per [{unit}]²",
@@ -164,7 +165,7 @@ def _sections(
     Raises
     ------
     DataError
-        A section is of no column of the data, or in another unit than it.
+        A section names no column of the data, or another unit than the column has.
     """
     given = tree.get(what, {})
     if not isinstance(given, dict):
@@ -179,7 +180,7 @@ def _sections(
                     f"{where} is in another unit than the logs, which have {own!r}; write its numbers in that"
                 )
             raise DataError(
-                f"{where} is of nothing in the logs{checks.nearest(name, names)}; there are {', '.join(names)}"
+                f"{where} names nothing in the logs{checks.nearest(name, names)}; there are {', '.join(names)}"
             )
         if not isinstance(section, dict):
             raise DataError(f"{where} is {section!r}; write it as a section with keys {', '.join(sorted(keys))}")

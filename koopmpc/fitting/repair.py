@@ -20,7 +20,7 @@ from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
 
 @dataclass(frozen=True)
 class Repair:
-    """Episodes with some columns alone, and with angles that run on; what was done is in `notes`.
+    """What is done to episodes before a fit: some columns are left out, and angles are unwrapped; `notes` say it all.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Repair:
     notes: tuple[str, ...]
 
     def __call__(self, episodes: Episodes) -> Episodes:
-        """Return the repaired episodes; themselves where there is nothing to repair."""
+        """Return the repaired episodes, or the episodes themselves where there is nothing to repair."""
         if not self.notes:
             return episodes
         made: list[Episode] = []
@@ -96,7 +96,7 @@ def needed(episodes: Episodes) -> Repair:
 
 
 def _useful(columns: Float[np.ndarray, "m n"], names: tuple[str, ...], notes: list[str]) -> list[int]:
-    """Return the columns that move and repeat none before."""
+    """Return the columns that move and are no copy of an earlier one."""
     kept: list[int] = []
     for i, name in enumerate(names):
         column = columns[:, i]
@@ -130,7 +130,7 @@ def noted(notes: list[str]) -> Generator[None]:
 
 
 def shortened(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
-    """Return the notes, those that files share in one line, and of those that differ by file the first few."""
+    """Return the notes: one line for a note that files share, and the first few of those that only one file has."""
     known = {str(file) for file in files}
     of: dict[str, list[str]] = {}
     for note in notes:
@@ -150,7 +150,7 @@ def shortened(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
             short.append(said)
         alone += len(where) == 1
     if alone > _SHOWN:
-        short.append(f"{alone - _SHOWN} more files have such notes of their own; load_episodes says them")
+        short.append(f"{alone - _SHOWN} more files have notes of their own; load_episodes shows them")
     return short
 
 
@@ -170,17 +170,17 @@ class Divided:
     fitted
         A source, larger than memory if need be.
     seen
-        Episodes of it, for what a report says of training data.
+        Some of the fitted episodes, which stand for the training data in the report.
     held_out
         Episodes that no fit sees.
     horizon
         Steps ahead.
     size
-        What there is, in words.
+        The amount of data, in words.
     notes
         What was done to the data, in sentences.
     delay
-        Steps of the past that signals which are late ask for.
+        Steps of the past that a model needs for signals that are late.
     """
 
     fitted: Source | Episodes
@@ -260,7 +260,7 @@ def _in_memory(
         if len(whole) > number:
             notes = (
                 f"too few episodes to hold some out: cut into {len(whole)} blocks of about {block} steps; a held-out "
-                "block lies between those of the fit, so its errors may flatter",
+                "block lies between those of the fit, so its errors may be too small",
             )
     long = [i for i, episode in enumerate(whole) if len(episode) >= needed]
     if len(long) < 4:

@@ -40,7 +40,7 @@ class DesignRow(Value):
     violation
         Largest violation of a limit in any run that was not lost, as a share of its range.
     lost
-        How many runs were lost: they left the data by more than half of its range, or ended in no number.
+        How many runs were lost: they left the data by more than half of its range, or became NaN or infinite.
     runs
         How many runs it was judged by.
     off

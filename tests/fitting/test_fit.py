@@ -320,7 +320,7 @@ def test_of_notes_that_differ_from_file_to_file_the_first_are_shown_and_the_othe
     files = [tmp_path / f"{i}.csv" for i in range(9)]
     short = shortened([*(f"{file}: gap {i}" for i, file in enumerate(files)), "of all: one"], files)
     assert short[:2] == [f"{files[0]}: gap 0", f"{files[1]}: gap 1"]
-    assert short[6:] == ["of all: one", "3 more files have such notes of their own; load_episodes says them"]
+    assert short[6:] == ["of all: one", "3 more files have notes of their own; load_episodes shows them"]
 
 
 @pytest.mark.usefixtures("quick")
