@@ -1,4 +1,4 @@
-"""Where the lifted state is, and what disturbs it."""
+"""Observers: the lifted state now, and the disturbance that acts on it."""
 
 from typing import TYPE_CHECKING
 

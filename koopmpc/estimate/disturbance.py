@@ -24,10 +24,10 @@ GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps
 class LiftedDisturbance(Value):
     """z = ψ(x) afresh each step; d follows the misfits e = ψ(x⁺) − A ψ(x) − B u − E w as far as they are constant.
 
-    At rest d is exactly what the model lacks at that state and input, in every lifted coordinate, so the equilibria
-    z = A z + B u + d of the controller hold the plant's own. A disturbance of fewer coordinates leaves an offset
-    when z is lifted afresh from x. The Constant is known: its d is zero. In a controller on x⁺ = F(x, u) + d the
-    states have the disturbances.
+    At rest d is exactly what the model lacks at that state and input, in every lifted coordinate. So the plant's
+    equilibrium is one of the controller's model, z = A z + B u + d. With disturbances of fewer coordinates an offset
+    remains, because z is lifted afresh from x. The Constant has no disturbance. In a controller on x⁺ = F(x, u) + d
+    the states have the disturbances.
 
     A plan holds d over its horizon, but what a model lacks in a transient is not what it lacks where the plan ends.
     Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the
@@ -67,7 +67,7 @@ class LiftedDisturbance(Value):
 class Filtered(Measured):
     """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is.
 
-    The disturbances of what is known are zero: of the Constant, and of a state's past. A step is one product,
+    The Constant and the past of a state have no disturbances. A step is one product,
     A z + B u + E w, and one call of the CasADi function `_rule`: an observer has half of the time of a step.
 
     Parameters
@@ -75,7 +75,7 @@ class Filtered(Measured):
     model
         The predictor, or a model whose z is the state.
     gain
-        In (0, 1].
+        Weight of the newest misfit, in (0, 1].
     """
 
     _OWN = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_evaluate", "_buffer")

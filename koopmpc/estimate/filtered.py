@@ -17,8 +17,8 @@ from koopmpc.predict.predictors import LinearPredictor
 class Augmented:
     """s⁺ = F s + G [u; w] + f, y = M s + h for s = [z; d] without the Constant's coordinate.
 
-    What a controller of z⁺ = A z + B u + d needs is linear in s: z + H⁺C_d d and B_d d + (I − A) H⁺C_d d. An offset
-    of y is so a shift of the coordinates, in which H z is y itself.
+    A controller on z⁺ = A z + B u + d gets z + H⁺C_d d for z and B_d d + (I − A) H⁺C_d d for d, both linear in s. In
+    these shifted coordinates H z is y itself, the offset of y included.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Augmented:
 
 
 class FilterModel(NamedTuple):
-    """What a filter runs on: the augmented system, the covariance P before a measurement, and that of y."""
+    """The data of a filter: the augmented system, the covariance P before a measurement, and that of y."""
 
     system: Augmented
     P: Float[np.ndarray, "n n"]
@@ -58,8 +58,8 @@ class FilterModel(NamedTuple):
 class Kalman:
     """The observer of a `LiftedKalman`: s ← s + K (y − M s − h), the gain K from the stationary covariance P.
 
-    Where some of y is NaN the gain is that of the rest; where all is, s is predicted. Where all of y has come, without
-    delay, a step is one product, [s; z; d] = Ω [s; u; w; y; 1].
+    Entries of y that are NaN are left out of the correction; where all are NaN, s is only predicted. Where no entry is
+    NaN and there is no delay, a step is one product, [s; z; d] = Ω [s; u; w; y; 1].
     """
 
     _VIEWS = ("z", "d", "_s", "_uw", "_y", "_s_new")
@@ -78,7 +78,7 @@ class Kalman:
         self.reset()
 
     def _see(self) -> None:
-        """Make the views of what the product reads and writes; a copy makes its own."""
+        """Make the views of the arrays that the product reads and writes; a copy makes its own."""
         n, inputs, nz = self._parts
         self._s, self._uw, self._y, _ = np.split(self._known, [n, n + inputs, n + inputs + self.ny])
         self._s_new, self.z, self.d = np.split(self._found, [n, n + nz])
@@ -117,7 +117,7 @@ class Kalman:
         self._missed = 0
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Correct the state of `delay` steps ago with y, and predict it to now through the inputs since."""
+        """Correct the state of `delay` steps ago with y, and predict it to the present with the inputs since then."""
         if self._started and not self._delay:
             self._uw[: len(u)] = u
             if len(w):
@@ -131,7 +131,7 @@ class Kalman:
         return self._corrected(y, u, w)
 
     def _corrected(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Predict, and correct with what has come of y."""
+        """Predict, and correct with the entries of y that have come."""
         system = self._system
         if self._started:
             self._inputs.append(np.concatenate([u, w]))
@@ -161,7 +161,7 @@ class Kalman:
             M, R = self._system.M[came], self._R[np.ix_(came, came)]
             PM = self._P @ M.T
             S = M @ PM + R
-            size = np.sqrt(S.diagonal())[:, None]  # units of the outputs are no ill condition
+            size = np.sqrt(S.diagonal())[:, None]  # scaled, for different units of the outputs are no ill-conditioning
             scaled = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos"))
             self._gains[key] = (scaled / size).T
         return self._gains[key]

@@ -1,4 +1,4 @@
-"""LiftedKalman: a Kalman filter on [z; d] for what is measured of the lifted state, late or now and then."""
+"""LiftedKalman: a Kalman filter on [z; d], from some measured observables, which may be late or missing at times."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,13 +59,13 @@ class LiftedKalman(Value):
     """Stationary Kalman filter on s = [z; d]: z⁺ = A z + B u + E w + B_d d, d⁺ = d, y = H z + C_d d.
 
     z is never lifted afresh. There is one disturbance for each measurement, so that at rest the filter explains y
-    exactly: with the tracked outputs among those measured, and no more of them than inputs, the loop has no offset.
-    The Constant is known, and never estimated.
+    exactly. The loop has no offset if all tracked outputs are measured, and if there are no more of them than inputs.
+    The Constant is known, and not estimated.
 
     Parameters
     ----------
     outputs
-        What y holds: names of observables, with or without unit, or a matrix H (ny, nz).
+        The entries of y: names of observables, with or without unit, or a matrix H (ny, nz).
     disturbance
         "input": the first nu outputs are explained by disturbances of the inputs (B_d = B), each further one by
         an offset of its own. "output": every output has an offset of its own (C_d = I); not for a plant that
@@ -83,7 +83,7 @@ class LiftedKalman(Value):
     delay
         y is `delay` steps old; what followed is predicted from the inputs that acted since.
     patience
-        So many samples without any measurement in a row are bridged by prediction; then the state is unknown.
+        How many samples in a row without any measurement are bridged by prediction; after them the state is unknown.
 
     Raises
     ------
@@ -188,7 +188,7 @@ class LiftedKalman(Value):
         return H
 
     def _words(self, predictor: LinearPredictor, model: Augmented, lost: Hidden) -> str:
-        """Say what moves unseen, and what to do."""
+        """Return the message on a mode that y does not show, and what to do."""
         ny, nu = len(model.M), predictor.nu
         names = predictor.lifting.names
         labels = [f"{names[int(i)]!r}" for i in model.kept]
@@ -250,8 +250,8 @@ def _settling(
 ) -> Float[np.ndarray, " nd"]:
     """Return the least drift of each d with which its error falls to exp(−4) in four times so many steps.
 
-    All of d drift alike in the filters that are tried. Where none is enough it is the drift with which the error
-    falls most.
+    In the filters that are tried all of d has the same drift. Where none is enough, the drift is taken with which the
+    error falls most.
     """
     nz, nd, whole = len(process), len(F) - len(process), int(np.ceil(4 * steps))
     left = np.empty((len(DRIFTS), nd))

@@ -1,7 +1,4 @@
-"""What a controller asks about its present: z and d of z⁺ = A z + B u + d, where the state itself is measured.
-
-The observer here takes the state as it was measured, without a disturbance.
-"""
+"""What an observer is: z and d of z⁺ = A z + B u + d now. `Measured` is the observer where the state is measured."""
 
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -17,11 +14,11 @@ from koopmpc.predict.predictors import LinearPredictor
 
 @runtime_checkable
 class StateModel(Protocol):
-    """z⁺ = F(z, u) + E w + d of a controller: a lifted linear model, or a map whose z is the state itself."""
+    """The model z⁺ = F(z, u) + E w + d of a controller: a lifted linear one, or a map whose z is the state itself."""
 
     @property
     def ny(self) -> int:
-        """Number of the plant's states, which y holds where all is measured."""
+        """Number of the plant's states; y has as many entries where all of them are measured."""
         ...
 
     @property
@@ -143,8 +140,8 @@ class Estimator(Protocol):
 class History:
     """ζ_k = [x_k, u_{k−1}, x_{k−1}, …] of a run.
 
-    The first measurement stands in for what was before it. A missed one makes the x_k of its own ζ_k NaN; in those that
-    follow, the last state that was measured stands in.
+    The first measurement also fills the past before it. A missed measurement makes x_k NaN in its own ζ_k; in later ζ
+    the last measured state takes its place.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ def leading(rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]) -> 
         A whole number; the least number of directions that hold this share of Σσ², between 0 and 1; or
         "hard-threshold", all σ above ω(β) times their median.
     sentences
-        Gets one where the snapshots have a lower rank than was asked for, which is taken.
+        The list that gets a sentence where the snapshots have a lower rank than asked for; the lower one is then taken.
     """
     Z = rows.P[:, :nz]
     if len(Z) < nz:  # LAPACK is faster on the tall side
@@ -85,7 +85,7 @@ def lost(
     C: Float[np.ndarray, "nx nz"] | None,
     samples: int,
 ) -> Float[np.ndarray, " nx"]:
-    """Return the root-mean-square of C (I − U_r U_rᵀ) ψ(x), what the truncation takes from each state."""
+    """Return the root-mean-square of C (I − U_r U_rᵀ) ψ(x), the part of each state that the truncation loses."""
     gap = (Z @ basis) @ basis.T
     np.subtract(Z, gap, out=gap)
     gap = gap if C is None else gap @ C.T

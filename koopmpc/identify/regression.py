@@ -32,7 +32,7 @@ class Regression:
     Attributes
     ----------
     method, route
-        For the report.
+        What the report says of them.
     rows
         P = [ψ(x) u]; T begins with ψ(x⁺).
     x_next
@@ -120,12 +120,12 @@ def regression_of(
 
 
 class FitResult(NamedTuple):
-    """What a method found: z⁺ = A z + B u, B with the columns of w, and what the report says of it.
+    """The result of a method: z⁺ = A z + B u, where B has the columns of w too, and what the report says of it.
 
     Attributes
     ----------
     rule
-        What solved it, in words.
+        How it was solved, in words.
     doubts, changes
         Sentences of the report: its warnings, and what a prior, a limit or a penalty changed.
     """
@@ -156,7 +156,7 @@ def unreduced(
     doubts: Sequence[str] = (),
     changes: Sequence[str] = (),
 ) -> FitResult:
-    """Return the result that K = [A B E]ᵀ is, in the lifting of the regression.
+    """Return the result of K = [A B E]ᵀ, in the lifting of the regression.
 
     Rank and condition number are those of the regressors, computed here where they are not given.
     """
@@ -180,7 +180,7 @@ def unreduced(
 
 
 def fit_report(regression: Regression, result: FitResult, *, warn: bool = True) -> FitReport:
-    """Return the report; each of its doubts is a FitWarning at the line outside of the library that asked for it."""
+    """Return the report. Each doubt in it is also a FitWarning, at the line outside of koopmpc that called the fit."""
     for sentence in result.doubts if warn else ():
         warnings.warn(sentence, FitWarning, stacklevel=_level_outside())
     return FitReport(
@@ -227,7 +227,7 @@ def linear_predictor(regression: Regression, result: FitResult, *, warn: bool = 
 
 
 def scale_of(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz nz"]:
-    """Return the upper triangular R with RᵀR = Σ w z zᵀ / Σ w, z what this lifting makes of the regression's data."""
+    """Return the upper triangular R with RᵀR = Σ w z zᵀ / Σ w, where z is the lifted data of the regression."""
     Z = regression.rows.P[:, : regression.lifting.nz]
     if lifting is not regression.lifting and isinstance(lifting, Projected):
         Z = Z @ lifting.basis
@@ -237,8 +237,8 @@ def scale_of(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz 
 def scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:
     """Return the upper triangular R with RᵀR = PᵀP / M, and a diagonal above 0, so that P R⁻¹ has orthogonal columns.
 
-    Columns that depend on others leave it invertible: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
-    together lose half of the digits at most. A column of zeros is one of its own unit, 1.
+    It is invertible even where columns depend on others: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
+    together lose at most half of the digits. A column of zeros counts as one of size 1.
     """
     size = norms(P)
     live = size > 0
@@ -248,7 +248,7 @@ def scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray,
 
 
 def growth(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
-    """Return in words how much of the observables, each relative to its size, K and the plain fit miss."""
+    """Return in words how far K and the plain fit miss the observables, each relative to its size."""
     before, after = relative_misfit(rows, plain), relative_misfit(rows, K)
     return f"relative one-step misfit of the observables {after:.3g}, of the plain fit {before:.3g}"
 

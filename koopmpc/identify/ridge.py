@@ -1,6 +1,6 @@
 """cross_validated: the ridge of one fit by generalised cross-validation, ``ridge="gcv"``.
 
-It weighs the errors of one step. `select` chooses a ridge by the errors over a horizon on held-out folds:
+It is chosen by the errors of one step. `select` chooses one by the errors over a horizon on held-out folds, see
 synthesis/cross_validation.py.
 """
 

@@ -42,9 +42,9 @@ class RegressionRows:
     T
         (m, nt) targets, as far as they lie in these rows.
     rest
-        (nt,) the energy Σt² of each target outside these rows, where no P can reach.
+        (nt,) the energy Σt² of the part of each target outside these rows, which no K can fit.
     samples
-        M.
+        The number M of snapshots.
     """
 
     P: Float[np.ndarray, "m n"]
@@ -78,7 +78,7 @@ def norms(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
 
 
 def unit(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-    """Return P with columns of norm 1; a column of zeros stays."""
+    """Return P with columns of norm 1; a column of zeros stays as it is."""
     size = norms(P)
     return P / np.where(size > 0, size, 1.0)
 
@@ -92,14 +92,14 @@ def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True) -> S
     """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag of the columns' norms.
 
     With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
-    takes norm and cut on columns of unit norm, where units of the data mean nothing. "gcv" chooses the ridge by
+    takes norm and cut on columns of unit norm, so that units of the data mean nothing. "gcv" chooses the ridge by
     generalised cross-validation.
     """
     return path(rows, (ridge,), scaled=scaled)[0]
 
 
 def path(rows: RegressionRows, ridges: Sequence[Ridge], *, scaled: bool = True) -> list[Solution]:
-    """Return the solution for each ridge, of one decomposition."""
+    """Return the solution for each ridge, from one decomposition."""
     size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
     size[size == 0] = 1.0
     U, s, Vt = np.linalg.svd(rows.P / size, full_matrices=False)
@@ -132,7 +132,7 @@ def scaled_rank(rows: RegressionRows, P: Float[np.ndarray, "m n"]) -> tuple[int,
 
 
 def orthonormal(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:
-    """Return an orthonormal basis of the span of these columns, those of norm 0 left out."""
+    """Return an orthonormal basis of the span of these columns; columns of norm 0 are left out."""
     U, s, _ = np.linalg.svd(unit(columns[:, norms(columns) > 0]), full_matrices=False)
     return U[:, s > cut * s.max(initial=0.0)]
 
@@ -157,14 +157,14 @@ def rule(rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = Tru
 def doubts(
     rows: RegressionRows, observables: Sequence[str], inputs: Sequence[str], *, regular: bool
 ) -> tuple[list[str], float]:
-    """Return one sentence for each reason to doubt a regression on [ψ(x) u], P of `rows`, and its condition number.
+    """Return a sentence for each reason to doubt the regression on P = [ψ(x) u], and its condition number.
 
     The condition number is that of columns scaled to unit norm; inf where they are dependent.
 
     Parameters
     ----------
     rows
-        Their P holds the observables, then the inputs.
+        The rows; their P holds the observables, then the inputs.
     observables, inputs
         Names of the columns of P.
     regular
@@ -219,7 +219,7 @@ def doubts(
 
 
 def _dependent(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:
-    """Return for the columns beyond `rank` which others they depend on."""
+    """Return, for each column beyond `rank`, the other columns on which it depends."""
     R, pivots = qr(unit(P), mode="r", pivoting=True)
     sorted_names = [names[int(j)] for j in pivots]
     weights = np.abs(solve_triangular(R[:rank, :rank], R[:rank, rank:]))

@@ -135,7 +135,7 @@ def test_states_without_weight_are_not_tracked_and_a_list_is_a_reference_for_eac
     ("old", "new", "sentence"),
     [
         ("position [m]", "position [cm]", r"is in another unit than the logs, which have 'position \[m\]'"),
-        ("position [m]", "postion [m]", r"of nothing in the logs"),
+        ("position [m]", "postion [m]", r"names nothing in the logs"),
         ("reference = 0.5", "refrence = 0.5", "has 'refrence'.*reference"),
         ("reference = 0.5", "reference = nan", "NaN"),
         ("reference = 0.5", 'reference = "up"', "write a number, or a list"),
