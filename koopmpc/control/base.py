@@ -94,14 +94,14 @@ class InitialCondition:
     def take(
         self, y: ArrayLike, last: Float[np.ndarray, " nu"], applied: ArrayLike | None, w: ArrayLike | None
     ) -> None:
-        """Take y_k and write down where the plan starts; z is NaN where y cannot be used.
+        """Take y_k and store where the plan starts; z is NaN where y cannot be used.
 
         Parameters
         ----------
         last
             The input that was computed last.
         applied
-            What acted since the last call; by default the input that was computed L + 1 calls ago.
+            The input that acted since the last call; by default the one that was computed L + 1 calls ago.
         w
             (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
@@ -143,7 +143,7 @@ class InitialCondition:
             self.d[:] = d
 
     def _preview(self, w: ArrayLike | None) -> None:
-        """Write down the preview of the measured disturbances."""
+        """Store the preview of the measured disturbances."""
         if w is None:
             self.W[:] = self._ahead[:] = 0.0
             return
@@ -172,9 +172,9 @@ class MPCBase(Savable):
     dt
         Sampling time [s].
     model
-        What the plan is made with.
+        The model of the plan.
     tracking
-        What is tracked and limited.
+        The tracked and limited outputs, with their weights and limits.
     blocks, move_of
         Lengths of the blocks of held inputs, and which of a plan's moves each of the N steps takes.
     observer, estimator
@@ -184,9 +184,9 @@ class MPCBase(Savable):
     time_limit
         Wall-clock time of a step [s].
     with_rates
-        Whether the last input counts.
+        Whether the last input matters, for a weight or a limit of the changes.
     monitor
-        Says of each step whether the model knows; None where nobody asks.
+        What tells of each step whether the model knows it; None where that is not asked.
     """
 
     solver_fails = False  # set by fault injection alone, see control.move.Fallible
@@ -261,7 +261,7 @@ class MPCBase(Savable):
         self._given = plan[: self.nu]
 
     def _watched(self, watch: Watch, move: Move, applied: ArrayLike | None, start: float) -> Move:
-        """Return the step that says whether its model knows."""
+        """Return the move with the answer whether the model knows this step."""
         move.known = watch.look(self._initial, move.u, applied)
         move.solve_time = perf_counter() - start
         return move
@@ -289,7 +289,7 @@ class MPCBase(Savable):
         start: float,
         solver: str = "",
     ) -> Move:
-        """Return what stands in for a failed step, with the status that says why: a late one says that it is late.
+        """Return the move that replaces a failed step, with the status that says why; TIME_LIMIT where it is late.
 
         Parameters
         ----------

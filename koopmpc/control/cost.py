@@ -126,12 +126,12 @@ class Cost(Value):
 
 
 class Sizes(NamedTuple):
-    """How far each state, input and limited row [x; of(x)] goes, and the scale of the cost: what units mean nothing to.
+    """The sizes of states, inputs and limited rows [x; of(x)], and the scale of the cost, by which units mean nothing.
 
-    A limit is as large as half the width of its two finite ends; else as half the range of the data behind the model;
-    else as the value of its row that costs, by Q, what the sizes of the other rows cost on the mean; else as |limit|;
-    else 1. The same goes for states without a limit, and for inputs by R. The scale of the cost is the most that a
-    tracked output or an input of known size costs in a step.
+    The size of a limited row is half the width between two finite limits; else half the range of the model's data; else
+    the value that costs, by Q, the mean of what the sizes of other rows cost; else |limit|; else 1. The same goes for
+    states without a limit, and for inputs by R. The scale of the cost is the largest cost of a tracked output or an
+    input of known size in a step.
     """
 
     states: Float[np.ndarray, " nx"]

@@ -64,8 +64,8 @@ class SizedLimits(NamedTuple):
 class Limits(Value):
     """u_min ≤ u_k ≤ u_max and du_min ≤ u_k − u_{k−1} ≤ du_max, x_min ≤ x_k ≤ x_max and y_min ≤ of(x_k) ≤ y_max.
 
-    Inputs (k = 0 … N−1) are always inside their limits. Where the last input and a change inside its limits do not
-    reach them, they win, and the status says SOFTENED. States and outputs (k = 1 … N) are soft unless told.
+    Inputs (k = 0 … N−1) are always inside their limits. If no change inside its limits leads there from the last input,
+    the limits of the inputs win, and the status says SOFTENED. States and outputs (k = 1 … N) are soft by default.
 
     Parameters
     ----------

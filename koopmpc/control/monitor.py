@@ -1,4 +1,4 @@
-"""Monitor: where the data of a model were and how well it predicted them; each step asks whether that holds now."""
+"""Monitor: the region of a model's data and its errors there, to ask at each step whether the loop is inside both."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -59,9 +59,10 @@ class Monitor(Value):
         model
             The predictor of the controller.
         data
-            The episodes that it was fitted to; held-out episodes make the band honest where the fit is close.
+            The episodes that it was fitted to. Where the fit is close, pass held-out episodes: on its own data the
+            errors are too small.
         level
-            Share of these data that is to count as known, by each of the two checks.
+            Share of these data that counts as known, in each of the two checks.
 
         Raises
         ------
@@ -87,7 +88,7 @@ class Monitor(Value):
 
 
 def _whitening(rows: Float[np.ndarray, "M n"], share: float, of: Float[np.ndarray, "K n"]) -> Float[np.ndarray, "n n"]:
-    """Return G with mean ‖G v‖² = n over the rows, no column of which counts as smaller than this share of `of`."""
+    """Return G with mean ‖G v‖² = n over the rows; a column counts as no smaller than this share of that of `of`."""
     floor = share * np.sqrt((of**2).mean(axis=0))
     norm = np.sqrt((rows**2).mean(axis=0) + floor**2)
     norm = np.where(norm > 0, norm, 1.0)
@@ -103,7 +104,7 @@ def _to_one(G: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "M n"], rank: i
 
 
 def monitor_of(given: Monitor | Episodes, model: Any) -> Monitor:
-    """Return the monitor that a controller was given, or that of the data that it was given.
+    """Return the monitor of a controller, made of the data where these were given.
 
     Raises
     ------
@@ -120,17 +121,17 @@ def monitor_of(given: Monitor | Episodes, model: Any) -> Monitor:
 
 
 class Watch:
-    """The monitor of one closed loop: `inside` where the data were, `fits` as the model predicted there.
+    """The monitor in one closed loop: whether the last step was `inside` the data, and whether the prediction `fits`.
 
-    Both are of the last step. What came is compared with the prediction of the step before, under the input that the
-    plant got, the measured disturbances and the estimated one.
+    The state is compared with its prediction from the step before, with the input that the plant got, the measured
+    disturbances and the estimated one.
 
     Parameters
     ----------
     monitor
-        What is known.
+        The region and the band.
     model
-        What predicts.
+        The model that predicts.
     latency
         Steps until an input acts; the prediction that is compared is that of the plan's start.
     """
@@ -164,7 +165,7 @@ class Watch:
         self._see()
 
     def update(self, model: LinearPredictor | StateModel) -> None:
-        """Compare with the predictions of another model from now on; what counts as known stays."""
+        """Compare with the predictions of another model from now on; region and band stay."""
         self._model, W = model, self.monitor.band
         if isinstance(model, LinearPredictor):
             nx, n, nz = len(W), self._n, model.nz
@@ -217,7 +218,7 @@ class Watch:
         return self.inside and self.fits
 
     def _stepped(self, start: "InitialCondition", applied: ArrayLike | None) -> bool:
-        """Return whether the state came as the map of a nonlinear model said."""
+        """Return whether the state is the one that a nonlinear model predicted."""
         model, W = self._model, self.monitor.band
         if self._old is None or isinstance(model, LinearPredictor):
             return True

@@ -20,7 +20,7 @@ Kind = Literal["KoopmanMPC", "BilinearMPC", "NonlinearMPC"]
 
 @dataclass(frozen=True, eq=False)
 class SavedController(Value):
-    """What a controller was made of; it begins anew when it is loaded, as after `reset`.
+    """The data that a controller is made of. A loaded controller begins as after `reset`.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class SavedController(Value):
     model
         The predictor of the controller.
     cost, limits, horizon, estimator, latency, moves, time_limit
-        Its arguments; `moves` are the lengths of the blocks of held inputs.
+        Arguments of the controller; `moves` are the lengths of the blocks of held inputs.
     options
         The arguments that only this class has.
     monitor
-        What it knows, where it watches.
+        The monitor, where it has one.
     """
 
     name: Kind

@@ -103,7 +103,7 @@ class Targets:
 
 
 def observable_sizes(predictor: LinearPredictor, sizes: Sizes) -> Float[np.ndarray, " nz"]:
-    """Return the sizes of observables: those of a model's data, else the largest |ψ| on the way to the states' sizes.
+    """Return the sizes of observables: those of a model's data, else the largest |ψ| at shares of the states' sizes.
 
     An observable that is zero there has size 1.
     """

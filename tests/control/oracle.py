@@ -10,10 +10,10 @@ from tests.control.models import end_of
 TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 
 
-def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=None, C=None, of=None, targets=None):
+def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=None, C=None, of=None):
     """U (N, nu) and the least cost, by CLARABEL; None where there is none.
 
-    `of` is the matrix of limited observables; the targets are found anew unless they are passed.
+    `of` is the matrix of limited observables.
     """
     import cvxpy as cp
 
@@ -21,7 +21,7 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
     N, nu, nz = len(R) - 1, model.nu, model.nz
     e = np.zeros(nz) if W is None else model.E @ W[-1]
     e = e if d is None else e + d
-    targets = targets_of(model, cost, limits, R, e, C, of) if targets is None else targets
+    targets = targets_of(model, cost, limits, R, e, C, of)
     u_prev = np.zeros(nu) if u_prev is None else u_prev
     blocks = (1,) * N if blocks is None else blocks
     Q, Ru = cost.matrices(len(C), nu)
@@ -155,12 +155,3 @@ def targets_of(model, cost, limits, R, e, C, of=None):
             u_r = given[min(k, len(given) - 1)]
         found.append((v[:nz], np.zeros(nu) if isinstance(cost.u_target, str) and cost.u_target == "zero" else u_r))
     return found
-
-
-def targets_of_controller(mpc, R, e):
-    """(z_r, u_r) of each row of R as the controller finds them, for rows whose target two limits and a tie decide."""
-    found = mpc._map.targets
-    return [
-        (found.z0 + found.z_disturbance @ e + found.Z @ a, found.u0 + found.u_disturbance @ e + found.W @ a)
-        for a in found.coordinates(R, e)
-    ]

@@ -28,7 +28,7 @@ FOLLOWED = 0.02  # a plan follows the model whose defects are below this share o
 SETTLED = (
     1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
 )
-FAR = 3.0  # sizes of a state: a plan that expected another state by more begins anew, for it, or y, was a glitch
+FAR = 3.0  # sizes of a state: where y is farther from the expected state, the plan begins anew, for one was a glitch
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -184,7 +184,7 @@ class BilinearMPC(StagedMPC):
     def _begin_anew(
         self, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
     ) -> tuple[Status, int]:
-        """Make the cheapest plan that several starts lead to the plan; return how it ended, and all iterations.
+        """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
 
         Plans that follow the model come before those that do not yet.
         """
@@ -241,10 +241,9 @@ class BilinearMPC(StagedMPC):
     ) -> tuple[Status, int]:
         """Return how the last of at most this many iterations ended, and the solver's iterations of all.
 
-        They begin at these states and inputs, by default at the plan.
-
-        They end early at a solution, where no more than a share `settled` of the plan moves, where F is nowhere near
-        its linearisation, and at the deadline: then what was found before it is used, and late.
+        The first one begins at the states and inputs `begin`, by default at the plan. They end early where no more than
+        a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
+        plan found so far is used, and the step is late.
         """
         total, status, iteration = 0, Status.FAILED, self._iteration
         if begin is not None:

@@ -306,7 +306,7 @@ class StagedMPC(MPCBase):
         start: float,
         free: Float[np.ndarray, " nu"] | None = None,
     ) -> Move:
-        """Return what stands in for a failed step; the next one starts anew, unless there was no time."""
+        """Return the move that replaces a failed step; the next step begins anew, unless this one ran out of time."""
         self._warm = status is Status.TIME_LIMIT
         known = free is not None and bool((np.abs(free) < HUGE).all())
         return self._fail(free if known else None, applied, status, iterations, start)

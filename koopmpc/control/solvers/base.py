@@ -1,4 +1,4 @@
-"""Who solves the QP of a step: what all solvers share, and which of them are asked one after the other."""
+"""The solvers of a step's QP: what all of them share, and how several are asked one after the other."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -155,9 +155,9 @@ class Choice(NamedTuple):
 class StepSolver:
     """The QP of a step, by the first of some solvers that has an answer, started from the last one moved on by a step.
 
-    After a step that another than the first had to finish, that one is asked first, until a plan is free of limits:
-    where a first-order method has met its bound it will in the next step, too, and an active-set method then needs few
-    iterations.
+    Where another solver than the first had the answer, it is asked first in the next steps, until a plan meets all
+    limits: a first-order method that has reached its bound of iterations will reach it in the next step, too, and an
+    active-set method then needs few iterations.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ class StepSolver:
         self._last = None
 
     def rest(self) -> None:
-        """Forget the last answer, and who had to find it: the plan is free of limits."""
+        """Forget the last answer, and which solver found it, for the plan meets all limits."""
         self._last, self._turn = None, 0
 
     def reset(self) -> None:
