@@ -1,8 +1,9 @@
-"""The nine controllers of the bench, and what they share of one problem: step map, plant, data and models."""
+"""The ten controllers of the bench, and what they share of one problem: step map, plant, data and models."""
 
 import time
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -10,11 +11,13 @@ from jaxtyping import Float
 
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
+from koopmpc.control.adaptive import Adaptive
 from koopmpc.control.cost import state_tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.linear.linear_mpc import LinearMPC
 from koopmpc.control.lqr import LQR
+from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import Equilibria
@@ -26,20 +29,30 @@ from koopmpc.errors import FitWarning, ProblemError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
+from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.plants.dynamics import Dynamics, Plant
 from koopmpc.plants.step_map import SimulatedPlant, StepMap, discretize
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.design import design
+from koopmpc.synthesis.designed import Design, made
 
 
 class Prepared:
     """The parts of a problem; each is built when it is first used and then kept.
 
     Koopman controllers get `model` or `bilinear`, which are fitted to data alone; the others get `step_map`.
+
+    Parameters
+    ----------
+    problem
+        What is controlled.
+    monitored
+        Whether controllers of learned models say at each step whether it is like the data.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, *, monitored: bool = False) -> None:
+        self.problem, self._monitored = problem, monitored
+        self._designs: list[tuple[Limits, Design]] = []
         self.training_time = 0.0
         self._held: dict[str, Float[np.ndarray, "T nu"]] = {}
 
@@ -113,6 +126,32 @@ class Prepared:
         self.training_time = time.perf_counter() - start
         return model
 
+    @property
+    def watched(self) -> Episodes | None:
+        """What a monitor compares with: the data, or None where no step is watched."""
+        return self.data if self._monitored else None
+
+    def design(self, limits: Limits) -> Design:
+        """Return what `design` makes of the data, for the first case's reference and the starts of all cases."""
+        known = next((found for own, found in self._designs if own == limits), None)
+        if known is not None:
+            return known
+        problem = self.problem
+        cases = list(problem.cases.values())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FitWarning)  # of cases that ask for what the data do not hold
+            found = design(
+                self.data,
+                problem.cost,
+                limits,
+                horizon=problem.horizon,
+                reference=cases[0].reference,
+                starts=np.array([case.x0 for case in cases]),
+                angles=problem.angles,
+            )
+        self._designs.append((limits, found))
+        return found
+
     @cached_property
     def bilinear(self) -> BilinearPredictor:
         """z⁺ = A z + B u + Σ uᵢ Nᵢ z fitted to the same data with the same lifting."""
@@ -141,41 +180,44 @@ def _linear_mpc(parts: Prepared, limits: Limits) -> Controller:
 
 def _koopman_mpc(parts: Prepared, limits: Limits) -> Controller:
     """MPC on the lifted predictor, learned from data."""
-    return KoopmanMPC(parts.model, parts.problem.cost, limits, parts.problem.horizon)
+    return KoopmanMPC(parts.model, parts.problem.cost, limits, parts.problem.horizon, monitor=parts.watched)
 
 
 def _offset_free(parts: Prepared, limits: Limits) -> Controller:
     """MPC on the lifted predictor, with an estimated disturbance of every lifted coordinate."""
     problem = parts.problem
-    return KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
+    return KoopmanMPC(
+        parts.model, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance(), monitor=parts.watched
+    )
 
 
 def _bilinear_mpc(parts: Prepared, limits: Limits) -> Controller:
     """Real-time iteration on the bilinear predictor, which is lifted anew at every step of the plan."""
-    return BilinearMPC(parts.bilinear, parts.problem.cost, limits, parts.problem.horizon)
+    return BilinearMPC(parts.bilinear, parts.problem.cost, limits, parts.problem.horizon, monitor=parts.watched)
 
 
 def _bilinear_offset(parts: Prepared, limits: Limits) -> Controller:
     """The same on the bilinear predictor, with an estimated disturbance of every state."""
     problem = parts.problem
-    return BilinearMPC(parts.bilinear, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance())
+    return BilinearMPC(
+        parts.bilinear, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance(), monitor=parts.watched
+    )
+
+
+def _adaptive(parts: Prepared, limits: Limits) -> Controller:
+    """The same as koopman-mpc, with a model that goes on learning from each step that its monitor knows."""
+    problem = parts.problem
+    mpc = KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, monitor=parts.watched)
+    online = OnlineEDMD.start(parts.data, problem.lifting, forgetting=_FORGETTING, ridge=problem.ridge)
+    return Adaptive(mpc, online)
 
 
 def _designed(parts: Prepared, limits: Limits) -> Controller:
-    """What `design` makes of the data, for the first case's reference and the starts of all cases."""
-    problem = parts.problem
-    cases = list(problem.cases.values())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FitWarning)  # of cases that ask for what the data do not hold
-        return design(
-            parts.data,
-            problem.cost,
-            limits,
-            horizon=problem.horizon,
-            reference=cases[0].reference,
-            starts=np.array([case.x0 for case in cases]),
-            angles=problem.angles,
-        ).controller
+    """What `design` makes of the data; one design serves all cases with these limits."""
+    saved = parts.design(limits).controller.as_data()
+    if parts.watched is not None:
+        saved = replace(saved, monitor=Monitor.of(saved.model, parts.watched))
+    return made(saved, "the design")
 
 
 def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
@@ -192,15 +234,17 @@ CONTROLLERS: dict[str, Build] = {
     "bilinear-mpc": _bilinear_mpc,
     "bilinear-offset": _bilinear_offset,
     "nonlinear-mpc": _nonlinear_mpc,
+    "adaptive": _adaptive,
     "designed": _designed,
 }
-ASKED = ("designed",)  # a design takes up to a minute, so it runs where it is named
+ASKED = ("adaptive", "designed")  # for plants that drift; a design takes up to a minute: they run where they are named
 
-LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset", "designed")
+LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset", "adaptive", "designed")
+_FORGETTING = 0.98  # of the adaptive one: what is 35 steps ago counts by half
 
 
 def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Return the names as a tuple, by default all but "designed", which has to be named.
+    """Return the names as a tuple, by default all but "adaptive" and "designed", which have to be named.
 
     Raises
     ------

@@ -57,6 +57,7 @@ def sweep(
     *,
     folder: str | Path,
     faults: bool = False,
+    monitor: bool = False,
     live: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[RunRow]:
@@ -67,12 +68,15 @@ def sweep(
     problems
         The problems; `load_problem("cart_pole:recover")` holds one case alone.
     controllers
-        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc, bilinear-offset and
-        nonlinear-mpc; by default the controllers that each problem names, which are all eight where it names none.
+        Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc, bilinear-offset, nonlinear-mpc,
+        adaptive and designed; by default the controllers that each problem names, where it names none the first eight.
     folder
         Receives <problem>-<case>-<controller>.rrd for each run, and results.parquet; it is made where it is missing.
     faults
         Whether to run each case again under each of `FAULTS`; their logs end in <controller>-<fault>.rrd.
+    monitor
+        Whether MPC of learned models says at each step whether it is like the data; `metrics` counts those that are
+        not, and the logs keep them.
     live
         Whether to stream each run to a Rerun viewer; one is opened where none is up. Without a viewer there is one
         UserWarning, and the runs are recorded all the same.
@@ -111,7 +115,7 @@ def sweep(
     parts: Prepared | None = None
     for problem, task in tasks:
         if parts is None or parts.problem is not problem:
-            parts = Prepared(problem)
+            parts = Prepared(problem, monitored=monitor)
         if progress is not None:
             progress(f"{problem.name}:{' '.join(filter(None, task))}", len(rows), len(tasks))
         rows.append(_row(parts, task, folder, live))

@@ -110,7 +110,7 @@ def _cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iter
         yield f"{figures.violation:.2g}"
     yield duration(figures.solve_time_p50)
     yield duration(figures.solve_time_p99)
-    yield _counts(figures.status)
+    yield _counts(figures.status) + ("" if figures.unknown is None else f"; {figures.unknown} unknown")
 
 
 def _counts(status: Mapping[str, int]) -> str:

@@ -28,10 +28,14 @@ app = typer.Typer(name="koopmpc", no_args_is_help=True, add_completion=False, pr
 _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
 Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
 Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
+Watched = Annotated[
+    bool, typer.Option("--monitor", help="Count the steps at which a learned model is beyond its data.")
+]
 Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
 LogFiles = Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]
 Controllers = Annotated[
-    list[str] | None, typer.Option("--controller", "-c", help="One of the eight; may be repeated. Default: all.")
+    list[str] | None,
+    typer.Option("--controller", "-c", help="One of the ten; may be repeated. Default: those that suit any plant."),
 ]
 
 
@@ -86,6 +90,7 @@ def run(
     problem: Annotated[str, typer.Argument(help=_PROBLEM)],
     controller: Controllers = None,
     faults: Faults = False,
+    monitor: Watched = False,
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
@@ -94,7 +99,7 @@ def run(
 
     with _friendly():
         loaded = load_problem(problem)
-        _sweep([loaded], controller, faults, live, logs, loaded.name)
+        _sweep([loaded], controller, logs, loaded.name, faults=faults, monitor=monitor, live=live)
 
 
 @app.command()
@@ -102,14 +107,16 @@ def bench(
     problems: Annotated[list[str] | None, typer.Argument(help=_PROBLEM + " Default: all shipped problems.")] = None,
     controller: Controllers = None,
     faults: Faults = False,
+    monitor: Watched = False,
     live: Live = False,
     logs: Logs = Path("logs"),
 ) -> None:
-    """Compare the eight controllers on several problems."""
+    """Compare the controllers that each problem names, else the eight that suit any, on several problems."""
     from koopmpc.bench.library import load_problem, shipped
 
     with _friendly():
-        _sweep([load_problem(p) for p in problems or shipped()], controller, faults, live, logs, "bench")
+        chosen = [load_problem(p) for p in problems or shipped()]
+        _sweep(chosen, controller, logs, "bench", faults=faults, monitor=monitor, live=live)
 
 
 @app.command()
@@ -318,7 +325,14 @@ def reproduce(paper: Annotated[str, typer.Argument(help="The paper: snyder.")], 
 
 
 def _sweep(
-    problems: Sequence["Problem"], controllers: list[str] | None, faults: bool, live: bool, logs: Path, what: str
+    problems: Sequence["Problem"],
+    controllers: list[str] | None,
+    logs: Path,
+    what: str,
+    *,
+    faults: bool,
+    monitor: bool,
+    live: bool,
 ) -> None:
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
@@ -329,7 +343,7 @@ def _sweep(
     controller_names(controllers)
     folder = _new_folder(logs, what)
     with _bar("") as progress:
-        rows = sweep(problems, controllers, folder=folder, faults=faults, live=live, progress=progress)
+        rows = sweep(problems, controllers, folder=folder, faults=faults, monitor=monitor, live=live, progress=progress)
     out = _console()
     out.print(results_table(rows))
     out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)

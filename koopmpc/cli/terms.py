@@ -43,6 +43,10 @@ TERMS: dict[str, str] = {
         "What replaces the answer of a failed step, always inside the input limits: the last plan moved on by a "
         "step, else a clipped feedback, else the last input."
     ),
+    "unknown": (
+        "Steps at which a learned model was beyond its data: state and input lay where the data were not, or what came "
+        "was not what the model had predicted. About 2 of 100 steps are so by chance. Asked for by --monitor."
+    ),
     "lost": "Only because of the fault the run did not reach its reference.",
     "–": (
         "No number: without the fault the run does not reach its reference either, or there is no run to compare with."
@@ -57,6 +61,7 @@ TERMS: dict[str, str] = {
         "along its plan once a step."
     ),
     "bilinear-offset": "bilinear-mpc with an estimate of what the model misses, so that no error remains at rest.",
+    "adaptive": "koopman-mpc whose model goes on learning from every step of the run.",
     "designed": "The controller that km.design chooses, by closed loops on models learned from the same data.",
     "nonlinear-mpc": (
         "Predictive control on your equations as they are, solved to the end: slow, and the measure for all."

@@ -11,7 +11,7 @@ from tests.bench.tiny import SOURCE, write
 
 
 def test_the_shipped_problems_are_two_plants_and_their_swing_ups():
-    names = ["cart_pole", "cart_pole_swing", "pendulum", "pendulum_swing"]
+    names = ["cart_pole", "cart_pole_swing", "drifting_arm", "pendulum", "pendulum_swing"]
     assert [path.stem for path in km.bench.shipped()] == names
 
 

@@ -54,3 +54,17 @@ def test_only_the_estimator_leaves_no_offset_where_nobody_was_told_of_the_load(r
 def test_all_eight_controllers_end_as_they_should_on_all_cases(tmp_path):
     swept = km.sweep([km.load_problem(path) for path in km.bench.shipped()], folder=tmp_path)
     assert [row.failure for row in swept if row.failure] == []
+
+
+def test_a_payload_that_grows_leaves_an_error_to_those_who_neither_learn_nor_estimate(tmp_path):
+    problem = replace(km.load_problem("drifting_arm"), scene=lambda x, u: [])
+    rows = {(row.case, row.controller): row for row in km.sweep([problem], folder=tmp_path, monitor=True)}
+    assert {row.failure for row in rows.values()} == {None}
+    assert [name for (case, name), row in rows.items() if case == "drift" and row.reached] == [
+        "offset-free",
+        "adaptive",
+    ]
+    cost = {key: row.metrics.cost for key, row in rows.items()}
+    assert cost["drift", "adaptive"] < cost["drift", "koopman-mpc"]
+    assert cost["steady", "adaptive"] == pytest.approx(cost["steady", "koopman-mpc"], rel=1e-6)
+    assert rows["drift", "koopman-mpc"].metrics.unknown > 10 * rows["steady", "koopman-mpc"].metrics.unknown + 50

@@ -9,6 +9,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.bench.results import failures
+from tests.bench.test_table import printed
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
 
@@ -288,7 +289,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(km.bench.CONTROLLERS) == [*EIGHT, "designed"]
+    assert list(km.bench.CONTROLLERS) == [*EIGHT, "adaptive", "designed"]
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):
@@ -375,3 +376,15 @@ def test_a_run_that_diverged_reaches_nothing_and_warns_of_nothing(swept):
     run = km.load_run(next(row.log for row in swept[1] if row.case == "far"))
     for value in (np.inf, np.nan, 1e200):
         assert not km.bench.reached(replace(run, X=np.full_like(run.X, value)))
+
+
+def test_a_monitor_counts_unknown_steps_of_learned_mpc_in_rows_logs_and_table(tmp_path):
+    problem = km.load_problem(write(tmp_path))
+    problem = replace(problem, cases={"near": problem.cases["near"]})
+    names = ["lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset", "adaptive"]
+    rows = km.sweep([problem], names, folder=tmp_path / "logs", monitor=True)
+    assert [row.failure for row in rows] == [None] * 6
+    assert [row.metrics.unknown is None for row in rows] == [name == "lqr" for name in names]
+    assert (km.load_run(rows[1].log).known >= 0).all()
+    assert "unknown" in printed(km.bench.results_table(rows[1:2]))
+    assert "unknown" not in printed(km.bench.results_table(rows[:1]))

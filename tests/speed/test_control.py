@@ -64,6 +64,20 @@ def test_step_with_nothing_active(benchmark, model):
     report(benchmark, **{"median µs": half, "p99 µs": high})
 
 
+def test_step_with_a_monitor(benchmark):
+    """Plain and watched steps by turns, so that both meet the same machine: the ratio is what a monitor costs."""
+    data = km.collect(pendulum(), km.Uniform([-3.2, -4], [3.2, 4]), km.Noise(-10, 10), episodes=200, steps=40)
+    lifting = km.State() + km.Fourier(2, states="theta") + km.Expressions(products, list("abcde")) + km.Constant()
+    model, cost, limits = km.edmd(data, lifting), km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25)
+    plain, watched = (km.KoopmanMPC(model, cost, limits, 40, monitor=given) for given in (None, data))
+    rng = np.random.default_rng(0)
+    states, reference = 0.05 * rng.normal(size=(4000, 2)), np.zeros(2)
+    times = np.array([[timed(mpc, x, reference)[0] for mpc in (plain, watched)] for x in states])
+    benchmark(watched, states[0], reference)
+    half = np.median(times, axis=0) * 1e6
+    report(benchmark, **{"median µs": half[1], "plain µs": half[0], "ratio": half[1] / half[0]})
+
+
 class Kept:
     """A solver that writes down what it is asked, beside the bare solver of the same QP."""
 

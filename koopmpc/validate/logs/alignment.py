@@ -187,6 +187,7 @@ def _said(log: Log, shift: tuple[Shift, ...]) -> LogFault:
 
 
 _QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of an input, at which an actuator may end
+_BENT = (2, 3, 4, 5)  # powers of an input that a clipped one must beat
 _LEFT = 0.1  # share of the gain of a clipped input that what is clipped may add
 
 
@@ -210,6 +211,10 @@ def ending(log: Log) -> Iterator[LogFault]:
         rest = (column - clipped.U[:, j])[:, None] / log.input_size[j]
         inside = clipped.residuals(log)
         if won(log, inside, clipped.residuals(log, rest)) > _LEFT * won(log, E, inside):
+            continue
+        v = (plain.U[:, [j]] - log.input_center[j]) / log.input_size[j]
+        bent = plain.residuals(log, np.hstack([v**power for power in _BENT]))
+        if won(log, bent, inside) < _SURE / len(bent):  # a smooth curve says as much: no end, but a plant that bends
             continue
         name = short(log.data.inputs[j])
         said = [f"below {low:.3g}"] * bool(low > column.min()) + [f"above {high:.3g}"] * bool(high < column.max())
@@ -256,6 +261,7 @@ def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float
 
 _JUMP = 1.5  # times the largest usual change from row to row
 _OFF = 10.0  # times the largest usual residual
+_ALONE = 0.2  # leverage of a row from which on so few rows are like it that nothing is known of what follows
 
 
 def jumps(log: Log) -> Iterator[LogFault]:
@@ -267,7 +273,7 @@ def jumps(log: Log) -> Iterator[LogFault]:
     places: list[Place] = []
     for e, episode in enumerate(log.data):
         d = np.diff(episode.X, axis=0)
-        off = (np.abs(log.residuals[e]) / usual).max(axis=1)
+        off = np.where(log.leverage[e] < _ALONE, (np.abs(log.residuals[e]) / usual).max(axis=1), 0.0)
         wide = (np.abs(d) > _JUMP * widest) & (widest > 0)
         for k in 1 + np.flatnonzero(((off > _OFF) & wide.any(axis=1))[1:]):
             if not (np.abs(log.residuals[e][k]) * log.size > 0.5 * np.abs(d[k]))[wide[k]].any():

@@ -24,7 +24,10 @@ _SHORTEST = 30  # rows of a segment
 _SHARE = 0.6  # of the segments that agree on a law
 _RESTARTS = 12
 _TRIED = 4  # segments by which an offset is found
-_GAIN = 1.0  # nats a row and state that a change must win
+_GAIN = 0.5  # nats a row and state that a change must win
+_MOST = 0.5  # share of what a segment is off that undoing must win
+_NOTHING, _TURN = 0.05, 0.3  # rad by which the offset of an angle may miss 0, and whole turns: then it is no fault
+_REFINED = 9  # rounds in which an offset is narrowed down, each by a factor of six
 _SURE = 40.0  # nats in all
 _BACK = 0.7  # nats a row and state by which a segment may stay behind the consensus
 _FLOOR = 1e-8  # share of a state's size below which a residual counts as rounding
@@ -68,13 +71,18 @@ class OneStepLaw:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A hypothesis: what the recorder did to a segment, and the errors of the segment once that is undone."""
+    """A hypothesis: what the recorder did to a segment, and the errors of the segment once that is undone.
+
+    These errors may be larger than those of the consensus by `charged` nats, which is what undoing adds by itself. With
+    `chosen` a number was fitted or taken from a table, so that one segment can agree with it by accident: two must.
+    """
 
     kind: str
     columns: tuple[str, ...]
     says: str
     errors: Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]
-    shrinks: float = 0.0  # nats by which undoing makes a state smaller, which its errors are charged
+    charged: float = 0.0
+    chosen: bool = True
 
 
 def midway(log: Log) -> Iterator[LogFault]:
@@ -97,10 +105,12 @@ def midway(log: Log) -> Iterator[LogFault]:
         for s in apart:
             undone = change.errors(law, *pairs[s])
             gain = float((np.clip(errors[s], spread, None) - np.clip(undone, spread, None)).mean())
-            back = undone.max() < spread + _BACK + change.shrinks
+            back = undone.max() < spread + _BACK + change.charged and gain > _MOST * most[s]
             if gain > _GAIN and back and gain * len(pairs[s][1]) > _SURE:
                 won += gain * len(pairs[s][1])
                 which.append(s)
+        if len(which) == 1 and change.chosen:
+            continue
         if which and len(log.data) == 1 and len(agreed.intersection(range(which[0], which[-1]))) > 0.2 * len(which):
             continue  # within an episode a recorder changes once, not to and fro
         if which and (best is None or won > 1.02 * best[0]):
@@ -174,17 +184,17 @@ def _consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, set[
 def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change]:
     data = log.data
     for i, name in enumerate(data.states):
-        yield Change("sensor sign", (name,), f"{short(name)} has the other sign", _scaled_state(i, -1.0))
+        yield Change("sensor sign", (name,), f"{short(name)} has the other sign", _scaled_state(i, -1.0), chosen=False)
     for j, name in enumerate(data.inputs):
-        yield Change("input sign", (name,), f"{short(name)} has the other sign", _scaled_input(j, -1.0))
+        yield Change("input sign", (name,), f"{short(name)} has the other sign", _scaled_input(j, -1.0), chosen=False)
     if data.nu > 1:
-        yield Change("input sign", data.inputs, "every input has the other sign", _scaled_input(slice(None), -1.0))
+        yield Change("input sign", data.inputs, "every input has the other sign", _scaled_input(slice(None), -1.0), chosen=False)
     for i, j in combinations(range(data.nx), 2):
         names = data.states[i], data.states[j]
-        yield Change("swapped sensors", names, f"{short(names[0])} and {short(names[1])} are swapped", _swapped(i, j, True))
+        yield Change("swapped sensors", names, f"{short(names[0])} and {short(names[1])} are swapped", _swapped(i, j, True), chosen=False)
     for i, j in combinations(range(data.nu), 2):
         names = data.inputs[i], data.inputs[j]
-        yield Change("swapped inputs", names, f"{short(names[0])} and {short(names[1])} are swapped", _swapped(i, j, False))
+        yield Change("swapped inputs", names, f"{short(names[0])} and {short(names[1])} are swapped", _swapped(i, j, False), chosen=False)
     for said, factor in _FACTORS.items():
         for up, text in ((factor, f"{said} times as large"), (1 / factor, f"{said} times as small")):
             for i, name in enumerate(data.states):
@@ -194,11 +204,12 @@ def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change
                 yield Change("unit change", (name,), f"{short(name)} is {text}", _scaled_input(j, 1 / up))
     for i, name in enumerate(data.states):
         b = _best_offset(log, law, pairs[:_TRIED], i)
-        if i in log.angles and abs(b - 2 * np.pi * round(b / (2 * np.pi))) < 0.05:  # nothing, or whole turns of an angle
+        turns = round(b / (2 * np.pi))
+        if i in log.angles and abs(b - 2 * np.pi * turns) < (_TURN if turns else _NOTHING):
             continue
         yield Change("offset change", (name,), f"{short(name)} is {b:+.3g} off", _moved(i, -b))
-    for r in (2, 3, 4):
-        yield Change("mixed sampling", (), f"rows are {r} times as far apart ({r * data.dt:.3g} s)", _slower(r))
+    for r in (2, 3, 4):  # in r steps a push has moved a speed r times as far, and a position r² times
+        yield Change("mixed sampling", (), f"rows are {r} times as far apart ({r * data.dt:.3g} s)", _slower(r), 2 * float(np.log(r)))
         yield Change("mixed sampling", (), f"rows are {r} times as close ({data.dt / r:.3g} s)", _faster(r))
 
 
@@ -269,7 +280,7 @@ def _best_offset(log: Log, law: OneStepLaw, pairs: list[Pair], i: int) -> float:
 
     width = 4.0 * float(log.size[i])
     low, high = -width, width
-    for _ in range(5):
+    for _ in range(_REFINED):
         tries = np.linspace(low, high, 13)
         best = int(np.argmin([total(float(b)) for b in tries]))
         step = float(tries[1] - tries[0])

@@ -151,6 +151,13 @@ class Log:
         ends = np.cumsum([len(e) for e in self.data])[:-1]
         return tuple(np.split(E, ends))
 
+    @cached_property
+    def leverage(self) -> tuple[Float[np.ndarray, " T"], ...]:
+        """pᵀ(PᵀP)⁻¹p of each row p of the regressors: how much of the fit there rests on that row alone, 0 to 1."""
+        P = np.concatenate([self.stacked(e.X[:-1], e.U) for e in self.data])
+        found = np.einsum("kp,pk->k", P, solved(P.T @ P, P.T))
+        return tuple(np.split(found, np.cumsum([len(e) for e in self.data])[:-1]))
+
     def stacked(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> Float[np.ndarray, "M p"]:
         """Return the regressors of the states, the inputs, and the products of states and inputs."""
         Z, V = self.scaled(X, U)
