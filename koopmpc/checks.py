@@ -96,11 +96,15 @@ def weight(value: ArrayLike, name: str, size: int | None = None, *, definite: bo
     if float(np.abs(result - result.T).max(initial=0.0)) > 1e-9 * max(scale, 1e-300):
         raise DefinitenessError(f"{name} is not symmetric; pass (M + Mᵀ)/2")
     result = 0.5 * (result + result.T)
-    smallest = float(np.linalg.eigvalsh(result).min(initial=np.inf))
-    if smallest < -1e-9 * scale:
-        raise DefinitenessError(f"{name} is indefinite: its least eigenvalue is {smallest:.3g}; weights must be ⪰ 0")
-    if definite and smallest <= 0:
-        raise DefinitenessError(f"{name} is not positive definite: its least eigenvalue is {smallest:.3g}; raise it")
+    diagonal = np.abs(result.diagonal())
+    unit = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    alike = result / np.outer(unit, unit)  # on a diagonal of ones rounding is the same in all units
+    smallest = float(np.linalg.eigvalsh(alike).min(initial=np.inf))
+    if smallest < -1e-9 * float(np.abs(alike).max(initial=0.0)) or (definite and smallest <= 0):
+        least = float(np.linalg.eigvalsh(result).min())
+        if definite and smallest >= -1e-9:
+            raise DefinitenessError(f"{name} is not positive definite: its least eigenvalue is {least:.3g}; raise it")
+        raise DefinitenessError(f"{name} is indefinite: its least eigenvalue is {least:.3g}; weights must be ⪰ 0")
     return result
 
 

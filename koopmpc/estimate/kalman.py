@@ -161,16 +161,17 @@ class LiftedKalman(Value):
             Bd, Cd = np.hstack([predictor.B, np.zeros((nz, ny - nu))]), np.eye(ny, ny)
             Cd[:nu] = 0.0
         model = Augmented(predictor, kept, H, Bd, Cd)
-        size, y_size = _sizes(predictor, kept, H, Cd)
+        unit, y_unit = _sizes(predictor, kept, H, Cd)
+        size, y_size = (unit, y_unit) if predictor.scale is not None else _balanced(model.F, model.M, len(kept))
         F, M = model.F * size / size[:, None], model.M * size / y_size[:, None]
         lost = hidden(F, M)
         if lost is not None:
             raise DataError(self._words(predictor, model, lost))
         n, units = len(kept), np.outer(size, size)
         process = (
-            PROCESS * np.diag(size[:n] ** 2) if self.process is None else checks.weight(self.process, "process", n)
+            PROCESS * np.diag(unit[:n] ** 2) if self.process is None else checks.weight(self.process, "process", n)
         )
-        R = np.diag(_noise(predictor, H, y_size)) if self.noise is None else checks.weight(self.noise, "noise", ny)
+        R = np.diag(_noise(predictor, H, y_unit)) if self.noise is None else checks.weight(self.noise, "noise", ny)
         process, R_scaled = process / units[:n, :n], R / np.outer(y_size, y_size)
         if self.drift is None:
             drift = np.diag(_settling(F, M, process, R_scaled, settling))
@@ -224,6 +225,18 @@ def _sizes(
     for i in np.flatnonzero(~Cd.any(axis=0)):
         moved = float(np.linalg.norm(predictor.B[kept, i] / z))
         d[i] = 1.0 / moved if moved > 0 else 1.0
+    return np.concatenate([z, d]), y
+
+
+def _balanced(
+    F: Float[np.ndarray, "n n"], M: Float[np.ndarray, "ny n"], nz: int
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " ny"]]:
+    """Return units of [z; d] and of y in which a given model's rows and columns are alike, so that ranks are clear."""
+    z = np.asarray(scipy.linalg.matrix_balance(F[:nz, :nz], permute=False, separate=True)[1][0])
+    y = np.linalg.norm(M[:, :nz] * z, axis=1)
+    pushed = np.linalg.norm(F[:nz, nz:] / z[:, None], axis=0)  # an offset of y pushes no z, and has the unit of y
+    offset = np.where(np.abs(M[:, nz:]) > 0, y[:, None], 0.0).max(axis=0)
+    d = np.where(pushed > 0, 1.0 / np.where(pushed > 0, pushed, 1.0), np.where(offset > 0, offset, 1.0))
     return np.concatenate([z, d]), y
 
 

@@ -51,7 +51,8 @@ class NonlinearMPC(StagedMPC):
         Solve the first step, and one after a failure, from this many guesses, rest at x_0 and random inputs, and
         keep the best: several where this controller is the oracle, so that a local optimum is not the reference.
     settings
-        The solver's own settings by CasADi's names, for example ``{"ipopt.tol": 1e-10}``.
+        The solver's own settings by CasADi's names, for example ``{"ipopt.tol": 1e-10}``. It works on shares of the
+        sizes of inputs, states, limits and cost (see `Sizes`): its tolerances count so.
     estimator, latency, moves
         As for BilinearMPC.
     time_limit

@@ -168,8 +168,8 @@ class StagedProblem(NamedTuple):
         Whether a stage has an input; else v is zero there.
     held_from
         The stage whose input each stage takes.
-    sizes, input_sizes
-        What the entries of s and v are measured by, see `Sizes`.
+    sizes, input_sizes, scale
+        What the entries of s and v, and the cost, are measured by, see `Sizes`.
     """
 
     F: ca.Function
@@ -188,6 +188,7 @@ class StagedProblem(NamedTuple):
     sizes: Float[np.ndarray, " ns"]
     input_sizes: Float[np.ndarray, " nu"]
     margin: Float[np.ndarray, "N nm"]
+    scale: float
 
 
 class StageTargets(NamedTuple):
@@ -228,6 +229,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
             x_sizes,
             u_sizes,
             ahead(o.margin, N),
+            o.sizes.scale,
         )
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates
@@ -260,6 +262,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         np.concatenate([x_sizes, u_sizes, u_sizes[soft]]),
         u_sizes,
         ahead(o.margin, N),
+        o.sizes.scale,
     )
 
 

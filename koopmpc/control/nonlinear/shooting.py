@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Interval
+from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.errors import DataError
@@ -46,7 +46,7 @@ _STATUS = {
 
 
 class Start(NamedTuple):
-    """Where a solver begins: the variables, and the multipliers of their bounds and of the constraints."""
+    """Where a solver begins: its variables, and the multipliers of their bounds and of its constraints."""
 
     v: Float[np.ndarray, " n"]
     bounds: Float[np.ndarray, " n"]
@@ -68,7 +68,8 @@ class NLPSolution(NamedTuple):
 class Shooting:
     """The nonlinear program of a horizon: variables (u_k, x_{k+1}, ε_{k+1}) stage by stage, ε ≥ 0 the slacks.
 
-    The constraints are x_{k+1} = F(x_k, u_k) + e_k and the limits.
+    The constraints are x_{k+1} = F(x_k, u_k) + e_k and the limits. The solver works on shares: of the sizes of inputs,
+    states and limits, and of the scale of the cost, so that its tolerances mean the same in all units.
 
     Parameters
     ----------
@@ -103,14 +104,17 @@ class Shooting:
         linear, quadratic, allowance = p.softness
         soft = np.flatnonzero(np.isfinite(linear))
         ns = len(soft)
-        self.allowance = allowance[soft]
+        self.allowance, row = allowance[soft], allowance / SOFTENED
+        self._sizes = np.concatenate([p.input_sizes, p.sizes, row[soft]])
         W = ca.MX.sym("W", nu + nx + ns, N)
-        U, X, E = W[:nu, :], W[nu : nu + nx, :], W[nu + nx :, :]
+        whole = ca.DM(self._sizes) * W
+        U, X, E = whole[:nu, :], whole[nu : nu + nx, :], whole[nu + nx :, :]
         x0, r, u_r, e = (ca.MX.sym("p", *size) for size in ((nx, 1), (nr, N), (nu, N), (moved, N)))
         M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
 
         # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N, the order in which fatrop finds the stages, with its sign
-        gaps = X - F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) - ca.vertcat(e, ca.MX(nx - moved, N))
+        ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) + ca.vertcat(e, ca.MX(nx - moved, N))
+        gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
         end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
         f = _weighted(U - u_r, p.R) + ca.sumsqr(end)
         if N > 1:
@@ -121,8 +125,8 @@ class Shooting:
             relaxed = ca.DM(np.eye(ng)[:, soft]) @ E if ns else ca.MX(ng, N)
             if ns:
                 f += ca.sum2(ca.DM(linear[soft]).T @ E + ca.DM(quadratic[soft]).T @ E**2)
-            path = ca.vertcat(values - relaxed, values + relaxed)
-            low, high = np.concatenate([-infinite, p.box.low]), np.concatenate([p.box.high, infinite])
+            path = ca.vertcat(values - relaxed, values + relaxed) / ca.DM(np.tile(row, 2))
+            low, high = np.concatenate([-infinite, p.box.low / row]), np.concatenate([p.box.high / row, infinite])
         npath = path.shape[0]
         g = [
             gaps[:, k] if part == 0 else path[:, k - part]
@@ -143,16 +147,17 @@ class Shooting:
         lbg, ubg = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
         lbg[path_at], ubg[path_at] = low, high
         if ng:  # [values − ε ≤ high; values + ε ≥ low], the last outputs of each moved inwards
-            last = path_at[:, ng - p.margin.shape[1] : ng]
-            ubg[last] -= p.margin
-            lbg[last + ng] += p.margin
+            last, share = path_at[:, ng - p.margin.shape[1] : ng], p.margin / row[ng - p.margin.shape[1] :]
+            ubg[last] -= share
+            lbg[last + ng] += share
         unlimited = np.full(nx, np.inf)
         lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
         ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
         lbx[~p.free, :nu] = ubx[~p.free, :nu] = 0.0
+        lbx, ubx = lbx / self._sizes, ubx / self._sizes
         self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
         parameters = ca.veccat(x0, r, u_r, e, M, L, m)
-        nlp = {"x": ca.vec(W), "p": parameters, "f": f, "g": ca.vertcat(*g)}
+        nlp = {"x": ca.vec(W), "p": parameters, "f": f / p.scale, "g": ca.vertcat(*g)}
         given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         if solver == "fatrop":
             given |= {
@@ -170,13 +175,14 @@ class Shooting:
                 f"{solver} was not built with settings {dict(settings)}: {reason}; pass its own settings by CasADi's "
                 'names, for example {"ipopt.tol": 1e-8}'
             ) from error
+        self._scale = p.scale
         self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
 
     def at(self, X: Float[np.ndarray, "N nx"], U: Float[np.ndarray, "N nu"]) -> Start:
         """Return a start with these states x_1 … x_N and inputs."""
         W = np.zeros(self._shape)
         W[:, : self._split[0]], W[:, self._split[0] : self._split[1]] = U, X
-        return Start(W.ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
+        return Start((W / self._sizes).ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
 
     def solve(
         self,
@@ -188,7 +194,8 @@ class Shooting:
     ) -> NLPSolution:
         """Solve from `start` with u_0 inside `first`."""
         nu, t = self._split[0], targets
-        self._bounds["lbx"][:nu], self._bounds["ubx"][:nu] = first
+        for end, value in zip(("lbx", "ubx"), first, strict=True):
+            self._bounds[end][:nu] = value / self._sizes[:nu]
         p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
         with listening():
@@ -199,9 +206,11 @@ class Shooting:
         status = _STATUS.get(str(stats["return_status"]), _STATUS.get(unified, Status.FAILED))
         if not np.isfinite(v).all():
             status = Status.FAILED
-        U, X, slacks = np.split(v.reshape(self._shape), self._split, axis=1)
+        U, X, slacks = np.split(v.reshape(self._shape) * self._sizes, self._split, axis=1)
         after = Start(v[self._next_v], bounds[self._next_v], constraints[self._next_g])
-        return NLPSolution(U, X, slacks, float(found["f"]), status, int(stats.get("iter_count", 0)), after)
+        return NLPSolution(
+            U, X, slacks, self._scale * float(found["f"]), status, int(stats.get("iter_count", 0)), after
+        )
 
 
 def _weighted(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:
