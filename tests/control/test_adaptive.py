@@ -135,3 +135,11 @@ def test_the_drift_bench(seed, noise):
 def test_the_controller_that_is_told_is_better_than_one_that_is_not():
     m = payloads(0.5)
     assert km.metrics(run(Told(m), m)).cost < km.metrics(run(controllers(m)["fixed"], m)).cost
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_forecast_that_turns_nan_is_the_worst_of_all(model, train, monkeypatch, value):
+    """NaN is smaller than nothing: such a model would neither be refused nor left."""
+    one = adaptive(model, train)
+    monkeypatch.setattr(one, "_errors", lambda model, pairs: np.full((3, 2), value))
+    assert one._error(model, []) == np.inf

@@ -194,3 +194,27 @@ def test_several_starts_leave_a_local_optimum() -> None:
     several(hanging, [0, 1, 0])
     highest = [np.cos(mpc.plan().X[:, 0]).max() for mpc in (one, several)]
     assert highest[1] > highest[0] + 0.1
+
+
+class Tank(km.Dynamics):
+    """ḣ = u − √h: below an empty tank there is no forecast."""
+
+    states, inputs = ("h [m]",), ("inflow [m/s]",)
+
+    def rhs(self, x, u):
+        return ca.vertcat(u[0] - ca.sqrt(x[0]))
+
+
+@pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
+def test_a_forecast_that_turns_nan_is_no_plan(kind):
+    plant = km.discretize(Tank(), 0.2, km.Euler())
+    mpc = kind(plant, km.Cost(Q=[10.0], R=0.01, u_target=[0.0]), km.Limits(u_min=0, u_max=1), 10)
+    for x in (1.0, 0.05, 0.01, 1e-4, 1e-9, 0.5):
+        move = mpc([x], [0.0])
+        assert 0 <= move.u[0] <= 1
+        plan = mpc.plan()
+        if move.fallback is km.control.Fallback.NONE:
+            assert np.isfinite(plan.X).all()
+            assert np.isfinite(plan.U).all()
+            assert np.abs(plan.X[1:, 0] - plan.X[:-1, 0] - 0.2 * (plan.U[:, 0] - np.sqrt(plan.X[:-1, 0]))).max() < 0.05
+    assert move.fallback is km.control.Fallback.NONE  # a level from which there is a forecast again

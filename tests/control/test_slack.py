@@ -12,11 +12,11 @@ COST = km.Cost(Q=[10.0, 1.0], R=0.1, Q_N=np.diag([10.0, 1.0]))
 LIMITS = km.Limits(-1, 1, x_min=[-np.inf, -0.3], x_max=[np.inf, 0.3], slack=(20.0, 5.0))
 
 
-def by_hand(x: np.ndarray) -> float:
+def by_hand(x: np.ndarray, price: float = 20.0) -> float:
     """Return the largest slack of the optimal plan."""
     X, U, slack = cp.Variable((N + 1, 2)), cp.Variable((N, 1)), cp.Variable(N, nonneg=True)
     cost = sum(cp.sum_squares(np.diag([10**0.5, 1.0]) @ X[k]) for k in range(1, N + 1))
-    cost += 0.1 * cp.sum_squares(U) + 20 * cp.sum(slack) + 5 * cp.sum_squares(slack)
+    cost += 0.1 * cp.sum_squares(U) + price * cp.sum(slack) + 5 * cp.sum_squares(slack)
     held = [X[0] == x, X[1:] == X[:-1] @ A.T + U @ B.T, cp.abs(U) <= 1, cp.abs(X[1:, 1]) <= 0.3 + slack]
     cp.Problem(cp.Minimize(cost), held).solve(solver="CLARABEL")
     return float(np.max(slack.value))
@@ -65,3 +65,21 @@ def test_a_run_keeps_it() -> None:
     gave = np.array([status is km.Status.SOFTENED for status in run.status])
     assert gave.any()
     assert ((run.slack > 0) == gave).all()
+
+
+@pytest.mark.parametrize("solver", ["osqp", "daqp"])
+@pytest.mark.parametrize(
+    ("x", "price"), [([0.0, 1.0], 20.0), ([1.0, -0.9], 20.0), ([0.6, 0.0], 0.2), ([-0.6, 0.0], 0.2)]
+)
+def test_what_gives_way_below_gives_way_above_in_the_mirror(x: list[float], price: float, solver: str) -> None:
+    """A limit that could be kept gives way where that costs more than the slack, the lower one like the upper one."""
+    limits = km.Limits(-1, 1, x_min=[-np.inf, -0.3], x_max=[np.inf, 0.3], slack=(price, 5.0))
+    mpc, moves = km.KoopmanMPC(MODEL, COST, limits, N, solver=solver), []
+    for sign in (1, -1):
+        mpc.reset()
+        moves.append(mpc([sign * value for value in x], [0.0, 0.0]))
+    up, down = moves
+    assert up.status is down.status is km.Status.SOFTENED
+    assert abs(up.slack - down.slack) < 1e-6
+    assert abs(up.slack - by_hand(np.array(x), price)) < 1e-4
+    np.testing.assert_allclose(up.u, -down.u, atol=1e-6)

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*text, and no part:koopmpc.errors.FitWarning")
-
 
 def text(file: Path, content: str, encoding: str = "utf-8") -> Path:
     file.write_bytes(content.encode(encoding))
@@ -23,7 +21,8 @@ def test_a_log_that_says_nothing_is_understood(tmp_path: Path) -> None:
         tmp_path / "log.csv",
         "time [s],theta [rad],omega,force [N],note\n0,1,2,5,a\n0.1,3,4,6,b\n0.2,5,6,,c\n",
     )
-    read = km.load_episodes(file)
+    with pytest.warns(km.FitWarning, match="'note' holds text, and no part of it is a state or an input"):
+        read = km.load_episodes(file)
     assert (read.dt, read.states, read.inputs) == (0.1, ("theta [rad]", "omega"), ("force [N]",))
     assert read[0].X.tolist() == [[1, 2], [3, 4], [5, 6]]
     assert read[0].U.tolist() == [[5], [6]]
@@ -170,7 +169,9 @@ def test_complex_cells_are_not_left_out_in_silence(tmp_path: Path) -> None:
 
 
 def test_a_column_of_labels_is_no_state(tmp_path: Path) -> None:
-    assert km.load_episodes(table(tmp_path, ["walk", "walk", "2nd", "3", "run"])).states == ("v",)
+    file = table(tmp_path, ["walk", "walk", "2nd", "3", "run"])
+    with pytest.warns(km.FitWarning, match="'x' holds text, and no part of it is a state or an input"):
+        assert km.load_episodes(file).states == ("v",)
 
 
 def test_truth_values_with_one_missing_cut_an_episode(tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ from koopmpc.data.source import Changed, source_of
 from tests.bare import shown
 from tests.example_plants import random_episodes
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*holds the same bytes:koopmpc.errors.FitWarning")
-
 
 def sets(count: int = 4) -> list[km.Episodes]:
     return [random_episodes(seed, [30, 5], 2, 1) for seed in range(count)]
@@ -126,6 +124,7 @@ def test_an_empty_file_is_named(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/1\{suffix}"):
         read(source)
     (tmp_path / f"0{suffix}").write_bytes(b"")
+    (tmp_path / f"1{suffix}").unlink()
     with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/0\{suffix}"):
         km.Files(tmp_path)
 

@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 import koopmpc as km
 from tests.data.test_storage import random_episodes
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*text, and no part:koopmpc.errors.FitWarning")
-
 TOLD = {"dt": 0.1, "states": ["x"], "inputs": ["u"]}
 
 
@@ -122,3 +120,18 @@ def test_a_cut_table_is_refused(tmp_path: Path) -> None:
             km.errors.LogError, match=r"own\.parquet holds no episodes that can be read: it is no \.parquet"
         ):
             km.load_episodes(file, **TOLD)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1, 0.3, 1e3, 1.7e6])
+@pytest.mark.parametrize("dt", [0.1, 0.01, 1 / 3])
+def test_a_log_on_the_grid_that_is_asked_for_is_resampled_to_itself(tmp_path: Path, start: float, dt: float) -> None:
+    """Times are those of floating-point numbers: a little before or behind the grid is on it."""
+    rows, rng = 200, np.random.default_rng(0)
+    X, U = rng.standard_normal(rows), rng.standard_normal(rows)
+    for time in (start + dt * np.arange(rows), start + np.cumsum(np.full(rows, dt))):
+        lines = [f"{float(t)!r},{float(x)!r},{float(u)!r}" for t, x, u in zip(time, X, U, strict=True)]
+        (tmp_path / "log.csv").write_text("\n".join(["time [s],x,u", *lines]) + "\n")
+        (episode,) = km.load_episodes(tmp_path / "log.csv", resample=dt)
+        assert episode.X.shape == (rows, 1)
+        np.testing.assert_allclose(episode.X[:, 0], X, atol=1e-6)
+        np.testing.assert_array_equal(episode.U[:, 0], U[:-1])

@@ -324,3 +324,26 @@ def test_a_disturbance_that_cannot_be_seen_is_told_in_any_units():
         data = km.Episodes([km.Episode(X=X * [size, 1.0], U=U)], 0.1, ("x0 [m]", "x1 [m]"), ("u0 [N]",))
         with pytest.raises(km.errors.DataError, match=r"not detectable from x0: .*an offset of output 'x0'"):
             km.LiftedKalman("x0", "output").start(km.dmdc(data), 20)
+
+
+@pytest.mark.parametrize("lost", [[0], [1], [2], [0, 2]])
+def test_the_gain_of_what_has_come_is_that_of_its_own_noise(lost):
+    """Whatever is missing, one step is the textbook's with the rows and the noise of the others."""
+    rng = np.random.default_rng(0)
+    model = linear(*stable(rng, 3, 1))
+    noise = np.diag([1e-4, 1e-2, 1.0])
+    observer = km.LiftedKalman(model.states, noise=noise).start(model, 20)
+    rest = km.LiftedKalman(model.states, noise=noise).start(model, 20)
+    for each in (observer, rest):
+        each.reset(np.zeros(3))
+        for _ in range(3):
+            each.observe(np.zeros(3), np.zeros(1), NO_W)
+    y = rng.normal(size=3)
+    y[lost] = np.nan
+    s = rest._next(rest._s, np.zeros(1))
+    came = np.isfinite(y)
+    M, R = rest._system.M[came], rest._R[np.ix_(came, came)]
+    K = rest._P @ M.T @ np.linalg.inv(M @ rest._P @ M.T + R)
+    s = s + K @ (y[came] - M @ s - rest._system.h[came])
+    observer.observe(y, np.zeros(1), NO_W)
+    np.testing.assert_allclose(observer.z, rest._system.to_z @ s + rest._system.one, atol=1e-9)

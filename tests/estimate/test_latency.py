@@ -10,6 +10,7 @@ from tests.control.models import PRECISE, Told, random_pair
 from tests.estimate.plants import linear
 
 LATE = [km.faults.ActuatorDelay(1)]
+INTEGRATOR = linear(np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]]))
 
 
 def pair(rng, nx, nu, limits):
@@ -81,3 +82,18 @@ def test_offset_free_with_latency():
         mpc = km.KoopmanMPC(model, km.Cost([1, 0], 0.1), km.Limits(-5, 5), 15, latency=1, estimator=estimator)
         run = km.simulate(true, mpc, x0=[0, 0], reference=[0.7, 0], steps=150, limits=km.Limits(-5, 5), faults=LATE)
         assert abs(run.X[-1, 0] - 0.7) < 1e-6
+
+
+def test_with_latency_changes_count_from_the_input_that_was_computed_last():
+    """What acts meanwhile is an older one: to be told of it changes nothing."""
+    limits = km.Limits(-1, 1, du_max=0.2)
+    told, untold = (km.KoopmanMPC(INTEGRATOR, km.Cost([1.0, 0.1], 0.1), limits, 10, latency=1) for _ in range(2))
+    x, acting, before, changes = np.array([3.0, 0.0]), np.zeros(1), np.zeros(1), []
+    for _ in range(12):
+        move = told(x, [0.0, 0.0], applied=acting)
+        assert np.array_equal(move.u, untold(x, [0.0, 0.0]).u)
+        assert move.status is km.Status.OPTIMAL
+        changes.append(float(move.u[0] - before[0]))
+        x, acting, before = INTEGRATOR.A @ x + INTEGRATOR.B @ acting, before, move.u
+    assert np.abs(changes).max() < 0.2 + 1e-6
+    assert changes[0] == pytest.approx(-0.2, abs=1e-4)  # the rates are active

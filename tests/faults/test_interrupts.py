@@ -71,7 +71,10 @@ BUSY = {
 }
 
 
-def _until(end, busy):
+def _interrupted(busy, after):
+    """Be busy until a Ctrl-C comes, which is sent after some seconds."""
+    timer, end = threading.Timer(after, _interrupt), time.monotonic() + SECONDS
+    timer.start()
     while time.monotonic() < end:
         busy()
 
@@ -87,12 +90,8 @@ def _interrupt():
 def test_an_interrupt_is_never_swallowed_in_python(tmp_path: Path, name: str, count: int) -> None:
     busy, rng = BUSY[name](tmp_path), random.Random(name)
     for _ in range(count):
-        timer = threading.Timer(rng.uniform(0.01, 0.2), _interrupt)
-        end = time.monotonic() + SECONDS
-        timer.start()
         with pytest.raises(KeyboardInterrupt):
-            _until(end, busy)
-        timer.join()
+            _interrupted(busy, rng.uniform(0.01, 0.2))
     assert not list(tmp_path.glob(".*.part"))
 
 

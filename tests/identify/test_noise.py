@@ -170,3 +170,11 @@ def test_what_has_no_sound_form_is_refused() -> None:
         km.dmd(turned, method="fb")
     code = 'data = km.Episodes([km.Episode(X=np.eye(4))], 0.1)\nshow(lambda: km.dmd(data, method="odr"))'
     assert shown(code) == ["DataError method is 'odr'; pass one of 'ls', 'tls', 'fb'"]
+
+
+@pytest.mark.parametrize("angle", [0.3, 0.8, 1.2, 1.5, 1.7, 2.5, 3.1])
+def test_without_noise_a_fast_rotation_keeps_its_frequency(angle: float) -> None:
+    """The square root of A² has two signs; beyond 45° the principal one of a real part is no longer A's."""
+    A = np.block([[turning(0.9, angle), np.zeros((2, 1))], [np.zeros((1, 2)), -0.7]])
+    model = km.dmd(measured(A, 0, 0.0, steps=15), method="fb")
+    assert np.allclose(model.A, A, atol=1e-8)

@@ -70,10 +70,14 @@ class Ramp:
 
 
 @pytest.fixture(scope="module")
-def controllers():
+def model():
     upright = km.Feedback([[5.0, 3.0]], km.Noise(-2.0, 2.0))
     data = km.collect(PLANT, km.Uniform([-1.0, -1.0], [1.0, 1.0]), upright, episodes=40, steps=20)
-    model = km.edmd(data, km.State() + km.Fourier(1, states="theta") + km.Constant())
+    return km.edmd(data, km.State() + km.Fourier(1, states="theta") + km.Constant())
+
+
+@pytest.fixture(scope="module")
+def controllers(model):
     origin = ([0.0, 0.0], [0.0])
     built = {
         "lqr": km.LQR(model.local(PLANT, *origin), COST, LIMITS),
@@ -389,3 +393,22 @@ show(lambda: run([km.faults.SensorDelay]))
         "DataError faults holds <class 'koopmpc.loop.faults.SensorDelay'>; pass objects, for example "
         "faults=[km.faults.NaNSensor()]",
     ]
+
+
+@pytest.mark.parametrize("name", ["koopman-mpc", "nonlinear-mpc"])
+def test_what_a_shifted_plan_of_blocked_moves_applies_is_the_plan_of_the_last_good_step(model, name):
+    """A move of several steps is applied as often as it is planned."""
+    build = {
+        "koopman-mpc": lambda: km.KoopmanMPC(model, COST, LIMITS, 8, moves=(1, 2, 5)),
+        "nonlinear-mpc": lambda: km.NonlinearMPC(PLANT, COST, LIMITS, 8, moves=(1, 2, 5)),
+    }
+    run = closed_loop(build[name](), (km.faults.SolverFailure(1.0, begin=1, end=4),), steps=4, plans=True)
+    planned = run.plans.U[0, :4]
+    assert planned[2] < planned[3]  # the second move, and the third
+    assert run.fallback[1:] == (km.control.Fallback.SHIFTED_PLAN,) * 3
+    assert np.array_equal(run.U, planned)
+
+
+def test_the_first_sample_always_arrives():
+    run = ramp((km.faults.DroppedSamples(1.0),))
+    assert np.array_equal(run.Y, np.tile(run.X[0], (9, 1)))

@@ -226,3 +226,8 @@ def test_the_steps_of_each_solver_are_counted():
         assert found.solver.get("daqp", 0) == run.solver.count("daqp")
         assert asked == "osqp" or set(found.solver) == {"daqp"}
         assert f"{run.solver.count(asked)} {asked}" in str(found)
+
+
+def test_a_step_that_takes_exactly_the_sampling_time_is_not_late():
+    run = replace(random_run(np.random.default_rng(0), T=4, dt=0.1), solve_time=np.array([0.1, 0.05, 0.1, 0.2]))
+    assert km.metrics(run).late == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 
 import koopmpc as km
 from tests.example_plants import one_step_pairs, random_predictor
@@ -161,3 +161,18 @@ def test_an_eigenfunction_that_is_zero_on_the_data_has_no_relative_error() -> No
     data = km.Episodes([km.Episode(X=[[1, 0], [0.9, 0]])], 0.1, ("a", "b"))
     with pytest.raises(km.errors.DataError, match="eigenfunction 1 is 0 in all snapshots"):
         km.spectrum.linearity_error(model, data)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_eigenvalues_come_by_magnitude_and_of_a_pair_the_negative_frequency_first(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    angles, sizes = rng.uniform(0.2, 2.9, 3), rng.uniform(0.2, 0.6, 3)
+    blocks = [
+        r * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for r, a in zip(sizes, angles, strict=True)
+    ]
+    A, T = block_diag(*blocks, [[0.9]]), rng.standard_normal((7, 7))
+    names = tuple(f"x{i}" for i in range(7))
+    model = km.LinearPredictor(T @ A @ np.linalg.inv(T), np.zeros((7, 0)), np.eye(7), km.State(), 0.1, names, ())
+    pairs = [r * np.exp(s * 1j * a) for r, a in sorted(zip(sizes, angles, strict=True), reverse=True) for s in (-1, 1)]
+    np.testing.assert_allclose(model.eigenvalues, [0.9, *pairs], atol=1e-9)
+    np.testing.assert_allclose(model.A @ model.modes, model.modes * model.eigenvalues, atol=1e-9)

@@ -1,0 +1,210 @@
+"""Mutation testing, run by `make mutants`: small changes of the library, of which the tests must notice each.
+
+A seed draws changes from the rooms that must not be wrong: comparisons swapped, + for −, other constants, statements
+and checks left out, conditions turned round, None returned. Each is made in a copy of the library, and the tests that
+run the changed line are run until one fails. Which tests run which line, and how long each takes, is measured once.
+A change that no test notices survives, and is printed. Those that change nothing that could be noticed stand, with the
+reason, in tests/mutation/equivalent.txt.
+"""
+
+import argparse
+import compileall
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from py_compile import PycInvalidationMode
+from queue import SimpleQueue
+
+from coverage import CoverageData
+
+from tests.mutation.changes import Mutant, mutants
+
+HOME = Path(__file__).parents[2]
+ROOMS = ("control", "identify", "estimate", "loop", "data", "predict")
+MORE = ("tests/faults",)  # tests of several rooms
+COPIED = ("koopmpc", "problems", "tests", "docs", "pyproject.toml", "README.md", "CHANGELOG.md", "Makefile")
+ENOUGH = 20.0  # seconds of processor time of tests that a change has to outlive
+PYTEST = (sys.executable, "-m", "pytest", "-q", "--benchmark-disable", "-p", "no:cacheprovider")
+
+
+def copied(folder: Path) -> Path:
+    """Copy what the tests need into the folder, and return it."""
+    for name in COPIED:
+        if (HOME / name).is_dir():
+            shutil.copytree(HOME / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.rrd"))
+        else:
+            shutil.copy(HOME / name, folder / name)
+    for name in ("koopmpc", "tests"):  # by content: a changed file is never taken for the one that was compiled
+        compileall.compile_dir(folder / name, quiet=1, invalidation_mode=PycInvalidationMode.CHECKED_HASH)
+    return folder
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "KOOPMPC_TESTS": ""}
+
+
+Map = dict[str, dict[int, list[str]]]
+
+
+def measured(folder: Path, workers: int) -> tuple[Map, dict[str, float]]:
+    """Run the tests of the rooms; return which of them run each line of each file, and the seconds of each.
+
+    Raises
+    ------
+    SystemExit
+        A test fails before anything is changed.
+    """
+    where = [f"tests/{room}" for room in ROOMS] + list(MORE)
+    done = subprocess.run(
+        [*PYTEST, "-n", str(workers), "--dist", "loadfile", "-p", "tests.mutation.seconds", *where]
+        + [f"--cov=koopmpc/{room}" for room in ROOMS]
+        + ["--cov-context=test", "--cov-report=", "--cov-fail-under=0"],
+        cwd=folder,
+        env=environment(folder),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    if done.returncode:
+        raise SystemExit(f"the tests fail without any change:\n{done.stdout[-3000:]}")
+    data, found = CoverageData(str(folder / ".coverage")), {}
+    data.read()
+    for file in data.measured_files():
+        lines = data.contexts_by_lineno(file)
+        name = str(Path(file).relative_to(folder))
+        found[name] = {n: sorted({c.rsplit("|", 1)[0] for c in held if c}) for n, held in lines.items()}
+    return found, json.loads((folder / "seconds.json").read_text())
+
+
+def tests_of(mutant: Mutant, covering: Map, seconds: dict[str, float]) -> list[str]:
+    """Return the tests that run this line, as many as take ENOUGH; the room's own and short files of tests first."""
+    lines = covering.get(mutant.file, {})
+    some = {test for n in range(mutant.first, mutant.last + 1) for test in lines.get(n, ())}
+    if not some and any(n in lines for n in range(mutant.first, mutant.last + 1)):  # it runs when it is imported
+        some = {test for tests in lines.values() for test in tests}
+    own = f"tests/{mutant.file.split('/')[1]}/"
+    files: dict[str, list[str]] = {}
+    for test in sorted(some, key=lambda test: seconds.get(test, 0.0)):
+        files.setdefault(test.split("::")[0], []).append(test)
+    total = {file: sum(seconds.get(test, 0.0) for test in tests) for file, tests in files.items()}
+    chosen, spent = [], 0.0
+    for file in sorted(files, key=lambda file: (not file.startswith(own), total[file])):
+        for test in files[file]:
+            if spent + seconds.get(test, 0.0) <= ENOUGH or not chosen:
+                chosen.append(test)
+                spent += seconds.get(test, 0.0)
+    return chosen
+
+
+class Copy:
+    """A copy of the library, and the process that runs tests in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = copied(folder)
+        command, pipe = [sys.executable, "-m", "tests.mutation.warm"], subprocess.PIPE
+        self._runner = subprocess.Popen(
+            command, cwd=folder, env=environment(folder), stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True
+        )
+
+    def outcome(self, mutant: Mutant, tests: list[str], seconds: float) -> str:
+        """Return "killed", "timed out" or "survived"."""
+        path, asked = self.folder / mutant.file, json.dumps([tests, int(60 + 5 * seconds)])
+        assert self._runner.stdin is not None
+        assert self._runner.stdout is not None
+        source = path.read_bytes()
+        path.write_bytes(mutant.of(source))
+        try:
+            self._runner.stdin.write(asked + "\n")
+            self._runner.stdin.flush()
+            code = int(self._runner.stdout.readline())
+        finally:
+            path.write_bytes(source)
+        return "survived" if code == 0 else "killed" if code > 0 else "timed out"
+
+    def close(self) -> None:
+        """End the process."""
+        self._runner.communicate()
+
+
+def equivalents() -> dict[tuple[str, str, str], str]:
+    """Return the reasons of changes that nobody can notice, by file, line and changed line."""
+    blocks = (HOME / "tests/mutation/equivalent.txt").read_text().strip().split("\n\n")
+    rows = [[line.strip() for line in block.splitlines()] for block in blocks if not block.startswith("#")]
+    return {(file, old.removeprefix("- "), new.removeprefix("+ ")): " ".join(why) for file, old, new, *why in rows}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="tests.mutation")
+    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--least", type=float, default=0.92, help="score below which it fails")
+    parser.add_argument("--only", default="", help="draw from files whose name holds this")
+    parser.add_argument("--kept", type=Path, help="folder for the measured map, used again where it is there")
+    asked = parser.parse_args()
+    files = sorted(path for room in ROOMS for path in (HOME / "koopmpc" / room).rglob("*.py"))
+    names = [str(path.relative_to(HOME)) for path in files]
+    sources = {name: (HOME / name).read_bytes() for name in names if asked.only in name}
+    everything = [mutant for name, source in sources.items() for mutant in mutants(name, source)]
+    drawn = random.Random(asked.seed).sample(everything, min(asked.count, len(everything)))
+    known, say = equivalents(), sys.stdout.write
+    with tempfile.TemporaryDirectory() as temporary:
+        made = [Copy(Path(temporary) / str(i)) for i in range(asked.workers)]
+        copies: SimpleQueue[Copy] = SimpleQueue()
+        for copy in made:
+            copies.put(copy)
+        kept = asked.kept and asked.kept / "map.json"
+        if kept and kept.exists():
+            held, seconds = json.loads(kept.read_text())
+            covering = {file: {int(n): tests for n, tests in lines.items()} for file, lines in held.items()}
+        else:
+            covering, seconds = measured(made[0].folder, asked.workers)
+            if kept:
+                kept.write_text(json.dumps([covering, seconds]))
+
+        quick = sorted(seconds, key=lambda test: seconds[test])[:20]
+        for copy in made:  # what is not changed must survive
+            if copy.outcome(replace(drawn[0], start=0, end=0, text=""), quick, 20.0) != "survived":
+                raise SystemExit("the tests fail without any change")
+
+        def judged(mutant: Mutant) -> tuple[Mutant, str, str]:
+            before, after = mutant.lines(sources[mutant.file])
+            why = known.get((mutant.file, before, after))
+            tests = tests_of(mutant, covering, seconds)
+            told = f"{mutant.file}:{mutant.first}\n- {before}\n+ {after}\n"
+            if why is not None:
+                return mutant, "equivalent", f"{told}  {why}\n"
+            if not tests:
+                return mutant, "survived", f"{told}  no test runs this line\n"
+            copy = copies.get()
+            try:
+                found = copy.outcome(mutant, tests, sum(seconds.get(test, 0.0) for test in tests))
+            finally:
+                copies.put(copy)
+            return mutant, found, f"{told}  {found}; {len(tests)} tests\n"
+
+        counts = dict.fromkeys(("killed", "timed out", "equivalent", "survived"), 0)
+        with ThreadPoolExecutor(asked.workers) as pool:
+            for _, found, told in pool.map(judged, drawn):
+                counts[found] += 1
+                if found in ("survived", "equivalent"):
+                    say(f"\n{found}: {told}")
+                sys.stdout.flush()
+        for copy in made:
+            copy.close()
+    noticed = counts["killed"] + counts["timed out"]
+    score = noticed / max(noticed + counts["survived"], 1)
+    said = ", ".join(f"{count} {name}" for name, count in counts.items())
+    say(f"\n{len(drawn)} of {len(everything)} changes, seed {asked.seed}: {said}; score {score:.1%}\n")
+    return int(score < asked.least)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,29 @@
+"""A pytest plugin that writes the seconds of processor time of each test to seconds.json."""
+
+import json
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+_seconds: Counter[str] = Counter()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    before = sum(os.times()[:4])  # of this process and of its children
+    result = yield
+    _seconds[item.nodeid] += sum(os.times()[:4]) - before
+    return result
+
+
+def pytest_sessionfinish(session):
+    if hasattr(session.config, "workeroutput"):  # of pytest-xdist: this is one of its processes
+        session.config.workeroutput["seconds"] = _seconds
+    else:
+        Path("seconds.json").write_text(json.dumps(_seconds))
+
+
+def pytest_testnodedown(node):
+    _seconds.update(node.workeroutput.get("seconds", {}))

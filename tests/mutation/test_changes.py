@@ -1,0 +1,53 @@
+"""Changes of a source file are those that are asked for, one at a time, and leave alone what is only said."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.mutation.changes import mutants
+
+SOURCE = '''"""Words with 1 < 2."""
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy
+
+def f(x: "1 n" = 3, *, on=True) -> float | None:
+    """Return 1 + 1."""
+    if x < 2 and not on:
+        raise ValueError(f"{x + 1} is too small, ä")
+    y = x - 1.5
+    self.kept = y
+    print(max(x, y), isinstance(x, int | float))
+    return y
+'''.encode()
+HEAD = 'def f(x: "1 n" = {}, *, on={}) -> float | None:'
+EXPECTED = [
+    HEAD.format(4, True),
+    HEAD.format(3, False),
+    "if (not (x < 2 and (not on))):",
+    "if (x < 2 or not on):",
+    "if (x <= 2) and not on:",
+    "if x < 3 and not on:",
+    "if x < 2 and on:",
+    "pass",
+    "y = (x + 1.5)",
+    "y = x - 3.0",
+    "pass",
+    "pass",
+    "print(min(x, y), isinstance(x, int | float))",
+    "return None",
+]
+
+
+def test_each_change_is_one_place_of_the_code_that_does_something() -> None:
+    assert sorted(mutant.lines(SOURCE)[1] for mutant in mutants("file.py", SOURCE)) == sorted(EXPECTED)
+
+
+@pytest.mark.parametrize("name", ["control/lqr.py", "data/files/csv.py", "loop/simulate.py"])
+def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> None:
+    source = (Path(__file__).parents[2] / "koopmpc" / name).read_bytes()
+    whole, made = ast.dump(ast.parse(source)), list(mutants(name, source))
+    assert len(made) > 20
+    assert all(ast.dump(ast.parse(mutant.of(source))) != whole for mutant in made)
