@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.bench.problem import Problem as Problem
     from koopmpc.bench.problem import Training as Training
     from koopmpc.bench.sweep import sweep as sweep
+    from koopmpc.codegen.compiled import compiled as compiled
+    from koopmpc.codegen.export import export as export
     from koopmpc.control.adaptive import Adaptive as Adaptive
     from koopmpc.control.adaptive import Guarded as Guarded
     from koopmpc.control.cost import Cost as Cost

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -216,6 +216,35 @@ def check(
     out.print(Text(f"{done}\n\nreport: {done.page}"), soft_wrap=True)
     if not done.kept:
         raise typer.Exit(1)
+
+
+@app.command()
+def export(
+    controller: Annotated[Path, typer.Argument(help="What the save of a controller or of a design wrote.")],
+    out: Annotated[Path, typer.Option("--out", help="The folder to write; it may hold an older export.")],
+    precision: Annotated[str, typer.Option("--precision", help="double or float.")] = "double",
+    problem: Annotated[
+        str | None, typer.Option("--problem", help="The example controls the plant of this problem: name or name:case.")
+    ] = None,
+) -> None:
+    """Write a controller as C99: sources, Makefile, CMakeLists.txt, an example, and a README with its sizes."""
+    import numpy as np
+
+    from koopmpc.bench.controllers import Prepared
+    from koopmpc.bench.library import load_problem
+    from koopmpc.codegen.export import export as write
+    from koopmpc.synthesis.designed import load_controller
+
+    example: dict[str, Any] = {}
+    with _friendly():
+        loaded = load_controller(controller)
+        if problem is not None:
+            given = load_problem(problem)
+            name, case = next(iter(given.cases.items()))
+            row = np.atleast_2d(np.asarray(case.reference))[0]
+            example = {"plant": Prepared(given).truth_of(name), "x0": case.x0, "reference": row, "steps": case.steps}
+        folder = write(loaded, out, precision=cast("Any", precision), **example)
+    _console().print(Text(f"{folder}: make run builds it and prints its closed loop"), soft_wrap=True)
 
 
 @app.command()

@@ -82,6 +82,7 @@ class Filtered(Measured):
 
     def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
         super().__init__(model)
+        self.gain = gain
         own = self._model
         known = slice(self.ny, None)
         if isinstance(model, LinearPredictor):

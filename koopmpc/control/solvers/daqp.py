@@ -40,7 +40,7 @@ _LEAST = np.full(1, 1e-300)
 _SLOW = 0.1  # share of what the step before missed above which the weight is eased
 _CURVED = 1e-6  # least curvature of a price by its slope, per unit of a row: DAQP divides by it
 
-_FEW = 20  # active rows up to which the next solve goes on from them
+FEW = 20  # active rows up to which the next solve goes on from them
 _MANY = 16  # iterations of a solve that tell how long one takes
 
 _OPTIMAL, _INFEASIBLE, _ITERATIONS, _TIME_LIMIT = 1, -1, -4, -7
@@ -144,7 +144,7 @@ class DAQP(QPSolver):
         self._send(None if y is None else self._active(y))
         x, multipliers, flag, iterations = self._run(limit)
         good = (flag == _OPTIMAL and self._exact) or (flag > 0 and self._accurate(x, multipliers))
-        self.resumes = good and int(np.count_nonzero(multipliers)) <= _FEW
+        self.resumes = good and int(np.count_nonzero(multipliers)) <= FEW
         if not good and flag != _TIME_LIMIT:
             steep = self._steep()
             if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(time_limit):

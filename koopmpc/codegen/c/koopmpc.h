@@ -1,0 +1,150 @@
+/**
+ * @file koopmpc.h
+ * @brief One controller as C99: no heap, no file, no clock, no library but math.h, no global variable.
+ *
+ * Everything that moves lives in one koopmpc_state, which the caller owns; copy it by assignment. Two states may be
+ * stepped by two threads at once. Arrays hold one value after the other; matrices and previews hold row after row.
+ */
+#ifndef KOOPMPC_H
+#define KOOPMPC_H
+
+#include "koopmpc_sizes.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#ifdef KOOPMPC_FLOAT
+typedef float koopmpc_real;
+#else
+typedef double koopmpc_real;
+#endif
+
+/** How a step ended. The first four are as intended; the others come with a fallback. */
+typedef enum {
+  KOOPMPC_UNCONSTRAINED = 0,   /**< the unconstrained optimum meets every limit */
+  KOOPMPC_OPTIMAL = 1,         /**< the QP was solved */
+  KOOPMPC_SOFTENED = 2,        /**< solved, and a soft limit or a rate gave way by more than its tolerance */
+  KOOPMPC_SATURATED = 3,       /**< a feedback law was clipped to the input limits */
+  KOOPMPC_MAX_ITERATIONS = 4,  /**< the solver met its bound of iterations */
+  KOOPMPC_TIME_LIMIT = 5,      /**< never returned here: C has no clock */
+  KOOPMPC_INFEASIBLE = 6,      /**< no plan meets the hard limits */
+  KOOPMPC_BAD_MEASUREMENT = 7, /**< NaN, inf or beyond 1e30 in y, the reference or w */
+  KOOPMPC_FAILED = 8           /**< the solver gave no usable answer */
+} koopmpc_status;
+
+/** What replaced the answer of a failed step; always inside the input limits. */
+typedef enum {
+  KOOPMPC_NONE = 0,         /**< nothing had to */
+  KOOPMPC_SHIFTED_PLAN = 1, /**< the last good plan, moved on by one step */
+  KOOPMPC_CLIPPED_LQR = 2,  /**< the unconstrained optimum, clipped to the input limits */
+  KOOPMPC_HOLD = 3          /**< the last input again */
+} koopmpc_fallback;
+
+/** Rows of a preview: `count` rows from this step on; the last one is repeated as long as rows are missing. */
+typedef struct {
+  const koopmpc_real *values; /**< row after row */
+  int count;                  /**< number of rows, at least 1 */
+} koopmpc_rows;
+
+/** What a step says of itself. */
+typedef struct {
+  koopmpc_status status;
+  koopmpc_fallback fallback;
+  int iterations;     /**< iterations of the QP solver */
+  koopmpc_real slack; /**< how far the plan breaks the soft limit that gives way most, in its unit; 0 but SOFTENED */
+} koopmpc_report;
+
+#if KOOPMPC_IS_LQR
+
+/** All that moves from step to step. */
+typedef struct {
+  koopmpc_real last[KOOPMPC_NU]; /**< the last input */
+  koopmpc_real zeta[KOOPMPC_NZETA];
+  koopmpc_real z[KOOPMPC_NZ];
+  koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
+  int target_ints[KOOPMPC_TARGET_INTS];
+  int seen; /**< whether a past is known, where the model needs one */
+  int row;  /**< row of given input targets */
+} koopmpc_state;
+
+#else
+
+/** All that moves from step to step. */
+typedef struct {
+  koopmpc_real known[KOOPMPC_KNOWN + 1];   /**< [z; u_{-1}; w_0 ...; d], where the plan starts */
+  koopmpc_real t[KOOPMPC_NT];              /**< the plan of this step and what its targets come to */
+  koopmpc_real column[KOOPMPC_NT];         /**< the reference's part of the plan */
+  koopmpc_real reference[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows that `column` belongs to */
+  koopmpc_real kept[KOOPMPC_MOVES];        /**< inputs of the last good plan */
+  koopmpc_real given[KOOPMPC_NU];          /**< the last input returned */
+  koopmpc_real sent[(KOOPMPC_LATENCY + 1) * KOOPMPC_NU]; /**< inputs computed and not yet acted */
+  koopmpc_real ahead[(KOOPMPC_LATENCY + 1) * KOOPMPC_NW1];
+  koopmpc_real w[KOOPMPC_NW1];
+  koopmpc_real dual[KOOPMPC_QP_M1];        /**< multipliers of the last solve, from which the next one starts */
+  koopmpc_real zeta[KOOPMPC_NZETA];
+  koopmpc_real z[KOOPMPC_NZ], d[KOOPMPC_NZ];
+  koopmpc_real scratch[2 * KOOPMPC_NS + 2];
+#if KOOPMPC_ESTIMATOR == 1
+  koopmpc_real last_z[KOOPMPC_NZ];
+  koopmpc_real newest[KOOPMPC_NZ + 2 * KOOPMPC_NX], means[KOOPMPC_NZ + 2 * KOOPMPC_NX];
+  koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX];
+  int learned, has_last;
+#elif KOOPMPC_ESTIMATOR == 2
+  koopmpc_real s[KOOPMPC_NS];
+  koopmpc_real queue[(KOOPMPC_DELAY_Y + 1) * (KOOPMPC_NU + KOOPMPC_NW1)];
+  koopmpc_real innovation[KOOPMPC_NY], factor[KOOPMPC_NY * KOOPMPC_NY];
+  int queued, started, missed;
+#endif
+  koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
+  int target_ints[KOOPMPC_TARGET_INTS];
+  koopmpc_real qp_reals[KOOPMPC_QP_REALS]; /**< memory of the QP solver, and the rows that it ended with */
+  int qp_ints[KOOPMPC_QP_INTS];
+  int aimed;      /**< whether `column` is that of `reference` */
+  int row;        /**< row of given input targets */
+  int warm;       /**< whether `dual` is of the last step */
+  int resumes;    /**< whether the solver may go on from the few rows that it holds */
+  int unmet;      /**< whether the hard limits of the last solve contradicted each other */
+  int has_kept, age, planned;
+  int seen;       /**< whether a past is known, where the model needs one */
+} koopmpc_state;
+
+#endif
+
+/**
+ * Forget all earlier steps.
+ * @param s      the state
+ * @param x0     KOOPMPC_NX numbers, the state that a filter starts at; NULL for zero
+ * @param u_prev KOOPMPC_NU numbers, the input that acted last; NULL for zero moved inside the limits
+ */
+void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev);
+
+/**
+ * Compute the input of one step; call it once every KOOPMPC_DT seconds.
+ * @param s         the state
+ * @param y         KOOPMPC_NY measurements; NaN is a missed one
+ * @param reference rows of KOOPMPC_NR numbers from this step on, up to KOOPMPC_HORIZON + 1 of them are read
+ * @param applied   KOOPMPC_NU numbers, what the plant really got last; NULL for the last u returned
+ * @param w         rows of KOOPMPC_NW measured disturbances from this step on; NULL for zero
+ * @param u         KOOPMPC_NU numbers, the input to apply; always inside its limits
+ * @param report    how the step ended; may be NULL
+ */
+void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
+                  const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report);
+
+/**
+ * Write the inputs of the last plan.
+ * @param s the state
+ * @param U KOOPMPC_N rows of KOOPMPC_NU inputs
+ * @return 1; 0 where the last step had no plan, and U is as it was
+ */
+int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U);
+
+/** z = psi(x), the lifting; zeta is the state, or the state and its past. */
+void koopmpc_lift(const koopmpc_real *zeta, koopmpc_real *z);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,57 @@
+/** @file koopmpc_common.h @brief Vectors, the history of delays, and targets: what all controllers share. */
+#ifndef KOOPMPC_COMMON_H
+#define KOOPMPC_COMMON_H
+
+#include "koopmpc_qp.h"
+
+#define KOOPMPC_HUGE ((koopmpc_real)1e30)
+
+static inline koopmpc_real koopmpc_abs(koopmpc_real a) { return a < 0 ? -a : a; }
+
+/** Whether all are numbers below 1e30 in size. */
+static inline int koopmpc_usable(const koopmpc_real *a, int n) {
+  int good = 1;
+  for (int i = 0; i < n; i++) good &= koopmpc_abs(a[i]) < KOOPMPC_HUGE;
+  return good;
+}
+
+static inline koopmpc_real koopmpc_dot(const koopmpc_real *a, const koopmpc_real *b, int n) {
+  koopmpc_real sum = 0;
+  for (int i = 0; i < n; i++) sum += a[i] * b[i];
+  return sum;
+}
+
+static inline void koopmpc_copy(koopmpc_real *to, const koopmpc_real *from, int n) {
+  for (int i = 0; i < n; i++) to[i] = from[i];
+}
+
+static inline void koopmpc_fill(koopmpc_real *to, koopmpc_real value, int n) {
+  for (int i = 0; i < n; i++) to[i] = value;
+}
+
+static inline koopmpc_real koopmpc_clip(koopmpc_real a, koopmpc_real low, koopmpc_real high) {
+  a = a < low ? low : a;
+  return a > high ? high : a;
+}
+
+/** Row k of a preview, the last one repeated. */
+static inline const koopmpc_real *koopmpc_row(const koopmpc_rows *rows, int k, int width) {
+  return rows->values + width * (k < rows->count ? k : rows->count - 1);
+}
+
+/** to += map x for a matrix (rows, columns) that is stored column after column. */
+void koopmpc_add(koopmpc_real *to, const koopmpc_real *map, int rows, const koopmpc_real *x, int columns);
+
+/** Move zeta = [x_k, u_{k-1}, x_{k-1}, ...] on by a step that led to x under u, and write z = psi(zeta). */
+void koopmpc_observe(koopmpc_real *zeta, int *seen, koopmpc_real *z, const koopmpc_real *x, const koopmpc_real *u);
+
+/** The nearest coordinates of a target without limits; e is what disturbances add to z, NULL for nothing. */
+void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
+
+/** The same inside the limits; 1 where they had to be moved. */
+int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
+
+/** Move u inside its change since `last` within (low, high), where `low` is not NULL, and inside its limits. */
+void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last);
+
+#endif

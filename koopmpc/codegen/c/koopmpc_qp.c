@@ -1,0 +1,138 @@
+/** @file koopmpc_qp.c @brief DAQP on memory that belongs to the caller. */
+#include "koopmpc_qp.h"
+#include "koopmpc_solver.h"
+
+#include "daqp/daqp.h"
+
+static koopmpc_real magnitude(koopmpc_real a) { return a < 0 ? -a : a; }
+
+enum { ROWS_CHANGED = 2 };
+enum { ACTIVE_ROWS, SINGULAR_ROW, SWAPPED };
+
+static koopmpc_real *share(koopmpc_real **reals, int n) {
+  koopmpc_real *mine = *reals;
+  *reals += n;
+  return mine;
+}
+
+koopmpc_qp_memory koopmpc_qp_on(const koopmpc_qp *qp, koopmpc_real *reals, int *ints) {
+  const int n = qp->n, m = qp->m, k = n + qp->soft + 1;
+  koopmpc_qp_memory mem;
+  mem.low = share(&reals, m);
+  mem.high = share(&reals, m);
+  mem.dlow = share(&reals, m);
+  mem.dhigh = share(&reals, m);
+  mem.product = share(&reals, m);
+  mem.dual = share(&reals, m);
+  mem.primal = share(&reals, n);
+  mem.u = share(&reals, n);
+  mem.lam = share(&reals, k);
+  mem.lam_star = share(&reals, k);
+  mem.D = share(&reals, k);
+  mem.xldl = share(&reals, k);
+  mem.zldl = share(&reals, k);
+  mem.L = reals;
+  mem.held = ints;
+  mem.sense = ints + 3;
+  mem.WS = mem.sense + m;
+  return mem;
+}
+
+/** Mark the rows from which to start, and those whose two limits are one; 0 where limits cross. */
+static int marked(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume) {
+  const int one = DAQP_ACTIVE | DAQP_IMMUTABLE | DAQP_AUTO_EQUALITY;
+  int result = 1;
+  for (int i = 0; i < qp->m; i++) {
+    const koopmpc_real width = mem->high[i] - mem->low[i];
+    int sense = resume ? mem->sense[i] : qp->sense[i];
+    if (push && push[i] > 0) sense |= DAQP_ACTIVE;
+    if (push && push[i] < 0) sense |= DAQP_ACTIVE | DAQP_LOWER;
+    if (!(width >= -KOOPMPC_PRIMAL_TOL)) return 0;
+    if (width < KOOPMPC_ZERO_TOL && !(sense & DAQP_SOFT)) {
+      if ((sense & one) != one) result = ROWS_CHANGED;
+      sense |= one;
+    } else if (sense & DAQP_AUTO_EQUALITY) {
+      result = ROWS_CHANGED;
+      sense &= ~one;
+    }
+    mem->sense[i] = sense;
+  }
+  return result;
+}
+
+koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push,
+                                koopmpc_real wider, int resume) {
+  const DAQPWorkspace empty = {0};
+  DAQPSettings settings = KOOPMPC_SETTINGS;
+  DAQPWorkspace work = empty;
+  koopmpc_qp_end end = {DAQP_EXIT_INFEASIBLE, 0};
+  const int n = qp->n, m = qp->m;
+  int rows;
+
+  for (int j = 0; j < n; j++) mem->primal[j] = mem->u[j] = 0;
+  for (int i = 0; i < m; i++) mem->dual[i] = 0;
+  if (wider > 0)
+    for (int i = 0; i < m; i++) {
+      mem->low[i] -= wider * (1 + magnitude(mem->low[i]));
+      mem->high[i] += wider * (1 + magnitude(mem->high[i]));
+    }
+  rows = marked(qp, mem, push, resume);
+  if (!rows) return end;
+  for (int i = 0; i < m; i++) {
+    mem->dlow[i] = mem->low[i] * qp->scaling[i];
+    mem->dhigh[i] = mem->high[i] * qp->scaling[i];
+  }
+  work.settings = &settings;
+  work.n = n;
+  work.m = m;
+  work.M = (koopmpc_real *)qp->M; /* DAQP reads it only */
+  work.scaling = (koopmpc_real *)qp->scaling;
+  work.Rinv = 0; /* rows of M hold it, and the solution is taken back below */
+  work.dlower = mem->dlow;
+  work.dupper = mem->dhigh;
+  work.sense = mem->sense;
+  work.x = work.u = mem->u;
+  work.lam = mem->held[SWAPPED] && resume ? mem->lam_star : mem->lam;
+  work.lam_star = mem->held[SWAPPED] && resume ? mem->lam : mem->lam_star;
+  work.D = mem->D;
+  work.L = mem->L;
+  work.xldl = mem->xldl;
+  work.zldl = mem->zldl;
+  work.WS = mem->WS;
+  work.Mu = mem->product;
+  work.outer_iter = 1;
+  if (qp->soft) {
+    work.rho_ls = work.rho_us = (koopmpc_real *)qp->rho;
+    work.w_ls = work.w_us = (koopmpc_real *)qp->linear;
+  }
+  reset_daqp_workspace(&work);
+  if (resume) {
+    work.n_active = mem->held[ACTIVE_ROWS];
+    work.sing_ind = mem->held[SINGULAR_ROW];
+  }
+  if (!resume || rows == ROWS_CHANGED || !work.n_active) {
+    reset_daqp_workspace(&work);
+    end.flag = daqp_activate_constraints(&work);
+    if (end.flag < 0) return end;
+  }
+  end.flag = daqp_ldp(&work);
+  mem->held[ACTIVE_ROWS] = work.n_active;
+  mem->held[SINGULAR_ROW] = work.sing_ind;
+  mem->held[SWAPPED] = work.lam == mem->lam_star;
+  end.iterations = work.iterations;
+  if (end.flag <= 0) return end;
+#ifdef KOOPMPC_FLOAT
+  if (work.n_active > 0 && work.sing_ind == DAQP_EMPTY_IND) /* floats leave active rows off by their rounding */
+    for (int pass = 0; pass < 2; pass++) daqp_refine_active(&work);
+#endif
+  for (int i = 0; i < work.n_active; i++)
+    mem->dual[work.WS[i]] = work.lam_star[i] * qp->scaling[work.WS[i]];
+  if (qp->rinv) {
+    const koopmpc_real *r = qp->rinv;
+    for (int i = 0; i < n; i++)
+      for (int j = i; j < n; j++) mem->primal[i] += *r++ * work.u[j];
+  } else {
+    for (int j = 0; j < n; j++) mem->primal[j] = work.u[j];
+  }
+  return end;
+}

@@ -1,0 +1,358 @@
+"""A controller in machine code: the C of `export`, built with the compiler at hand, behind the Controller protocol."""
+
+import ctypes
+import platform
+import re
+import subprocess
+import warnings
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import numbers
+from koopmpc.codegen.sources import sources_of
+from koopmpc.codegen.tables import tables_of
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.lqr import LQR
+from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.plants.compiled import compiler, library, private_cache
+
+Precision = Literal["double", "float"]
+_STATUS, _FALLBACK = list(Status), list(Fallback)
+
+# One call with one pointer: that is what ctypes does fastest.
+_DOOR = """
+#ifdef _WIN32
+#define DOOR __declspec(dllexport)
+#else
+#define DOOR
+#endif
+typedef struct {
+  koopmpc_state *state;
+  koopmpc_real *y;
+  koopmpc_rows reference;
+  koopmpc_real *applied;
+  koopmpc_rows w;
+  koopmpc_real *u;
+  koopmpc_report report;
+} koopmpc_frame;
+DOOR void koopmpc_call(koopmpc_frame *f) {
+  koopmpc_step(f->state, f->y, &f->reference, f->applied, f->w.count ? &f->w : 0, f->u, &f->report);
+}
+DOOR long koopmpc_state_size(void) { return (long)sizeof(koopmpc_state); }
+"""
+
+
+class NoCompilerWarning(UserWarning):
+    """No C compiler was found, or it failed: the controller stays as it was, in Python."""
+
+
+class _Rows(ctypes.Structure):
+    _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
+
+
+class _Frame(ctypes.Structure):
+    """What a call passes; the same fields as in C."""
+
+    _fields_ = (
+        ("state", ctypes.c_void_p),
+        ("y", ctypes.c_void_p),
+        ("reference", _Rows),
+        ("applied", ctypes.c_void_p),
+        ("w", _Rows),
+        ("u", ctypes.c_void_p),
+        ("status", ctypes.c_int),
+        ("fallback", ctypes.c_int),
+        ("iterations", ctypes.c_int),
+        ("slack", ctypes.c_double),
+    )
+
+
+class _SingleFrame(ctypes.Structure):
+    """The same where numbers are floats."""
+
+    _fields_ = (
+        ("state", ctypes.c_void_p),
+        ("y", ctypes.c_void_p),
+        ("reference", _Rows),
+        ("applied", ctypes.c_void_p),
+        ("w", _Rows),
+        ("u", ctypes.c_void_p),
+        ("status", ctypes.c_int),
+        ("fallback", ctypes.c_int),
+        ("iterations", ctypes.c_int),
+        ("slack", ctypes.c_float),
+    )
+
+
+class _Built(NamedTuple):
+    """What a compiler made of a controller."""
+
+    code: ctypes.CDLL
+    sizes: dict[str, int]
+    state_size: int
+
+
+def compiled(controller: Controller, *, precision: Precision = "double") -> Controller:
+    """Return the same controller in machine code: the C of `km.export`, several times as fast a step.
+
+    It takes and returns what the original does, from the state after `reset`. Copies and pickles are controllers of
+    their own; a pickle is built again where it is loaded. Where there is no C compiler, or it fails, a warning says so
+    and the controller itself is returned. The original is left alone.
+
+    Parameters
+    ----------
+    controller
+        An LQR, a KoopmanMPC or a LinearMPC.
+    precision
+        "double", or "float": the numbers of a microcontroller, to look at what they cost.
+
+    Raises
+    ------
+    DataError
+        A part of the controller cannot be written in C; the message says which, and what would do.
+    """
+    if precision not in ("double", "float"):
+        raise DataError(f'precision is {precision!r}; pass "double" or "float"')
+    if isinstance(controller, Compiled):
+        return controller
+    if not isinstance(controller, LQR | KoopmanMPC):
+        tables_of(controller, single=False)  # says why not
+    command = compiler()
+    if command is None:
+        warnings.warn(
+            "no C compiler was found ($CC, cc, gcc, clang); the controller stays in Python", NoCompilerWarning, 2
+        )
+        return controller
+    try:
+        return Compiled(controller, precision, command)  # pyright: ignore[reportArgumentType]  # see above
+    except (OSError, subprocess.SubprocessError) as error:
+        warnings.warn(
+            f"the C compiler failed, the controller stays in Python: {first_error(error)}", NoCompilerWarning, 2
+        )
+        return controller
+
+
+def first_error(error: Exception) -> str:
+    """Return the first error that a compiler printed, or what the system says."""
+    printed = getattr(error, "stderr", None) or b""
+    text = printed.decode(errors="replace") if isinstance(printed, bytes) else str(printed)
+    lines = [line for line in text.splitlines() if "error" in line.lower()]
+    return lines[0] if lines else str(error)
+
+
+def amalgamated(files: dict[str, str]) -> str:
+    """Return all sources as one, each local header where it is first included."""
+    seen: set[str] = set()
+
+    def inlined(text: str, folder: str) -> str:
+        def replaced(match: re.Match[str]) -> str:
+            name = match.group(1)
+            path = next((p for p in (folder + name, name) if p in files), "")
+            if not path:  # what DAQP includes for its own clock
+                return match.group()
+            if path in seen:
+                return ""
+            seen.add(path)
+            return inlined(files[path], path.rpartition("/")[0] + "/" if "/" in path else "")
+
+        return re.sub(r'^#include "([^"]+)"$', replaced, text, flags=re.MULTILINE)
+
+    own = [name for name in files if name.endswith(".c") and "/" not in name]
+    return "\n".join(inlined(files[name], "") for name in own)
+
+
+def machine() -> list[str]:
+    """Return the flags for this very processor, where the compiler takes them."""
+    return ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
+
+
+def _processor() -> str:
+    """Return what tells this processor from others whose machine code it may not run."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith("flags")), platform.processor())
+
+
+def _built(controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> _Built:
+    single = precision == "float"
+    tables = tables_of(controller, single=single)
+    text = amalgamated(sources_of(tables, single=single)) + _DOOR + f"/* {_processor()} */\n"
+    cache = private_cache()
+    try:
+        code = library(text, [*command, *machine()], cache)
+    except subprocess.SubprocessError:
+        code = library(text, command, cache)  # it may not know this processor
+    code.koopmpc_state_size.restype = ctypes.c_long
+    code.koopmpc_init.restype = code.koopmpc_call.restype = None
+    return _Built(code, tables.sizes, int(code.koopmpc_state_size()))
+
+
+class Compiled:
+    """A controller in machine code; see `compiled`.
+
+    One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
+    """
+
+    def __init__(self, controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> None:
+        self.original, self.precision = controller, precision
+        self._built = built = _built(controller, precision, command)
+        sizes = built.sizes
+        self.dt, self.nu, self.horizon = controller.dt, sizes["NU"], sizes["HORIZON"]
+        self.cost, self.limits, self.predictor = controller.cost, controller.limits, controller.predictor
+        self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
+        self._memory = np.zeros(-(-built.state_size // 8))
+        self._connect()
+        self.reset()
+
+    def _connect(self) -> None:
+        """Make the arrays and the frame that a call passes."""
+        self._token, self._inside = [0], 0
+        single = self.precision == "float"
+        kind, sizes = np.float32 if single else np.float64, self._built.sizes
+        rows = sizes["HORIZON"] + 1
+        self._y, self._u, self._applied = (np.zeros(n, kind) for n in (self._ny, self.nu, self.nu))
+        self._reference = np.zeros((rows, self._nr), kind)
+        self._w = np.zeros((rows, max(1, self._nw)), kind)
+        frame = self._frame = _SingleFrame() if single else _Frame()
+        frame.state, frame.y, frame.u = (a.ctypes.data for a in (self._memory, self._y, self._u))
+        frame.reference = _Rows(self._reference.ctypes.data, 1)
+        frame.w = _Rows(self._w.ctypes.data, 0)
+        self._applied_address = self._applied.ctypes.data
+        self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
+        self._call = self._built.code.koopmpc_call
+        self._row_shapes = (self._nr,), self._reference[0]
+
+    @alone
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Forget all earlier steps; see the original."""
+        kind = self._y.dtype
+        given = (
+            None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
+            for value, name, size in ((x0, "x0", self.predictor.nx), (u_prev, "u_prev", self.nu))
+        )
+        start, last = given
+        self._built.code.koopmpc_init(
+            ctypes.c_void_p(self._memory.ctypes.data),
+            None if start is None else ctypes.c_void_p(start.ctypes.data),
+            None if last is None else ctypes.c_void_p(last.ctypes.data),
+        )
+
+    def __call__(
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+    ) -> Move:
+        """Return the next input for measurement y; the arguments are those of the original."""
+        try:
+            held = self._token.pop()
+        except IndexError:
+            raise busy(self) from None
+        try:
+            start = perf_counter()
+            frame = self._frame
+            measured = numbers(y, "y")
+            if measured.shape != self._y.shape:
+                raise ShapeError(f"y has shape {measured.shape}, expected {self._y.shape}")
+            self._y[:] = measured
+            target = numbers(reference, "reference")
+            if target.shape == self._row_shapes[0]:
+                self._row_shapes[1][:] = target
+                frame.reference.count = 1
+            else:
+                frame.reference.count = self._rows(target, self._reference, self._nr, "reference")
+            if applied is None:
+                frame.applied = None
+            else:
+                got = numbers(applied, "applied")
+                if got.shape != self._u.shape:
+                    raise ShapeError(f"applied has shape {got.shape}, expected {self._u.shape}")
+                self._applied[:] = got
+                frame.applied = self._applied_address
+            if w is None:
+                frame.w.count = 0
+            else:
+                frame.w.count = self._disturbances(numbers(w, "w"))
+            self._call(self._pointer)
+            u = self._u.astype(np.float64)
+            if not frame.status:
+                return Move(u, Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
+            return Move(
+                u,
+                _STATUS[int(frame.status)],
+                _FALLBACK[int(frame.fallback)],
+                perf_counter() - start,
+                frame.iterations,
+                frame.slack,
+                "daqp" if frame.iterations else "",
+            )
+        finally:
+            self._token.append(held)
+
+    def _rows(self, rows: Float[np.ndarray, "..."], to: Float[np.ndarray, "..."], width: int, name: str) -> int:
+        """Copy a preview; return how many of its rows count."""
+        if rows.ndim > 2 or rows.shape[-1:] != (width,) or len(rows) == 0:
+            raise ShapeError(
+                f"{name} has shape {rows.shape}, expected ({width},), or rows of {width} for steps k … k+{len(to) - 1}"
+            )
+        table = rows.reshape(-1, width)[: len(to)]
+        to[: len(table)] = table
+        return len(table)
+
+    def _disturbances(self, w: Float[np.ndarray, "..."]) -> int:
+        if not self._nw:
+            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
+        return self._rows(w, self._w, self._nw, "w")
+
+    def plan(self) -> Plan | None:
+        """Return the plan of the last call; None where it had none."""
+        if isinstance(self.original, LQR):
+            return None
+        model, sizes = self.predictor, self._built.sizes
+        U = np.zeros((sizes["N"], self.nu), self._y.dtype)
+        if not self._built.code.koopmpc_plan(ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_void_p(U.ctypes.data)):
+            return None
+        U = U.astype(np.float64)
+        known = self._memory.view(self._y.dtype)[: sizes["KNOWN"]].astype(np.float64)
+        first = model.nz + self.nu * sizes["WITH_RATES"]
+        end = first + sizes["N"] * model.nw
+        push = known[first:end].reshape(sizes["N"], model.nw) @ model.E.T
+        if sizes["ESTIMATOR"]:
+            push = push + known[end:]
+        Z = np.empty((sizes["N"] + 1, model.nz))
+        Z[0] = known[: model.nz]
+        for k in range(sizes["N"]):
+            Z[k + 1] = model.A @ Z[k] + model.B @ U[k] + push[k]
+        return Plan(Z @ model.C.T, U)
+
+    def __copy__(self) -> "Compiled":
+        """Return a copy that shares nothing with this one that moves in a step."""
+        twin = object.__new__(Compiled)
+        twin.__dict__.update(self.__dict__)
+        twin._memory = self._memory.copy()
+        twin._connect()
+        return twin
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Compiled":
+        return self.__copy__()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (self.original, self.precision, self._memory)
+
+
+def _rebuilt(controller: LQR | KoopmanMPC, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:
+    """Return the controller of a pickle, built here; it goes on where the pickled one was."""
+    result = compiled(controller, precision=precision)
+    if isinstance(result, Compiled) and result._memory.shape == memory.shape:
+        result._memory[:] = memory
+    return result

@@ -1,0 +1,277 @@
+"""`export`: a controller as a folder of C99 that builds anywhere."""
+
+import subprocess
+import tempfile
+import warnings
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.codegen.compiled import Precision
+from koopmpc.codegen.sources import constants, flops, iteration_flops, shipped, sources_of
+from koopmpc.codegen.tables import Tables, tables_of
+from koopmpc.codegen.text import Language, function, traced
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.lqr import LQR
+from koopmpc.control.move import Controller
+from koopmpc.errors import DataError
+from koopmpc.estimate.filtered import Kalman
+from koopmpc.plants.compiled import compiler
+from koopmpc.plants.step_map import StepMap
+
+_BUILT = (".o", ".a", ".su")  # what a build leaves in the folder
+_PROGRAMS = ("example", "sanitized")
+_DIGITS = 1e-3  # share of an input's span that rounding in single precision may come to
+
+
+class PrecisionWarning(UserWarning):
+    """Single precision is too coarse for this controller."""
+
+
+def export(
+    controller: Controller,
+    folder: str | Path,
+    *,
+    precision: Precision = "double",
+    plant: StepMap | None = None,
+    x0: ArrayLike | None = None,
+    reference: ArrayLike | None = None,
+    steps: int = 200,
+) -> Path:
+    """Write the controller as C99 into a folder: sources, Makefile, CMakeLists.txt, an example and a README.
+
+    The C has no heap, no file, no clock, no global variable, and no library but math.h. It computes what the controller
+    does: lifting, delays, estimator, latency, previews, limits, fallbacks, with the same statuses. Its QP solver is
+    DAQP, whose sources come along; a controller with solver="daqp" and its C agree to rounding.
+
+    Parameters
+    ----------
+    controller
+        An LQR, a KoopmanMPC or a LinearMPC, without a time_limit.
+    folder
+        Is made; one that holds other files than those of an export is refused.
+    precision
+        "double" or "float".
+    plant
+        What `example.c` controls; by default the controller's own model, lifted afresh each step.
+    x0, reference
+        Where the example starts, and the row that it holds; by default one root mean square of the data, and zero.
+    steps
+        How long the example runs.
+
+    Raises
+    ------
+    DataError
+        A part of the controller, or the plant, cannot be written in C, or the folder holds other files.
+
+    Warns
+    -----
+    PrecisionWarning
+        Rounding in single precision may move an input by more than 0.1 % of its span.
+    """
+    if precision not in ("double", "float"):
+        raise DataError(f'precision is {precision!r}; pass "double" or "float"')
+    single = precision == "float"
+    tables = tables_of(controller, single=single)
+    coarse = float(np.finfo(np.float32).eps) * tables.conditioning
+    if single and coarse > _DIGITS:
+        warnings.warn(
+            f"in single precision rounding may move an input by {100 * coarse:.2g} % of its span (the gain on z "
+            f'amplifies it {tables.conditioning:.2g} times); export precision="double", or scale the lifting',
+            PrecisionWarning,
+            stacklevel=2,
+        )
+    if not isinstance(controller, LQR | KoopmanMPC):
+        raise AssertionError("tables_of refuses all others")
+    texts = sources_of(tables, single=single)
+    texts |= {name: shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
+    texts |= _plant(controller, tables, plant, x0, reference, checks.count(steps, "steps"), Language(single))
+    root = Path(folder)
+    _refuse_others(root, {*texts, "README.md"})
+    for name, text in texts.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    (root / "README.md").write_text(_readme(controller, tables, root, precision), encoding="utf-8")
+    return root
+
+
+def _refuse_others(root: Path, known: set[str]) -> None:
+    """Raise DataError where the folder holds what no export has written."""
+    if root.exists() and not root.is_dir():
+        raise DataError(f"{root} is a file; pass a folder")
+    for path in sorted(root.rglob("*")) if root.exists() else []:
+        name = path.relative_to(root).as_posix()
+        ours = name in known or path.suffix in _BUILT or name in _PROGRAMS or name.startswith("koopmpc_")
+        if path.is_file() and not ours:
+            raise DataError(f"{root} holds {name}, which no export wrote; pass an empty folder, or remove that file")
+
+
+def _plant(
+    controller: LQR | KoopmanMPC,
+    tables: Tables,
+    plant: StepMap | None,
+    x0: ArrayLike | None,
+    reference: ArrayLike | None,
+    steps: int,
+    language: Language,
+) -> dict[str, str]:
+    """Return plant.c and plant.h: what the example controls."""
+    predictor, sizes = tables.predictor, tables.sizes
+    if plant is not None:
+        checks.kind(plant, "plant", StepMap, "discretize the dynamics")
+    step_map = predictor.step_map() if plant is None else plant
+    nx, nu = step_map.F.size1_in(0), step_map.F.size1_in(1)
+    if nu != sizes["NU"]:
+        raise DataError(f"the plant has {nu} inputs, the controller {sizes['NU']}; pass the plant that it controls")
+    x = ca.SX.sym("x", nx)
+    measured = _measured(controller, step_map, x, sizes["NY"])
+    step = traced(step_map.F, "the plant")
+    look = traced(ca.Function("measure", [x], [measured]), "what the plant measures")
+    start = _start(predictor.scale, predictor.C, nx) if x0 is None else checks.array(x0, "x0", (nx,))
+    held = np.zeros(sizes["NR"]) if reference is None else checks.array(reference, "reference", (sizes["NR"],))
+    rest = np.clip(np.zeros(nu), tables.limits["input_low"], tables.limits["input_high"])
+    arrays = "".join(
+        language.array(name, values).replace("static const", "const") + "\n"
+        for name, values in (("plant_x0", start), ("plant_u0", rest), ("plant_reference", held))
+    )
+    code = (
+        '/** @file plant.c @brief What the example controls. */\n#include <math.h>\n\n#include "plant.h"\n\n'
+        + arrays
+        + function(step, "plant_step", {"x": nx, "u": nu}, "next", language).text
+        + function(look, "plant_measure", {"x": nx}, "y", language).text
+    )
+    header = (
+        "/** @file plant.h @brief What the example controls. */\n#ifndef PLANT_H\n#define PLANT_H\n\n"
+        '#include "koopmpc.h"\n\n'
+        f"#define PLANT_NX {nx}\n#define PLANT_STEPS {steps}\n\n"
+        f"extern const koopmpc_real plant_x0[{nx}], plant_u0[{nu}], plant_reference[{len(held)}];\n\n"
+        "/** next = F(x, u), one sample later. */\n"
+        "void plant_step(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *next);\n\n"
+        "/** y, what the controller measures. */\nvoid plant_measure(const koopmpc_real *x, koopmpc_real *y);\n\n"
+        "#endif\n"
+    )
+    return {"plant.c": code, "plant.h": header}
+
+
+def _measured(controller: LQR | KoopmanMPC, plant: StepMap, x: ca.SX, ny: int) -> ca.SX:
+    """Return what the controller takes as y, of the plant's state x."""
+    observer = controller._observer if isinstance(controller, LQR) else controller._initial.observer
+    predictor = controller.predictor
+    if isinstance(observer, Kalman) and len(predictor.lifting.bound_states) == x.numel():
+        system = observer._system
+        H = np.zeros((ny, predictor.nz))
+        H[:, system.kept] = system.M[:, : len(system.kept)]
+        return ca.mtimes(ca.DM(H), predictor.lifting.symbolic(x)) + ca.DM(system.h)
+    y = plant.h(x)
+    if y.shape != (ny, 1):
+        y = x[:ny]
+    if y.shape != (ny, 1):
+        raise DataError(
+            f"the plant measures {y.shape[0]} values, the controller takes {ny}; pass the plant it controls"
+        )
+    return y
+
+
+def _start(scale: Float[np.ndarray, "nz nz"] | None, C: Float[np.ndarray, "nx nz"], nx: int) -> Float[np.ndarray, " n"]:
+    sizes = np.ones(len(C)) if scale is None else np.linalg.norm(scale @ C.T, axis=0)
+    return np.resize(sizes, nx)
+
+
+def _measure_objects(root: Path) -> tuple[int, int, int] | None:
+    """Return bytes of code and constants, of the state, and of the stack of all functions; None without a compiler."""
+    command = compiler()
+    if command is None:
+        return None
+    probe = '#include "koopmpc.h"\nkoopmpc_state probe;\n'
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        (place / "probe.c").write_text(probe)
+        files = [*sorted(root.glob("koopmpc_*.c")), place / "probe.c"]
+        try:
+            for file in files:
+                out = place / (file.stem + ".o")
+                flags = ["-std=c99", "-Os", "-ffunction-sections", "-fno-common", "-fstack-usage", f"-I{root}"]
+                subprocess.run([*command, *flags, "-c", str(file), "-o", str(out)], check=True, capture_output=True)
+            printed = subprocess.run(
+                ["size", *(str(place / (file.stem + ".o")) for file in files)],
+                check=True,
+                capture_output=True,
+                text=True,
+            ).stdout
+        except (OSError, subprocess.SubprocessError):
+            return None
+        rows = [line.split() for line in printed.splitlines()[1:]]
+        stack = sum(
+            int(line.split("\t")[1]) for path in place.glob("koopmpc_*.su") for line in path.read_text().splitlines()
+        )
+    flash = sum(int(row[0]) + int(row[1]) for row in rows if "probe" not in row[-1])
+    state = sum(int(row[2]) for row in rows if "probe" in row[-1])
+    return flash, state, stack
+
+
+def _readme(controller: LQR | KoopmanMPC, tables: Tables, root: Path, precision: Precision) -> str:
+    """Return what there is to know of the folder."""
+    sizes, predictor, single = tables.sizes, tables.predictor, precision == "float"
+    numbers_held = constants(tables) * (4 if single else 8)
+    measured = _measure_objects(root)
+    rows = [("constants", f"{numbers_held} bytes")]
+    if measured is not None:
+        flash, state, stack = measured
+        rows += [
+            ("flash: code and constants, this machine's compiler with -Os", f"{flash} bytes"),
+            ("RAM: one `koopmpc_state`", f"{state} bytes"),
+            ("RAM: stack, at most (the frames of all functions together)", f"{stack} bytes"),
+        ]
+    rows.append(("floating-point operations of a step without active limits, at most", str(flops(tables))))
+    if not tables.is_lqr:
+        limit = int(tables.settings["iter_limit"])
+        rows += [
+            ("iterations of the QP solver in one solve, at most", str(limit)),
+            ("floating-point operations of one iteration, at most", str(iteration_flops(tables))),
+        ]
+    rows.append(("rounding of the lifted state, amplified to a share of an input's span", f"{tables.conditioning:.2g}"))
+    table = "\n".join(f"| {what} | {value} |" for what, value in rows)
+    notes = "".join(f"- {note}\n" for note in tables.notes)
+    bound = (
+        ""
+        if tables.is_lqr
+        else 'A bound on the worst step comes from the iterations: export a controller with `solver="daqp", '
+        'settings={"iter_limit": 100}`.\n'
+    )
+    dt, state_names, input_names = predictor.dt, ", ".join(predictor.states), ", ".join(predictor.inputs)
+    return f"""# {type(controller).__name__} in C99
+
+Sampling time {dt} s; states {state_names}; inputs {input_names}. Precision: {precision}.
+
+    make run        # builds the library and the example, prints its closed loop
+    make strict     # our own files with every warning an error
+    make sanitize   # the example under the sanitizers
+
+```c
+#include "koopmpc.h"
+
+static koopmpc_state state;
+koopmpc_init(&state, 0, 0);
+for (;;) {{ /* every {dt} s */
+  koopmpc_rows reference = {{r, 1}}; /* one row, held; or rows of a preview and their count */
+  koopmpc_step(&state, y, &reference, 0, 0, u, &report);
+}}
+```
+
+| size | |
+|---|---|
+{table}
+
+{bound}
+y has {sizes["NY"]} values, u {sizes["NU"]}, a reference row {sizes["NR"]}, a row of w {sizes["NW"]}; up to
+{sizes["HORIZON"] + 1} rows of a preview are read. NaN in y is a missed measurement. `koopmpc.h` says what every
+argument and every status means.
+
+{notes}
+`daqp/` holds sources of DAQP 0.11.0 by Daniel Arnström, unchanged, under the MIT licence in `daqp/LICENSE`.
+"""

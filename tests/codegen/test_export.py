@@ -1,0 +1,147 @@
+"""`km.export`: a folder that builds with every warning an error, runs clean, and closes the loop as Python does."""
+
+import shutil
+import subprocess
+
+import casadi as ca
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import koopmpc as km
+from koopmpc.cli.app import app
+from koopmpc.codegen.text import EXPRESSIONS, Language, function
+from koopmpc.plants.compiled import library
+from koopmpc.plants.graph import OPERATIONS, Graph
+
+COST = km.Cost(Q=[10.0, 1.0], R=0.1)
+LIMITS = km.Limits(u_min=-25.0, u_max=25.0, x_min=[-0.5, -1.0], x_max=[0.5, 1.0], du_max=20.0)
+HEAP = {"malloc", "calloc", "realloc", "free", "fopen", "printf", "time", "clock"}
+
+
+@pytest.fixture(scope="module")
+def exported(pendulum, tmp_path_factory):
+    """A controller with soft limits, rates, latency and an estimator, and its folder."""
+    plant, model = pendulum
+    controller = km.KoopmanMPC(
+        model, COST, LIMITS, 15, solver="daqp", latency=1, estimator=km.LiftedDisturbance(), moves=10
+    )
+    folder = tmp_path_factory.mktemp("c") / "controller"
+    return plant, controller, km.export(controller, folder, plant=plant, x0=[0.7, 0.0], reference=[0.1, 0.0], steps=80)
+
+
+def make(folder, *words):
+    return subprocess.run(["make", "-s", *words], cwd=folder, capture_output=True, text=True)
+
+
+def table(printed):
+    return np.array([[float(word) for word in line.split(",")] for line in printed.splitlines()[1:]])
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_our_files_build_with_every_warning_an_error(exported, compiler):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not here")
+    done = make(exported[2], "strict", f"CC={compiler}")
+    assert done.returncode == 0, done.stderr[:2000]
+
+
+def test_the_example_closes_the_loop_as_python_does_with_inputs_that_act_late(exported):
+    plant, controller, folder = exported
+    done = make(folder, "run")
+    assert done.returncode == 0, done.stderr[:2000]
+    rows = table(done.stdout)
+    controller.reset()
+    x, acting = np.array([0.7, 0.0]), np.zeros(1)
+    for row in rows:
+        move = controller(x, [0.1, 0.0])
+        np.testing.assert_allclose(row[1:3], x, atol=1e-6)
+        np.testing.assert_allclose(row[3], move.u, atol=1e-5)
+        assert int(row[4]) == move.status.value
+        x, acting = plant(x, acting), move.u
+
+
+def test_no_object_calls_the_heap_a_file_or_a_clock(exported):
+    folder = exported[2]
+    assert make(folder, "libkoopmpc.a").returncode == 0
+    printed = subprocess.run(
+        ["nm", "-u", "libkoopmpc.a"], cwd=folder, capture_output=True, text=True, check=True
+    ).stdout
+    asked = {line.split()[-1] for line in printed.splitlines() if line.strip().startswith("U ")}
+    assert not HEAP & asked
+    # Tables that hold addresses are written once by the loader, unless the code stands where it was linked for.
+    assert make(folder, "clean").returncode == 0
+    assert make(folder, "libkoopmpc.a", "CFLAGS=-O2 -fno-pic").returncode == 0
+    printed = subprocess.run(["nm", "libkoopmpc.a"], cwd=folder, capture_output=True, text=True, check=True).stdout
+    kinds = {line.split()[-2] for line in printed.splitlines() if len(line.split()) == 3}
+    assert "T" in kinds
+    assert not kinds & set("DdBbC")
+
+
+def test_the_example_runs_clean_under_the_sanitizers(exported):
+    done = make(exported[2], "sanitize")
+    assert done.returncode == 0, done.stderr[:2000]
+
+
+def test_the_folder_may_be_written_again_but_not_over_other_files(exported, tmp_path):
+    _, controller, folder = exported
+    assert km.export(controller, folder) == folder
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(km.errors.DataError, match=r"holds thesis.tex, which no export wrote"):
+        km.export(controller, tmp_path)
+    assert (tmp_path / "thesis.tex").read_text() == "mine"
+    with pytest.raises(km.errors.DataError, match="is a file; pass a folder"):
+        km.export(controller, tmp_path / "thesis.tex")
+
+
+def test_the_readme_states_sizes(exported):
+    text = (exported[2] / "README.md").read_text()
+    assert "RAM: one `koopmpc_state`" in text
+    assert "DAQP" in text
+    assert "(a" not in (exported[2] / "koopmpc_sizes.h").read_text()
+
+
+def test_a_plant_of_another_size_is_refused(exported):
+    _, controller, folder = exported
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    other = km.StepMap(ca.Function("F", [x, u], [x]), 0.05)
+    with pytest.raises(km.errors.DataError, match="the plant has 2 inputs, the controller 1"):
+        km.export(controller, folder, plant=other)
+
+
+def test_single_precision_warns_where_rounding_moves_the_input(pendulum, tmp_path):
+    model = pendulum[1]
+    narrow = km.LQR(model, km.Cost(Q=[1e9, 1.0], R=1e-6), km.Limits(u_min=-1e-3, u_max=1e-3))
+    with pytest.warns(UserWarning, match=r"single precision rounding may move an input by .* % of its span"):
+        km.export(narrow, tmp_path / "f", precision="float")
+
+
+def test_a_saved_controller_is_exported_from_the_shell(exported, tmp_path):
+    exported[1].save(tmp_path / "c.npz")
+    arguments = ["export", str(tmp_path / "c.npz"), "--out", str(tmp_path / "c"), "--problem", "pendulum:hold"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "plant_step" in (tmp_path / "c" / "plant.c").read_text()
+
+
+def test_every_operation_of_a_graph_is_the_same_in_c():
+    assert set(EXPRESSIONS) == set(OPERATIONS)
+    a, b = ca.SX.sym("a"), ca.SX.sym("b")
+    results, names = [], []
+    for name, operation in OPERATIONS.items():
+        bounded = ca.sin(a) if name in ("asin", "acos", "atanh") else ca.fabs(a) + 0.1
+        first = bounded + 1 if name == "acosh" else bounded if name in ("log", "log1p", "sqrt", "pow") else a
+        first = bounded if name in ("asin", "acos", "atanh", "constpow") else first
+        results.append(operation.symbol(*(first, b)[: operation.operands]))
+        names.append(name)
+    graph = Graph.trace(ca.Function("all", [a, b], [ca.vertcat(*results)]))
+    text = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
+    code = library(text + function(graph, "all_of_them", {"a": 1, "b": 1}, "y", Language()).text, ["cc"], None)
+    rows = np.random.default_rng(0).normal(size=(50, 2)) * 2
+    expected = graph.evaluate(rows)
+    import ctypes
+
+    for row, want in zip(rows, expected, strict=True):
+        got, first, second = np.zeros(len(names)), row[:1].copy(), row[1:].copy()
+        code.all_of_them(*(ctypes.c_void_p(x.ctypes.data) for x in (first, second, got)))
+        np.testing.assert_allclose(got, want, rtol=1e-13, atol=1e-15)

@@ -1,0 +1,170 @@
+"""The C of a controller against the controller: every step is told the same, and both must answer alike."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+COST = km.Cost(Q=[10.0, 1.0], R=0.1)
+BOX = {"u_min": -25.0, "u_max": 25.0}
+CLOSE = 1e-6  # share of the inputs' span: DAQP's answers are good to its tolerance of 1e-8 times the price of slacks
+
+
+class Asked(NamedTuple):
+    """A controller of a model, what its steps are told, and statuses that have to come up."""
+
+    make: object
+    seen: tuple[str, ...]
+    preview: int = 0
+    bad: bool = True
+    applied: bool = False
+
+
+def mpc(limits, horizon=15, cost=COST, **options):
+    return lambda model: km.KoopmanMPC(model, cost, km.Limits(**limits), horizon, solver="daqp", **options)
+
+
+CONTROLLERS = {
+    "inputs": Asked(mpc(BOX), ("UNCONSTRAINED", "OPTIMAL", "BAD_MEASUREMENT")),
+    "lqr": Asked(lambda model: km.LQR(model, COST, km.Limits(**BOX, du_max=20.0)), ("SATURATED", "BAD_MEASUREMENT")),
+    "soft": Asked(mpc(BOX | {"x_min": [-0.5, -1.0], "x_max": [0.5, 1.0]}), ("SOFTENED",), preview=20),
+    "hard": Asked(mpc(BOX | {"x_min": [-0.6, -1.0], "x_max": [0.6, 1.0], "slack": None}, 8), ("OPTIMAL", "INFEASIBLE")),
+    "rates": Asked(
+        mpc(
+            BOX | {"du_max": 4.0, "x_max": [0.8, np.inf]},
+            cost=km.Cost(Q=[10.0, 1.0], R=0.1, R_delta=0.3),
+            moves=(1, 1, 2, 3, 8),
+            latency=1,
+        ),
+        ("OPTIMAL", "SOFTENED"),
+        applied=True,
+    ),
+    "disturbance": Asked(
+        mpc(BOX | {"x_max": [0.5, 9.0]}, estimator=km.LiftedDisturbance()), ("OPTIMAL", "SOFTENED"), preview=4
+    ),
+    "filter": Asked(
+        mpc(BOX, estimator=km.LiftedKalman(["theta", "omega"], disturbance="output", delay=2)), ("OPTIMAL",)
+    ),
+    "given": Asked(
+        mpc(BOX, cost=km.Cost(Q=[10.0, 1.0], R=0.1, u_target=np.linspace(0, 5, 30)[:, None]), horizon=10), ("OPTIMAL",)
+    ),
+}
+
+
+def steps_of(config, plant, steps, rng):
+    """What the steps are told: measurements of a run with noise, missed samples, previews, inputs that did not act."""
+    x = np.array([np.pi / 4, 0.0])
+    for k in range(steps):
+        y = x.copy()
+        if config.bad and k % 19 == 7:
+            y[rng.integers(2)] = np.nan
+        reference = np.zeros(2)
+        if config.preview:
+            phase = 0.1 * (k + np.arange(config.preview))
+            reference = np.column_stack([0.7 * np.sin(phase), np.zeros(len(phase))])
+        applied = rng.uniform(-25, 25, 1) if config.applied and k % 5 == 3 else None
+        if config.applied and k % 41 == 17:
+            applied = np.array([np.nan])
+        u = yield y, reference, applied
+        x = plant(x, u) + 0.02 * rng.standard_normal(2)
+        if np.abs(x).max() > 6 or k % 60 == 59:
+            x = rng.uniform(-1.5, 1.5, 2)
+
+
+def compared(controller, twin, told, steps, within):
+    """Drive both with the same; return the statuses that came up."""
+    controller.reset()
+    twin.reset()
+    seen = {}
+    said = next(told)
+    for _ in range(steps):
+        y, reference, applied = said
+        a, b = controller(y, reference, applied), twin(y, reference, applied)
+        assert (a.status, a.fallback) == (b.status, b.fallback)
+        np.testing.assert_allclose(b.u, a.u, rtol=0, atol=within)
+        if within < 1e-3:
+            assert a.iterations == b.iterations
+            assert abs(a.slack - b.slack) <= 1e-5 * max(1.0, a.slack)
+        seen[a.status.name] = seen.get(a.status.name, 0) + 1
+        try:
+            said = told.send(a.u)
+        except StopIteration:
+            break
+    return seen
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("steps", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_c_and_python_answer_alike(name, steps, pendulum):
+    plant, model = pendulum
+    asked = CONTROLLERS[name]
+    controller = asked.make(model)
+    twin = km.compiled(controller)
+    assert type(twin).__name__ == "Compiled"
+    told = steps_of(asked, plant, steps, np.random.default_rng(1))
+    seen = compared(controller, twin, told, steps, CLOSE * 50)
+    assert set(asked.seen) <= set(seen)
+
+
+@pytest.mark.parametrize("name", ["inputs", "soft"])
+@pytest.mark.parametrize("steps", [200, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_floats_answer_to_a_thousandth_of_the_range(name, steps, pendulum):
+    plant, model = pendulum
+    asked = CONTROLLERS[name]
+    controller = asked.make(model)
+    twin = km.compiled(controller, precision="float")
+    told = steps_of(asked, plant, steps, np.random.default_rng(2))
+    controller.reset()
+    said, off, other = next(told), [], 0
+    for _ in range(steps):
+        a, b = controller(*said), twin(*said)
+        if a.status is b.status:
+            off.append(np.abs(a.u - b.u).max())
+        else:
+            other += 1
+        try:
+            said = told.send(a.u)
+        except StopIteration:
+            break
+    assert max(off) <= 1e-3 * 50
+    assert other <= 0.002 * steps  # within a tolerance of a limit
+
+
+def test_a_past_two_inputs_and_a_measured_disturbance_are_told_alike(cart):
+    limits = km.Limits(u_min=-2.0, u_max=2.0, du_max=[0.5, 1.0], du_slack=(50.0, 5.0), x_max=[0.6, 1.0])
+    cost = km.Cost(Q=[5.0, 0.1], R=[0.1, 0.2])
+    controller = km.KoopmanMPC(
+        cart, cost, limits, 12, solver="daqp", latency=2, moves=6, estimator=km.LiftedDisturbance(gain=0.3)
+    )
+    twin = km.compiled(controller)
+    rng = np.random.default_rng(4)
+    seen = set()
+    for k in range(300):
+        x = rng.uniform(-1.2, 1.2, 2) if k % 7 else np.full(2, np.nan)
+        w = [None, rng.uniform(-1, 1, 1), rng.uniform(-1, 1, (5, 1)), np.array([np.nan])][k % 4 if k % 50 else 3]
+        reference = rng.uniform(-2, 2, (3, 2))
+        a, b = controller(x, reference, None, w), twin(x, reference, None, w)
+        assert (a.status, a.fallback) == (b.status, b.fallback), k
+        np.testing.assert_allclose(b.u, a.u, rtol=0, atol=4e-6)
+        seen.add(a.status.name)
+        first, second = controller.plan(), twin.plan()
+        assert (first is None) == (second is None)
+        if first is not None:
+            np.testing.assert_allclose(second.X, first.X, atol=1e-5)
+            np.testing.assert_allclose(second.U, first.U, atol=1e-5)
+    assert {"SOFTENED", "BAD_MEASUREMENT"} <= seen
+
+
+def test_a_closed_loop_costs_the_same(pendulum):
+    plant, model = pendulum
+    limits = km.Limits(**BOX, x_max=[1.0, 0.2])
+    controller = km.KoopmanMPC(model, COST, limits, 20, solver="daqp")
+    runs = [
+        km.simulate(plant, one, x0=[np.pi / 4, 0.0], reference=[0.4, 0.0], steps=150, cost=COST, limits=limits)
+        for one in (controller, km.compiled(controller))
+    ]
+    costs = [km.metrics(run).cost for run in runs]
+    assert abs(costs[1] / costs[0] - 1) < 1e-6
+    assert list(runs[0].status) == list(runs[1].status)

@@ -1,0 +1,23 @@
+"""Every Python block of docs/on_the_machine.md runs, one after the other, and the table of its example is what is printed."""
+
+import re
+import subprocess
+from pathlib import Path
+
+TEXT = (Path(__file__).parents[1] / "docs" / "on_the_machine.md").read_text(encoding="utf-8")
+
+
+def test_the_page_runs_as_it_stands(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for source in re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL):
+        exec(compile(source, "docs/on_the_machine.md", "exec"), names)
+    assert capsys.readouterr().out.splitlines()[-1] == "True"
+    printed = subprocess.run(
+        ["make", "-s", "run"], cwd=tmp_path / "controller", capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    shown = [line.strip() for line in TEXT.splitlines() if re.match(r"    (step|\d+),", line)]
+    assert printed[0] == shown[0]
+    for line, wanted in zip(printed[1:], shown[1:], strict=False):
+        numbers = [[float(word) for word in each.split(",")] for each in (line, wanted)]
+        assert max(abs(a - b) for a, b in zip(*numbers, strict=True)) < 1e-4
