@@ -17,11 +17,13 @@ from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.codegen.sources import sources_of
 from koopmpc.codegen.tables import tables_of
+from koopmpc.codegen.text import Language, function, traced
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
-from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
+from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, WholeRun, alone, busy
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.compiled import compiler, library, private_cache
+from koopmpc.plants.step_map import StepMap
 
 Precision = Literal["double", "float"]
 _STATUS, _FALLBACK = list(Status), list(Fallback)
@@ -46,7 +48,44 @@ DOOR void koopmpc_call(koopmpc_frame *f) {
   koopmpc_step(f->state, f->y, &f->reference, f->applied, f->w.count ? &f->w : 0, f->u, &f->report);
 }
 DOOR long koopmpc_state_size(void) { return (long)sizeof(koopmpc_state); }
+
+/* A whole run: the controller and the plant step by step, with a clock around the controller. */
+typedef struct {
+  long steps;
+  int nx, ny, preview, measured;
+  void (*step)(const double *x, const double *u, double *next);
+  void (*measure)(const double *x, double *y);
+  const koopmpc_real *rows, *W;
+  double *X, *Y, *U, *slack, *times;
+  int *reports;
+} koopmpc_whole;
+#ifndef KOOPMPC_FLOAT
+static double koopmpc_now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
+  for (long k = 0; k < run->steps; k++) {
+    const koopmpc_rows reference = {run->rows + k * KOOPMPC_NR, run->preview ? KOOPMPC_HORIZON + 1 : 1};
+    const koopmpc_rows w = {run->W + k * KOOPMPC_NW, run->preview && KOOPMPC_HORIZON > 0 ? KOOPMPC_HORIZON : 1};
+    double *x = run->X + k * run->nx, *u = run->U + k * KOOPMPC_NU;
+    const double start = koopmpc_now();
+    koopmpc_step(f->state, run->Y + k * run->ny, &reference, k ? u - KOOPMPC_NU : 0, run->measured ? &w : 0, u,
+                 &f->report);
+    run->times[k] = koopmpc_now() - start;
+    run->reports[3 * k] = (int)f->report.status;
+    run->reports[3 * k + 1] = (int)f->report.fallback;
+    run->reports[3 * k + 2] = f->report.iterations;
+    run->slack[k] = f->report.slack;
+    run->step(x, u, x + run->nx);
+    run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
+  }
+}
+#endif
 """
+_CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"
+_PLANTS = 8  # plants whose machine code a controller keeps
 
 
 class NoCompilerWarning(UserWarning):
@@ -88,6 +127,17 @@ class _SingleFrame(ctypes.Structure):
         ("fallback", ctypes.c_int),
         ("iterations", ctypes.c_int),
         ("slack", ctypes.c_float),
+    )
+
+
+class _Whole(ctypes.Structure):
+    """What a whole run passes; the same fields as in C."""
+
+    _fields_ = (
+        ("steps", ctypes.c_long),
+        *((name, ctypes.c_int) for name in ("nx", "ny", "preview", "measured")),
+        *((name, ctypes.c_void_p) for name in ("step", "measure", "rows", "W", "X", "Y", "U")),
+        *((name, ctypes.c_void_p) for name in ("slack", "times", "reports")),
     )
 
 
@@ -185,7 +235,7 @@ def _processor() -> str:
 def _built(controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> _Built:
     single = precision == "float"
     tables = tables_of(controller, single=single)
-    text = amalgamated(sources_of(tables, single=single)) + _DOOR + f"/* {_processor()} */\n"
+    text = _CLOCK + amalgamated(sources_of(tables, single=single)) + _DOOR + f"/* {_processor()} */\n"
     cache = private_cache()
     try:
         code = library(text, [*command, *machine()], cache)
@@ -210,6 +260,7 @@ class Compiled:
         self.cost, self.limits, self.predictor = controller.cost, controller.limits, controller.predictor
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
         self._memory = np.zeros(-(-built.state_size // 8))
+        self._plants: dict[int, tuple[StepMap, ctypes.CDLL]] = {}
         self._connect()
         self.reset()
 
@@ -335,6 +386,56 @@ class Compiled:
             Z[k + 1] = model.A @ Z[k] + model.B @ U[k] + push[k]
         return Plan(Z @ model.C.T, U)
 
+    @alone
+    def whole_run(
+        self,
+        plant: StepMap,
+        rows: Float[np.ndarray, "rows nr"],
+        W: Float[np.ndarray, "wrows nw"] | None,
+        X: Float[np.ndarray, "T1 nx"],
+        Y: Float[np.ndarray, "T1 ny"],
+        U: Float[np.ndarray, "T nu"],
+        *,
+        preview: bool,
+    ) -> WholeRun | None:
+        """Write a whole run from X[0] and Y[0] into X, Y and U; None where the plant cannot be written in C.
+
+        `simulate` asks for it where nothing between two steps needs Python.
+        """
+        misfit = rows.shape[1] != self._nr or Y.shape[1] != self._ny or (W is not None and W.shape[1] != self._nw)
+        code = None if misfit or self.precision == "float" else self._machine_of(plant)
+        if code is None:
+            return None
+        T = len(U)
+        slack, times, reports = np.zeros(T), np.zeros(T), np.zeros((T, 3), dtype=np.intc)
+        rows, W = np.ascontiguousarray(rows), np.zeros((1, 1)) if W is None else np.ascontiguousarray(W)
+        arrays = {"rows": rows, "W": W, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
+        whole = _Whole(T, X.shape[1], Y.shape[1], preview, W.shape[1] == self._nw and self._nw > 0)
+        for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
+            setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
+        for name, array in arrays.items():
+            assert array.flags.c_contiguous, "machine code reads contiguous arrays"
+            setattr(whole, name, array.ctypes.data)
+        self._built.code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
+        return WholeRun(reports[:, 0], reports[:, 1], reports[:, 2], slack, times)
+
+    def _machine_of(self, plant: StepMap) -> ctypes.CDLL | None:
+        """Return the plant in machine code, built when it is first driven."""
+        known = self._plants.get(id(plant))
+        if known is not None:
+            return known[1]
+        command = compiler()
+        try:
+            if command is None:
+                return None
+            code = library(plant_text(plant), command, private_cache())
+        except (DataError, OSError, subprocess.SubprocessError):
+            return None
+        while len(self._plants) >= _PLANTS:
+            self._plants.pop(next(iter(self._plants)))
+        self._plants[id(plant)] = plant, code
+        return code
+
     def __copy__(self) -> "Compiled":
         """Return a copy that shares nothing with this one that moves in a step."""
         twin = object.__new__(Compiled)
@@ -348,6 +449,24 @@ class Compiled:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (self.original, self.precision, self._memory)
+
+
+def plant_text(plant: StepMap) -> str:
+    """Return ``plant_step(x, u, next)`` and ``plant_measure(x, y)`` in double precision.
+
+    Raises
+    ------
+    DataError
+        Its equations cannot be written in C.
+    """
+    nx, nu = plant.F.size1_in(0), plant.F.size1_in(1)
+    step, look = traced(plant.F, "the plant"), traced(plant.h, "what the plant measures")
+    head = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
+    return (
+        head
+        + function(step, "plant_step", {"x": nx, "u": nu}, "next", Language()).text
+        + function(look, "plant_measure", {"x": nx}, "y", Language()).text
+    )
 
 
 def _rebuilt(controller: LQR | KoopmanMPC, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:

@@ -5,7 +5,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from koopmpc.codegen.tables import Arrays, Tables
+from koopmpc.codegen.tables import CArrays, Tables
 from koopmpc.codegen.text import Language, function
 
 OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c", "koopmpc_qp.h", "koopmpc_qp.c")
@@ -105,5 +105,5 @@ def _targets(tables: Tables, language: Language) -> str:
 
 def constants(tables: Tables) -> int:
     """Return how many numbers the controller's tables hold."""
-    groups: tuple[Mapping[str, np.ndarray] | Arrays, ...] = (tables.limits, tables.plan, tables.targets)
+    groups: tuple[Mapping[str, np.ndarray] | CArrays, ...] = (tables.limits, tables.plan, tables.targets)
     return sum(max(1, np.size(values)) for group in groups for values in group.values())

@@ -19,7 +19,7 @@ from koopmpc.estimate.filtered import Kalman
 from koopmpc.estimate.observer import Measured
 from koopmpc.predict.predictors import LinearPredictor
 
-Arrays = dict[str, np.ndarray]
+CArrays = dict[str, np.ndarray]
 _ZERO_ROW = 1e-11  # squared length below which DAQP leaves a row as it is
 _ADVICE = "export a KoopmanMPC, a LinearMPC or an LQR"
 
@@ -44,9 +44,9 @@ class Tables:
 
     predictor: LinearPredictor
     sizes: dict[str, int]
-    limits: Arrays = field(default_factory=dict)
-    plan: Arrays = field(default_factory=dict)
-    targets: Arrays = field(default_factory=dict)
+    limits: CArrays = field(default_factory=dict)
+    plan: CArrays = field(default_factory=dict)
+    targets: CArrays = field(default_factory=dict)
     target_qps: list[tuple[int, int]] = field(default_factory=list)
     settings: dict[str, float] = field(default_factory=dict)
     reals: dict[str, float] = field(default_factory=dict)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import wraps
 from threading import get_ident
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -80,6 +80,16 @@ class Move:
     slack: float = 0.0
     solver: str = ""
     known: bool | None = None
+
+
+class WholeRun(NamedTuple):
+    """The steps of a run that a controller has made at once: numbers of Status and Fallback, and the rest of a Move."""
+
+    status: Int[np.ndarray, " T"]
+    fallback: Int[np.ndarray, " T"]
+    iterations: Int[np.ndarray, " T"]
+    slack: Float[np.ndarray, " T"]
+    solve_time: Float[np.ndarray, " T"]
 
 
 @dataclass(frozen=True, eq=False)

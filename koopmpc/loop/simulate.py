@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.move import Controller, Fallback, Fallible, Move, Plan, Status
+from koopmpc.control.move import Controller, Fallback, Fallible, Move, Plan, Status, WholeRun
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.run import Plans, Run, Step
@@ -29,6 +29,7 @@ _CONTROLLER = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
     "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller"
 )
+_STATUS, _FALLBACK = list(Status), list(Fallback)
 _MOVE = ("u", "status", "fallback", "solve_time", "iterations", "slack")
 
 
@@ -175,7 +176,16 @@ def simulate(
         X[0] = state
     Y[0] = y = sensed(0, first) if spoilt else first
     controller.reset(x0)
-    for k in range(steps):
+    begin, whole = 0, getattr(controller, "whole_run", None)  # of a compiled controller
+    if whole is not None and isinstance(plant, StepMap) and not (spoilt or disturbed or observers or plans):
+        done: WholeRun | None = whole(plant, rows, W, X, Y, U, preview=preview)
+        if done is not None:
+            begin = steps
+            status = [_STATUS[i] for i in done.status.tolist()]
+            fallback = [_FALLBACK[i] for i in done.fallback.tolist()]
+            solver = ["daqp" if i else "" for i in done.iterations.tolist()]
+            solve_time, iterations, slack = done.solve_time.tolist(), done.iterations.tolist(), done.slack
+    for k in range(begin, steps):
         ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, nr))
         failing = fallible if broken is not None and broken.solver_fails(k) else None
         if failing is not None:

@@ -1,0 +1,63 @@
+"""`simulate` of a compiled controller on a StepMap runs in C, and returns the run that Python returns."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+COST = km.Cost(Q=[10.0, 1.0], R=0.1)
+LIMITS = km.Limits(u_min=-25.0, u_max=25.0, x_max=[0.6, 0.4])
+
+
+@pytest.fixture(scope="module")
+def controllers(pendulum):
+    controller = km.KoopmanMPC(pendulum[1], COST, LIMITS, 15, solver="daqp")
+    return controller, km.compiled(controller)
+
+
+@pytest.mark.parametrize("preview", [True, False])
+def test_a_run_in_c_is_that_of_python(pendulum, controllers, preview):
+    plant = pendulum[0]
+    phase = 0.05 * np.arange(121)
+    reference = np.column_stack([0.5 * np.sin(phase), np.zeros(121)])
+    first, second = (
+        km.simulate(plant, one, x0=[0.8, 0.0], reference=reference, steps=120, cost=COST, preview=preview)
+        for one in controllers
+    )
+    np.testing.assert_allclose(second.X, first.X, atol=1e-6)
+    np.testing.assert_allclose(second.U, first.U, atol=1e-4)
+    assert second.status == first.status
+    assert second.fallback == first.fallback
+    assert second.iterations.tolist() == first.iterations.tolist()
+    np.testing.assert_allclose(second.slack, first.slack, atol=1e-5)
+    assert abs(km.metrics(second).cost / km.metrics(first).cost - 1) < 1e-6
+    assert (second.solve_time > 0).all()
+
+
+def test_what_needs_python_between_two_steps_gets_it(pendulum, controllers):
+    plant, seen = pendulum[0], []
+    fast = controllers[1]
+    run = km.simulate(plant, fast, x0=[0.8, 0.0], reference=[0.0, 0.0], steps=5, observers=[seen.append])
+    assert len(seen) == 5
+    again = km.simulate(plant, fast, x0=[0.8, 0.0], reference=[0.0, 0.0], steps=5)
+    np.testing.assert_allclose(again.X, run.X, atol=1e-12)
+    noisy = km.simulate(plant, fast, x0=[0.8, 0.0], reference=[0.0, 0.0], steps=5, noise=[0.1, 0.1])
+    assert not np.array_equal(noisy.Y, run.Y)
+
+
+def test_a_plant_that_cannot_be_written_in_c_is_driven_from_python(controllers):
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    jump = ca.Function("jump", [x, u], [ca.if_else(x[0] > 0, x, x + 0.05 * ca.vertcat(x[1], u), False)])
+    callback = km.StepMap(ca.Function("F", [x, u], [jump(x, u)]), 0.05)
+    run = km.simulate(callback, controllers[1], x0=[-0.3, 0.0], reference=[0.0, 0.0], steps=10)
+    other = km.simulate(callback, controllers[0], x0=[-0.3, 0.0], reference=[0.0, 0.0], steps=10)
+    np.testing.assert_allclose(run.X, other.X, atol=1e-6)
+
+
+def test_many_runs_leave_nothing_behind_in_each_other(pendulum, controllers):
+    plant, fast = pendulum[0], controllers[1]
+    starts = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    rows = [km.simulate(plant, fast, x0=x, reference=[0.0, 0.0], steps=30).X for x in starts]
+    for x, row in zip(starts[::-1], rows[::-1], strict=True):
+        assert np.array_equal(km.simulate(plant, fast, x0=x, reference=[0.0, 0.0], steps=30).X, row)
