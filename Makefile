@@ -8,7 +8,7 @@ PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable
 TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
 
-.PHONY: bench test typed full mutants loops soak speed check format clean
+.PHONY: bench test typed full mutants loops soak speed check format clean embedded
 
 bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
@@ -37,6 +37,10 @@ speed: $(VENV)/installed-dev
 # Ten minutes of closed loops with faults, damaged files and interrupts; memory must stay flat.
 soak: $(VENV)/installed-dev
 	$(PINNED) $(BIN)/python -m tests.faults.soak
+
+# Three controllers in C on an emulated Cortex-M4F; says so where the Debian packages for it are missing.
+embedded: $(VENV)/installed-dev
+	$(PINNED) $(BIN)/python -m tests.embedded.run
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .

@@ -3,6 +3,7 @@
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +14,11 @@ from koopmpc import disk
 from koopmpc.bench.controllers import CONTROLLERS, LEARNED, Prepared, controller_names
 from koopmpc.bench.problem import Case, Problem
 from koopmpc.bench.results import RunRow, failures, reached, write_results
+from koopmpc.codegen.compiled import Compiled
+from koopmpc.codegen.compiled import compiled as built
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
-from koopmpc.errors import FullDiskError, ProblemError
+from koopmpc.errors import DataError, FullDiskError, ProblemError
 from koopmpc.loop.faults import (
     ActuatorDelay,
     ActuatorLoss,
@@ -59,6 +62,7 @@ def sweep(
     faults: bool = False,
     monitor: bool = False,
     live: bool = False,
+    compiled: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[RunRow]:
     """Run each controller on each case of each problem, and judge all by the same cost and limits.
@@ -80,6 +84,9 @@ def sweep(
     live
         Whether to stream each run to a Rerun viewer; one is opened where none is up. Without a viewer there is one
         UserWarning, and the runs are recorded all the same.
+    compiled
+        Whether to run those controllers in C that `km.compiled` can build; the others stay in Python. A run's metadata
+        say which it was.
     progress
         Called with (name of the run, runs done, runs in all).
 
@@ -118,7 +125,7 @@ def sweep(
             parts = Prepared(problem, monitored=monitor)
         if progress is not None:
             progress(f"{problem.name}:{' '.join(filter(None, task))}", len(rows), len(tasks))
-        rows.append(_row(parts, task, folder, live))
+        rows.append(_row(parts, task, folder, live, compiled))
         write_results(rows, folder / RESULTS)  # after every run, for the next one may be interrupted
     if not tasks:
         write_results(rows, folder / RESULTS)
@@ -133,12 +140,12 @@ def possible_faults(limits: Limits) -> tuple[str, ...]:
     return tuple(name for name in FAULTS if limited or name != "actuator-loss")
 
 
-def _row(parts: Prepared, task: _Task, folder: Path, live: bool) -> RunRow:
+def _row(parts: Prepared, task: _Task, folder: Path, live: bool, compiled: bool) -> RunRow:
     """Run one task, compute its figures, write its log and read it back; an exception becomes the row's failure."""
     problem, (case, name, fault) = parts.problem.name, task
     log = folder / ("-".join((problem, *filter(None, task))) + ".rrd")
     try:
-        run = _run(parts, task, live)
+        run = _run(parts, task, live, compiled)
         judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[case].steps)
     except FullDiskError:
         raise
@@ -179,19 +186,23 @@ def _recorded(run: Run, log: Path) -> list[str]:
     return []
 
 
-def _run(parts: Prepared, task: _Task, live: bool) -> Run:
+def _run(parts: Prepared, task: _Task, live: bool, compiled: bool) -> Run:
     """Return the run of one controller on one case."""
     problem, case, plant = parts.problem, parts.problem.cases[task.case], parts.truth_of(task.case)
     limits = problem.limits_of(task.case)
     controller = CONTROLLERS[task.controller](parts, limits)
+    if compiled:
+        with suppress(DataError):  # what cannot be written in C stays in Python
+            controller = built(controller)
     injected = () if task.fault is None else (FAULTS[task.fault],)
+    in_c = {"compiled": isinstance(controller, Compiled)} if compiled else {}
     held = parts.u_reference(task.case)
     _warm_up(controller, parts, case)
     about: dict[str, Any] = {
         "cost": problem.cost,
         "limits": limits,
         "angles": tuple(problem.angles),
-        "metadata": _metadata(problem, task, injected),
+        "metadata": _metadata(problem, task, injected) | in_c,
     }
     scene = problem.scene or getattr(plant, "scene", None)
 

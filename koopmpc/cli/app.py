@@ -109,6 +109,9 @@ def bench(
     faults: Faults = False,
     monitor: Watched = False,
     live: Live = False,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="Run in C the controllers that C is written for.")
+    ] = False,
     logs: Logs = Path("logs"),
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, on several problems."""
@@ -116,7 +119,7 @@ def bench(
 
     with _friendly():
         chosen = [load_problem(p) for p in problems or shipped()]
-        _sweep(chosen, controller, logs, "bench", faults=faults, monitor=monitor, live=live)
+        _sweep(chosen, controller, logs, "bench", faults=faults, monitor=monitor, live=live, compiled=compiled)
 
 
 @app.command()
@@ -362,6 +365,7 @@ def _sweep(
     faults: bool,
     monitor: bool,
     live: bool,
+    compiled: bool = False,
 ) -> None:
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
@@ -372,7 +376,8 @@ def _sweep(
     controller_names(controllers)
     folder = _new_folder(logs, what)
     with _bar("") as progress:
-        rows = sweep(problems, controllers, folder=folder, faults=faults, monitor=monitor, live=live, progress=progress)
+        asked: dict[str, bool] = {"faults": faults, "monitor": monitor, "live": live, "compiled": compiled}
+        rows = sweep(problems, controllers, folder=folder, progress=progress, **asked)
     out = _console()
     out.print(results_table(rows))
     out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)

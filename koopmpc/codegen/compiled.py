@@ -174,6 +174,8 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
         return controller
     if not isinstance(controller, LQR | KoopmanMPC):
         tables_of(controller, single=False)  # says why not
+    if getattr(controller, "watch", None) is not None:
+        warnings.warn("the monitor is not in the C: no Move says whether it is known", UserWarning, stacklevel=2)
     command = compiler()
     if command is None:
         warnings.warn(

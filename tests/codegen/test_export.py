@@ -124,6 +124,15 @@ def test_a_saved_controller_is_exported_from_the_shell(exported, tmp_path):
     assert "plant_step" in (tmp_path / "c" / "plant.c").read_text()
 
 
+def test_a_bench_in_c_says_of_each_controller_whether_it_was(tmp_path):
+    arguments = ["bench", "pendulum:upright", "-c", "koopman-mpc", "-c", "nonlinear-mpc", "--compiled"]
+    done = CliRunner().invoke(app, [*arguments, "--logs", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    runs = {path.stem.split("-", 2)[2]: km.load_run(path) for path in tmp_path.rglob("*.rrd")}
+    assert runs["koopman-mpc"].metadata["compiled"] is True
+    assert runs["nonlinear-mpc"].metadata["compiled"] is False
+
+
 def test_every_operation_of_a_graph_is_the_same_in_c():
     assert set(EXPRESSIONS) == set(OPERATIONS)
     a, b = ca.SX.sym("a"), ca.SX.sym("b")

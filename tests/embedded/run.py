@@ -1,0 +1,120 @@
+"""`make embedded`: the float controllers of three problems on an emulated Cortex-M4F, beside the same C on this machine.
+
+It needs the Debian packages gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm, and says so where one is missing.
+"""
+
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import koopmpc as km
+from koopmpc.bench.controllers import Prepared
+
+HERE = Path(__file__).parent
+PROBLEMS = ("pendulum:upright", "cart_pole", "pendulum_swing")
+STEPS, CLOSE = 200, 1e-3
+TOOLS = {
+    "arm-none-eabi-gcc": "gcc-arm-none-eabi and libnewlib-arm-none-eabi",
+    "qemu-system-arm": "qemu-system-arm",
+}
+CPU = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
+LIBRARIES = ("-lm", "-lc", "-lgcc", "--specs=nosys.specs")
+TICK = 40  # instructions, see board.c
+
+
+def say(line: str) -> None:
+    """Show a line at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Print a line a problem; 0 where all agree or a tool is missing."""
+    missing = [package for tool, package in TOOLS.items() if shutil.which(tool) is None]
+    if missing:
+        say(f"make embedded needs the Debian packages {', '.join(missing)}; nothing was run")
+        return 0
+    say(f"{'problem':<18}{'flash':>9}{'state':>9}{'stack':>8}{'instructions a step':>30}{'off host':>11}")
+    failed = False
+    for name in PROBLEMS:
+        with tempfile.TemporaryDirectory() as folder:
+            failed |= not shown(name, exported(name, Path(folder)))
+    return int(failed)
+
+
+def exported(name: str, folder: Path) -> Path:
+    """Export the Koopman MPC of a problem in single precision, its example on the problem's own plant."""
+    problem = km.load_problem(name)
+    parts = Prepared(problem)
+    case = next(iter(problem.cases.values()))
+    limits = problem.limits if case.limits is None else case.limits
+    controller = km.KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, solver="daqp")
+    row = np.atleast_2d(np.asarray(case.reference))[0]
+    return km.export(
+        controller, folder / "c", precision="float", plant=parts.step_map, x0=case.x0, reference=row, steps=STEPS
+    )
+
+
+def shown(name: str, folder: Path) -> bool:
+    """Build, run, compare and print; tell whether board and host agree."""
+    host = subprocess.run(["make", "-s", "run"], cwd=folder, capture_output=True, text=True, check=True).stdout
+    expected = np.array([[float(word) for word in line.split(",")] for line in host.splitlines()[1:]])
+    image = folder / "board.elf"
+    sources = [*sorted(folder.glob("koopmpc_*.c")), folder / "plant.c", HERE / "board.c"]
+    flags = (
+        "-o",
+        str(image),
+        "-std=gnu99",
+        "-O2",
+        "-ffunction-sections",
+        "-fdata-sections",
+        "-Wl,--gc-sections",
+        "-nostartfiles",
+    )
+    subprocess.run(
+        [
+            "arm-none-eabi-gcc",
+            *CPU,
+            *flags,
+            f"-I{folder}",
+            f"-T{HERE / 'cortex_m4.ld'}",
+            *map(str, sources),
+            *LIBRARIES,
+        ],
+        check=True,
+        capture_output=True,
+    )
+    size = subprocess.run(["arm-none-eabi-size", str(image)], capture_output=True, text=True, check=True).stdout
+    text, data, bss = (int(word) for word in size.splitlines()[1].split()[:3])
+    machine = ["-M", "mps2-an386", "-nographic", "-monitor", "none", "-serial", "none", "-icount", "shift=0"]
+    # what semihosting says goes to stderr
+    done = subprocess.run(
+        ["qemu-system-arm", *machine, "-semihosting-config", "enable=on,target=native", "-kernel", str(image)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    lines = (done.stdout + done.stderr).splitlines()
+    rows = [line.split() for line in lines if re.fullmatch(r"([0-9a-f]{8} )+[0-9a-f]{8}", line)]
+    stack = next((int(line.split()[1], 16) for line in lines if line.startswith("stack ")), 0)
+    if len(rows) != STEPS:
+        say(f"{name:<18} ended after {len(rows)} of {STEPS} steps: {lines[-1:]}")
+        return False
+    width = expected.shape[1] - 4
+    found = np.array([[struct.unpack(">f", bytes.fromhex(word))[0] for word in row[1 : 1 + width]] for row in rows])
+    instructions = TICK * np.array([int(row[-1], 16) for row in rows])
+    scale = np.abs(expected[:, 1 : 1 + width]).max(axis=0) + 1e-9
+    off = float((np.abs(found - expected[:, 1 : 1 + width]) / scale).max())
+    steps = f"{int(np.median(instructions))} median, {instructions.max()} worst"
+    say(f"{name:<18}{text + data:>9}{data + bss:>9}{stack:>8}{steps:>30}{off:>11.1e}")
+    return off <= CLOSE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
