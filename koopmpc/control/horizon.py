@@ -11,15 +11,17 @@ u = D_u ũ, r = D_r r̃, limited outputs D_g g̃, and a cost of `scale` times it
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag, solve_triangular
 
+from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking
 from koopmpc.control.riccati import Stage
 from koopmpc.control.target import Targets, observable_sizes
+from koopmpc.errors import DataError
 from koopmpc.predict.predictors import LinearPredictor
 
 
@@ -31,6 +33,32 @@ class SignalLayout(NamedTuple):
     nw: int
     nd: int
     size: int
+
+
+def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
+    """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
+
+    They are N ones, or M moves of which the last is held, or `moves` itself.
+
+    Raises
+    ------
+    DataError
+        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
+    """
+    N = checks.count(horizon, "horizon")
+    if moves is None:
+        return (1,) * N
+    if isinstance(moves, Sequence):
+        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
+        if sum(lengths) != N:
+            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
+        return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
+    M = checks.count(moves, "moves")
+    if M > N:
+        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
+    return (1,) * (M - 1) + (N - M + 1,)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""What a controller returns: a Move with a Status; a controller's protocol; move blocking; one thread at a time."""
+"""What a controller returns: a Move with a Status; a controller's protocol; one thread at a time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import wraps
@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ThreadError
+from koopmpc.errors import ThreadError
 from koopmpc.values import Value
 
 TurnTaker = TypeVar("TurnTaker", bound=Callable[..., Any])
@@ -148,32 +147,6 @@ class Controller(Protocol):
             (nw,) measured disturbances, or rows from step k on, the last repeated; zero by default.
         """
         ...
-
-
-def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
-    """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
-
-    They are N ones, or M moves of which the last is held, or `moves` itself.
-
-    Raises
-    ------
-    DataError
-        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
-    """
-    N = checks.count(horizon, "horizon")
-    if moves is None:
-        return (1,) * N
-    if isinstance(moves, Sequence):
-        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
-        if sum(lengths) != N:
-            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
-        return lengths
-    if not isinstance(cast(object, moves), int | np.integer):
-        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
-    M = checks.count(moves, "moves")
-    if M > N:
-        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
-    return (1,) * (M - 1) + (N - M + 1,)
 
 
 def busy(controller: object) -> ThreadError:

@@ -16,7 +16,7 @@ from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.monitor import Monitor, monitor_of
-from koopmpc.control.move import Move, Plan, Status, alone, blocked, busy
+from koopmpc.control.move import Move, Plan, Status, alone, busy
 from koopmpc.control.saved import Kind
 from koopmpc.control.solvers import SOLVERS, SolverName
 from koopmpc.control.solvers.base import Choice, StepSolver
@@ -105,7 +105,10 @@ class KoopmanMPC(MPCBase):
         if settings is not None:
             checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
-        track, blocks = lifted_tracking(predictor, cost, limits), blocked(moves, horizon)
+        track, asked, disturbed = lifted_tracking(predictor, cost, limits), SOLVERS[solver], estimator is not None
+        coordinates = self._wanted or asked.coordinates
+        self._map = plan_map(predictor, track, moves, horizon, coordinates, disturbed=disturbed)
+        blocks = self._map.blocks
         super().__init__(
             predictor.dt,
             predictor,
@@ -119,10 +122,8 @@ class KoopmanMPC(MPCBase):
             move_of=np.repeat(np.arange(len(blocks)), blocks),
             monitor=None if monitor is None else monitor_of(monitor, predictor),
         )
-        self.predictor, self._disturbed = predictor, estimator is not None
+        self.predictor, self._disturbed = predictor, disturbed
         self._options = {"solver": solver, "settings": dict(settings or {})}
-        asked = SOLVERS[solver]
-        self._map = plan_map(predictor, track, blocks, self._wanted or asked.coordinates, disturbed=self._disturbed)
         exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
         choices = [Choice(asked, {**asked.impatient, **(settings or {})}), *exact]
         self._qps = StepSolver(self._map.qp, [*choices, Choice(SOLVERS["osqp"], {}, late=True)])
@@ -167,7 +168,7 @@ class KoopmanMPC(MPCBase):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=self._disturbed)
+        self._map = plan_map(predictor, track, self._blocks, self._N, coordinates, disturbed=self._disturbed)
         self.predictor, self._states = predictor, None
         self._qps.update(self._map.qp)
         self._reference_key = None

@@ -1,5 +1,6 @@
 """The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -8,7 +9,7 @@ from jaxtyping import Float, Int
 
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
-from koopmpc.control.horizon import Horizon, Units, horizon_of, stages
+from koopmpc.control.horizon import Horizon, Units, blocked, horizon_of, stages
 from koopmpc.control.limits import Interval, Softness, ahead
 from koopmpc.control.linear.condense import Condensed, Coordinates, condense
 from koopmpc.control.riccati import recursion
@@ -49,6 +50,8 @@ class PlanMap:
 
     Attributes
     ----------
+    blocks
+        Lengths of the blocks of steps in which an input is held.
     moves, planned
         Entries of the inputs, which come first, and of v.
     box
@@ -69,7 +72,7 @@ class PlanMap:
 
     def __init__(self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed) -> None:
         self.track, self.targets, self.maps = track, targets, maps
-        self.moves = len(maps.hessian)
+        self.moves, self.blocks = len(maps.hessian), horizon.blocks
         self.deviation = maps.deviation[: self.moves]
         limits = _plan_limits(track, horizon, maps.deviation)
         self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low))
@@ -118,19 +121,20 @@ class PlanMap:
 def plan_map(
     predictor: LinearPredictor,
     track: LiftedTracking,
-    blocks: tuple[int, ...],
+    moves: int | Sequence[int] | None,
+    steps: int,
     coordinates: Coordinates,
     *,
     disturbed: bool,
 ) -> PlanMap:
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
-    targets = targets_of(predictor, track)
+    targets, blocks = targets_of(predictor, track), blocked(moves, steps)
     horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
     units = Units.of(predictor, track)
     own, aims = units.horizon(horizon), units.targets(targets)
-    cost, moves = units.cost(track.cost), stages(own, aims)
+    cost, parts = units.cost(track.cost), stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
-    law = recursion(moves, end.P, end.p)
+    law = recursion(parts, end.P, end.p)
     maps = condense(own, law, end, aims, units, coordinates)
     return PlanMap(track, targets, horizon, _scaled(maps, track.inputs, len(blocks)))
 

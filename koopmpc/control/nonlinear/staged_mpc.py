@@ -13,9 +13,10 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
+from koopmpc.control.horizon import blocked
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.monitor import Monitor, monitor_of
-from koopmpc.control.move import Move, Plan, Status, alone, blocked
+from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.data.episodes import Episodes
