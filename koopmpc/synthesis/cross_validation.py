@@ -109,6 +109,17 @@ class Tried(Value):
         alike = max(_ALIKE * worst[first:].min(), EXACT)
         return max(i for i in range(int(first), len(worst)) if worst[i] <= alike)
 
+    def nearest(self, floor: float) -> int:
+        """Return the index of the ridge from `floor` on with the least geometric mean of all errors.
+
+        On an unstable plant the last steps decide a mean over the horizon, and there a large ridge, which makes the
+        model tame, can win although it spoils the next step, and with it every gain. Here each step counts alike.
+        """
+        first = int(np.searchsorted(self.ridges[:-1], floor))
+        with np.errstate(divide="ignore"):
+            mean = np.log(np.maximum(self.errors[first:], EXACT)).mean(axis=(1, 2))
+        return first + int(np.argmin(mean))
+
 
 def tried(trial: Trial) -> Tried:
     """Cross-validate one candidate.
