@@ -1,0 +1,75 @@
+"""The reader's way: who follows a call opens few files, in the order in which the data goes, and returns to few of them."""
+
+import pytest
+
+from tests.bare import shown
+
+FOLLOWED = """
+import pathlib, sys
+root = str(pathlib.Path(km.__file__).parent) + "/"
+rng = np.random.default_rng(0)
+episodes = []
+for _ in range(4):
+    X, U = [rng.normal(size=2)], rng.normal(size=(60, 1))
+    for u in U:
+        X.append(X[-1] + 0.1 * np.array([X[-1][1], 2 * np.sin(X[-1][0]) + u[0]]) - 0.1 * X[-1])
+    episodes.append(km.Episode(X=np.array(X), U=U))
+data = km.Episodes(episodes, dt=0.1)
+
+def followed(name, call):
+    seen, returns, last, known = [], 0, None, set()
+    def hook(frame, event, arg):
+        nonlocal returns, last
+        code = frame.f_code
+        if event != "call" or code in known or not code.co_filename.startswith(root) or "<" in code.co_name:
+            return
+        known.add(code)
+        file = code.co_filename.removeprefix(root)
+        if file in ("errors.py", "checks.py", "values.py", "__init__.py") or file.startswith("lifting/"):
+            return
+        returns += file != last and file in seen
+        if file not in seen:
+            seen.append(file)
+        last = file
+    sys.setprofile(hook)
+    try:
+        result = call()
+    finally:
+        sys.setprofile(None)
+    print(name, len(seen), returns)
+    return result
+
+lifting = km.State() + km.Fourier(1, states=[0]) + km.Constant()
+cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-1, u_max=1, x_max=[1, 1])
+model = followed("edmd", lambda: km.edmd(data, lifting))
+bilinear = followed("bilinear_edmd", lambda: km.bilinear_edmd(data, lifting))
+mpc = followed("KoopmanMPC", lambda: km.KoopmanMPC(model, cost, limits, 20))
+followed("step", lambda: mpc([0.9, 0.9], [0, 0]))
+rti = followed("BilinearMPC", lambda: km.BilinearMPC(bilinear, cost, limits, 20))
+followed("bilinear_step", lambda: rti([0.9, 0.9], [0, 0]))
+plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.1)
+plant([0, 0], [0])  # its functions are set up at the first call
+followed("simulate", lambda: km.simulate(plant, mpc, x0=[0.3, 0], reference=[0, 0], steps=3))
+"""
+MOST = {  # files, returns
+    "edmd": (8, 6),
+    "bilinear_edmd": (8, 6),
+    "KoopmanMPC": (15, 6),
+    "step": (6, 3),
+    "BilinearMPC": (14, 6),
+    "bilinear_step": (8, 6),
+    "simulate": (10, 8),
+}
+
+
+@pytest.fixture(scope="module")
+def followed():
+    lines = (line.split() for line in shown(FOLLOWED))
+    return {name: (int(files), int(returns)) for name, files, returns in lines}
+
+
+@pytest.mark.parametrize("call", MOST)
+def test_who_follows_a_call_opens_few_files_and_returns_to_few(followed, call):
+    files, returns = followed[call]
+    assert files <= MOST[call][0]
+    assert returns <= MOST[call][1]
