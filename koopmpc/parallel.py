@@ -243,21 +243,39 @@ def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
     KoopmpcError
         Each worker died, or none can start.
     """
+    end = 0
     for _ in range(_TRIES):
         pool = _Pool(function, 1)
         try:
             with _one_thread(), _undisturbed():
                 begun = pool._executor.submit(os.getpid)
+            processes = list((pool._executor._processes or {}).values())
             try:
                 begun.result()
             except BrokenProcessPool as error:
+                end = _exit_code(processes)
+                if end < 0:
+                    continue
                 raise KoopmpcError(f"the worker processes cannot start; {_GUARD}") from error
+            end = 0
             return pool.submit(job).result()
         except BrokenProcessPool:
             continue
         finally:
             pool.close()
+    if end:
+        raise KoopmpcError(
+            f"each worker process was killed while it started (signal {-end}); run with fewer workers, or give them "
+            "more memory"
+        )
     raise KoopmpcError(died(str(job), f"{_TRIES} times"))
+
+
+def _exit_code(processes: list[Any]) -> int:
+    """Return how these processes ended: negative where a signal ended one, its number."""
+    for process in processes:
+        process.join(_GRACE)
+    return min((process.exitcode or 0 for process in processes), default=0)
 
 
 def _quiet_tracker() -> None:

@@ -22,6 +22,16 @@ def die(_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+class DeadOnArrival:
+    """A function whose worker is killed while it starts, for that is when it is unpickled there."""
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return die, (None,)
+
+    def __call__(self, task: object) -> object:
+        return task
+
+
 def die_once(task: tuple[str, int]) -> int:
     """Kill the worker the first time that the third task is done."""
     folder, i = task

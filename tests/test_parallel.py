@@ -166,6 +166,11 @@ def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
     assert 'put what the script runs under `if __name__ == "__main__":`' in ended.stderr
 
 
+def test_a_worker_that_is_killed_while_it_starts_is_not_blamed_on_the_script() -> None:
+    with pytest.raises(km.KoopmpcError, match=r"was killed while it started \(signal 9\); run with fewer workers"):
+        list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no process that removes semaphores")
 def test_a_program_that_ends_at_once_leaves_no_lines_of_its_workers_semaphores(tmp_path: Path) -> None:
     script = tmp_path / "script.py"

@@ -1,9 +1,11 @@
 """Problem: a plant, how to learn it, how to control it, and the cases in which controllers are compared."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -15,9 +17,11 @@ from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.plants.dynamics import Dynamics, Plant
-from koopmpc.plants.integrators import RK4, Integrator
-from koopmpc.plants.step_map import StepMap
+from koopmpc.plants.integrators import RK4, Euler, Integrator
+from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.scene import Scene
+
+_REST = 0.01  # share of 1 + |x| that a state may move by in one step from the equilibrium
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +131,11 @@ class Problem:
     ShapeError, DataError
         An initial state, a reference, the equilibrium, an angle, the cost or the limits do not fit; there is no case,
         or the name of one cannot be that of a file.
+
+    Warns
+    -----
+    UserWarning
+        The plant does not rest at the equilibrium.
     """
 
     dynamics: Dynamics
@@ -180,6 +189,19 @@ class Problem:
         wrong = [i for i in self.angles if not 0 <= i < nx]
         if wrong:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
+        self._check_rest(*point)
+
+    def _check_rest(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> None:
+        """Warn where the plant does not rest at the equilibrium: a state moves by 1 % of 1 + |x| in one step."""
+        moved = discretize(self.dynamics, self.dt, Euler())(x, u) - x
+        if not (np.abs(moved) <= _REST * (1 + np.abs(x))).all():
+            i = int(np.argmax(np.abs(moved) / (1 + np.abs(x))))
+            warnings.warn(
+                f"the equilibrium is none: from it {self.dynamics.states[i]!r} moves by {moved[i]:.3g} in one step of "
+                f"{self.dt:g} s; give x and u where the plant rests",
+                UserWarning,
+                stacklevel=4,
+            )
 
     def select(self, case: str) -> "Problem":
         """Return the problem with this case alone.

@@ -59,17 +59,19 @@ UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell 
 
 
 def results_table(rows: Sequence[RunRow]) -> RenderableType:
-    """Return one table for each case, the failures in full, and what the columns mean; all fits 100 columns."""
+    """Return one table for each case, each failure in full and once, and what the columns mean, within 100 columns."""
     parts: list[RenderableType] = []
     for (problem, case), group in groupby(rows, key=lambda row: (row.problem, row.case)):
         ran = list(group)
         parts.append(_case(f"{problem}:{case}", [row for row in ran if row.fault is None]))
         if any(row.fault is not None for row in ran):
             parts.append(_under_faults(f"{problem}:{case} under faults", ran))
+    failed: dict[str, list[str]] = {}
     for row in rows:
         if row.failure is not None:
             what = " ".join(filter(None, (f"{row.problem}:{row.case}", row.controller, row.fault)))
-            parts.append(Text(f"{what}: {row.failure}", style="red"))
+            failed.setdefault(row.failure, []).append(what)
+    parts += [Text(f"{', '.join(which)}: {failure}", style="red") for failure, which in failed.items()]
     broken = any(row.fault is not None for row in rows)
     parts.append(Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
     return Group(*parts)

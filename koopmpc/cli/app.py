@@ -428,7 +428,15 @@ def _console() -> Console:
 
 
 def _new_folder(logs: Path, what: str) -> Path:
-    """Make and return logs/<time>-<what>; a number follows where two calls share a second."""
+    """Make and return logs/<time>-<what>; a number follows where two calls share a second.
+
+    Raises
+    ------
+    LogError
+        `what` is a path, or no folder can be made there.
+    """
+    if not what or Path(what).name != what:
+        raise LogError(f"--name is {what!r}, and ends the name of one folder; leave out what makes it a path")
     stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}-{what}"
     tries = 0
     while True:
@@ -471,20 +479,24 @@ def _new_file(path: Path, text: str) -> Path:
 
 
 _OPTION = re.compile(r"\b(dt|states|inputs|resample|horizon|workers|scheduler)=")
+_SUBJECT = re.compile(r"(^|: )(dt|resample|horizon|workers|scheduler|runs)(?= is )")
 
 
 def _as_options(message: str) -> str:
     """Return the message with the options of this program in place of Python's arguments."""
-    return _OPTION.sub(lambda found: f"--{found.group(1)} ", message).replace(" ;", ";").replace(" ,", ",")
+    told = _OPTION.sub(lambda found: f"--{found.group(1)} ", message).replace(" ;", ";").replace(" ,", ",")
+    return _SUBJECT.sub(r"\1--\2", told)
 
 
 @contextmanager
 def _friendly() -> Generator[None]:
     """Show each warning and error of koopmpc as one message on stderr; an error exits with 2, a full disk with 1."""
-    err = Console(stderr=True)
+    err, shown = Console(stderr=True), set[str]()
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-        err.print(Text.assemble((f"{category.__name__}: ", "yellow"), _as_options(str(message))), soft_wrap=True)
+        if str(message) not in shown:
+            err.print(Text.assemble((f"{category.__name__}: ", "yellow"), _as_options(str(message))), soft_wrap=True)
+        shown.add(str(message))
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", FitWarning)

@@ -94,3 +94,11 @@ def test_select_keeps_all_but_the_other_cases(problem):
     assert one.dynamics is problem.dynamics
     with pytest.raises(km.errors.ProblemError, match=r"'tiny' has no case 'fra', did you mean 'far'\?"):
         problem.select("fra")
+
+
+@pytest.mark.parametrize(("name", "wrong"), [("pendulum", ([0.3, 0.0], [0.0])), ("cart_pole", ([0.0] * 4, [5.0]))])
+def test_a_point_where_the_plant_does_not_rest_is_named(name, wrong):
+    with pytest.warns(
+        UserWarning, match=r"the equilibrium is none: from it '(omega|velocity).*' moves by .* in one step of 0\.0"
+    ):
+        replace(km.load_problem(name), equilibrium=wrong)

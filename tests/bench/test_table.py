@@ -69,6 +69,13 @@ def test_each_case_has_a_table_with_training_time_and_failures_in_full():
     assert "raised" in text
 
 
+def test_a_failure_that_several_runs_share_is_told_once():
+    lost = "RuntimeError: the [gain] is lost"
+    text = printed(km.bench.results_table([*rows(), km.bench.RunRow("plant", "other", "koopman-mpc", failure=lost)]))
+    assert " ".join(text.split()).count(lost) == 1
+    assert f"plant:other lqr, plant:other koopman-mpc: {lost}" in " ".join(text.split())
+
+
 def test_a_column_of_violations_is_shown_only_where_there_are_some():
     assert "over " not in printed(km.bench.results_table([rows()[3]])).split("cost:")[0]
     assert "over " in printed(km.bench.results_table(rows())).split("cost:")[0]

@@ -1,5 +1,6 @@
 """Saves are whole or not there: full disks, interrupts and flipped bits lose no file and change none in silence."""
 
+import io
 import random
 import warnings
 import zipfile
@@ -201,3 +202,21 @@ def test_a_reader_that_ends_its_process_ends_no_other(tmp_path: Path, monkeypatc
     monkeypatch.setattr(rerun_reader.subprocess, "run", lambda command, **more: run([command[0], str(crash)], **more))
     with pytest.raises(km.errors.LogError, match=r"run\.rrd is damaged, beyond what can be read"):
         km.load_run(path)
+
+
+@pytest.mark.parametrize("depth", [50, 5_000, 200_000])
+@pytest.mark.parametrize("kind", ["list", "object", "sum"])
+def test_nested_text_in_a_model_is_refused(tmp_path: Path, depth: int, kind: str) -> None:
+    """Neither its reader nor what is built of it runs out of stack."""
+
+    left, right = {"list": ("[", "]"), "object": ('{"a":', "}"), "sum": ('{"kind": "Sum", "parts": [', "]}")}[kind]
+    path, member = tmp_path / "model.npz", io.BytesIO()
+    model().save(path)
+    text = f'{{"format": "koopmpc-1", "value": {left * depth}1{right * depth}}}'
+    with np.load(path) as held:
+        written = held["tree"].tobytes().decode()
+    format_of = written.split('"format":')[1].split('"')[1]
+    np.save(member, np.frombuffer(text.replace("koopmpc-1", format_of).encode(), dtype=np.uint8))
+    rezipped(path, tree=member.getvalue())
+    with pytest.raises(km.errors.LogError, match=r"model\.npz"):
+        km.load_model(path)

@@ -262,10 +262,16 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
         (["empty"], "holds no .npz, .parquet, .csv or .rrd file"),
         (["csv", "--states", "x,speed"], "has no column 'speed'"),
         (["csv", "--horizon", "500"], "pass a shorter --horizon"),
-        (["csv", "--horizon", "0"], "horizon is 0"),
+        (["csv", "--horizon", "0"], "--horizon is 0"),
+        (["csv", "--dt", "-1"], "--dt is -1"),
+        (["csv", "--resample", "0"], "--resample is 0"),
+        (["nowhere", "--name", "../x"], "--name is '../x', and ends the name of one folder"),
+        (["nowhere", "--name", ""], "--name is '', and ends the name of one folder"),
         (["csv/00.csv", "text.csv"], "text.csv"),
-        (["csv", "--workers", "0"], "workers is 0"),
-        (["csv", "--scheduler", "here"], "scheduler"),
+        (["nowhere", "--workers", "0"], "--workers is 0"),
+        (["nowhere", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "leave out --workers 2"),
+        (["nowhere", "--scheduler", "here"], "--scheduler is 'here'"),
+        (["csv/00.csv", "csv/00.csv"], "csv/00.csv is given twice"),
     ],
 )
 @pytest.mark.usefixtures("quick")
@@ -278,7 +284,8 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
     assert result.exit_code == 2, result.output
     assert words in result.stderr
     assert "Traceback" not in result.output
-    assert not list((tmp_path / "logs").iterdir())  # no empty folder is left behind
+    assert result.stderr.count(words) == 1
+    assert not list(tmp_path.glob("logs/*"))  # no empty folder is left behind
 
 
 def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):

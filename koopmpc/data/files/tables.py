@@ -143,6 +143,11 @@ class Told:
     disturbances: Sequence[str] | None = None
     resample: float | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("dt", "resample"):
+            if getattr(self, name) is not None:
+                checks.positive(getattr(self, name), name, "s")
+
     @property
     def nothing(self) -> bool:
         """True where the caller gives nothing."""
