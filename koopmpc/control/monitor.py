@@ -80,8 +80,8 @@ class Monitor(Value):
         rank = int(np.ceil((len(V) + 1) * level - 1e-9))
         if rank > len(V):
             raise DataError(
-                f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level)))} are needed for a level of "
-                f"{level:g}; pass more data, or a lower level"
+                f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level) - 1e-9))} are needed for a "
+                f"level of {level:g}; pass more data, or a lower level"
             )
         band, inside = _whitening(E, _EXACT, X), _whitening(V, 0.0, V)
         return cls(_to_one(inside, V, rank), _to_one(band, E, rank), level, model.lifting)

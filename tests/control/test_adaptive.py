@@ -143,3 +143,12 @@ def test_a_forecast_that_turns_nan_is_the_worst_of_all(model, train, monkeypatch
     one = adaptive(model, train)
     monkeypatch.setattr(one, "_errors", lambda model, pairs: np.full((3, 2), value))
     assert one._error(model, []) == np.inf
+
+
+def test_it_begins_as_after_a_reset(model, train):
+    fresh, again = adaptive(model, train), adaptive(model, train)
+    again.reset()
+    x = np.array(train[0].X[0])
+    for _ in range(3):
+        assert np.array_equal(fresh(x, np.zeros(len(x))).u, again(x, np.zeros(len(x))).u)
+    assert (fresh.learned, fresh.renewed) == (again.learned, again.renewed)

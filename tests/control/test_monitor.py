@@ -187,3 +187,23 @@ def test_what_cannot_be_monitored_is_refused_in_words(model, data):
         "show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), None, 5, monitor=3))"
     )
     assert "monitor is a int" in said[0] or "monitor" in said[0]
+
+
+def test_a_level_needs_as_many_rows_as_its_quantile_has(model):
+    """The 0.9 quantile of M errors is the ⌈0.9 (M + 1)⌉-th: nine are enough, eight are not."""
+    whole = collected(1, episodes=1)[0]
+
+    def head(rows):
+        return km.Episodes([km.Episode(X=whole.X[: rows + 1], U=whole.U[:rows])], DT, model.states, model.inputs)
+
+    assert km.Monitor.of(model, head(9), level=0.9).level == 0.9
+    with pytest.raises(km.errors.DataError, match=r"8 rows, at least 9 are needed for a level of 0\.9"):
+        km.Monitor.of(model, head(8), level=0.9)
+
+
+def test_a_bilinear_mpc_does_not_know_where_no_data_were(data):
+    mpc = km.BilinearMPC(km.bilinear_edmd(data, LIFTING, difference=True), COST, LIMITS, 10, monitor=data)
+    for x, inside in (([0.3, 0.0], True), ([1.0, 30.0], False), ([-0.2, 0.5], True), ([-1.0, -30.0], False)):
+        mpc.reset()
+        mpc(x, [0.0, 0.0])
+        assert mpc.watch.inside is inside

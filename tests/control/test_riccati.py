@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.riccati import Stage, iterate, leap, one_step, recursion, stationary
+from koopmpc.control.riccati import Stage, _growth, iterate, leap, one_step, recursion, stationary
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -250,3 +250,19 @@ def test_messages():
     for solve, unstable in ((km.lqr, [[1.0, 0], [0, 1]]), (km.dlqr, [[0.5, 0], [0, 1.1]])):
         with pytest.raises(km.errors.DataError, match=r"no stabilising solution: .* not stabilisable"):
             solve(unstable, B, 1, 1)
+
+
+@pytest.mark.parametrize("Q", [[1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
+@pytest.mark.parametrize("unstable", [1.05, -1.2])
+def test_a_mode_that_no_input_reaches_must_decay_by_itself(Q, unstable):
+    """The other mode is stabilised, and one slow mode is enough for no law."""
+    with pytest.raises(km.errors.KoopmpcError):
+        km.dlqr(np.diag([unstable, 0.5]), [[0.0], [1.0]], np.diag(Q), [[1.0]])
+
+
+@pytest.mark.parametrize("powers", [(0, 0, 0), (12, 0, -12), (-20, 5, 20)])
+def test_units_do_not_change_how_many_digits_a_step_is_said_to_lose(powers):
+    """A triangular matrix too: its eigenvalues stand apart, and its units are balanced all the same."""
+    T = np.diag(2.0 ** np.array(powers))
+    for A in (np.triu(np.ones((3, 3))), np.ones((3, 3))):
+        assert _growth(T @ A @ np.linalg.inv(T)) < 4 * _growth(A)

@@ -1,6 +1,9 @@
 """A doubtful fit warns once, says why, and keeps the sentence in its report."""
 
+import os
 import warnings
+from inspect import currentframe
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -126,3 +129,12 @@ def test_a_rank_that_the_data_do_not_have_is_lowered() -> None:
     assert "rank 3 was asked for, the snapshots have rank 2, which is taken" in sentences[0]
     assert model.A.shape == (2, 2)
     assert not warned(flat, km.State(), rank=2)[1]
+
+
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook stands between the calls")
+def test_a_doubt_points_at_the_callers_line() -> None:
+    data = km.Episodes([km.Episode(X=np.ones((6, 2)), U=np.zeros((5, 0)))], 0.1)
+    line = currentframe().f_lineno + 2
+    with pytest.warns(km.FitWarning) as caught:
+        km.edmd(data, km.State() + km.Monomials(2))
+    assert {(Path(warning.filename).name, warning.lineno) for warning in caught} == {("test_doubts.py", line)}
