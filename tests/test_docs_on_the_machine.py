@@ -12,7 +12,8 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     names = {}
     for source in re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL):
         exec(compile(source, "docs/on_the_machine.md", "exec"), names)
-    assert capsys.readouterr().out.splitlines()[-1] == "True"
+    said = capsys.readouterr().out.splitlines()
+    assert said[-2:] == ["True", "(1000, 201, 2) (1000, 200, 1) True"]
     printed = subprocess.run(
         ["make", "-s", "run"], cwd=tmp_path / "controller", capture_output=True, text=True, check=True
     ).stdout.splitlines()

@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -68,18 +68,31 @@ static double koopmpc_now(void) {
 DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
   for (long k = 0; k < run->steps; k++) {
     const koopmpc_rows reference = {run->rows + k * KOOPMPC_NR, run->preview ? KOOPMPC_HORIZON + 1 : 1};
-    const koopmpc_rows w = {run->W + k * KOOPMPC_NW, run->preview && KOOPMPC_HORIZON > 0 ? KOOPMPC_HORIZON : 1};
+    const koopmpc_rows w = {run->measured ? run->W + k * KOOPMPC_NW : 0,
+                            run->preview && KOOPMPC_HORIZON > 0 ? KOOPMPC_HORIZON : 1};
     double *x = run->X + k * run->nx, *u = run->U + k * KOOPMPC_NU;
-    const double start = koopmpc_now();
+    const double start = run->times ? koopmpc_now() : 0;
     koopmpc_step(f->state, run->Y + k * run->ny, &reference, k ? u - KOOPMPC_NU : 0, run->measured ? &w : 0, u,
                  &f->report);
-    run->times[k] = koopmpc_now() - start;
+    if (run->times) run->times[k] = koopmpc_now() - start;
     run->reports[3 * k] = (int)f->report.status;
     run->reports[3 * k + 1] = (int)f->report.fallback;
     run->reports[3 * k + 2] = f->report.iterations;
     run->slack[k] = f->report.slack;
     run->step(x, u, x + run->nx);
     run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
+  }
+}
+/* ManyRuns from many states, one after the other, each from the beginning; Y holds one run. */
+DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
+  for (long e = 0; e < runs; e++) {
+    koopmpc_init(f->state, KOOPMPC_NX == run->nx ? run->X : 0, 0);
+    run->measure(run->X, run->Y);
+    koopmpc_run(f, run);
+    run->X += (run->steps + 1) * run->nx;
+    run->U += run->steps * KOOPMPC_NU;
+    run->slack += run->steps;
+    run->reports += 3 * run->steps;
   }
 }
 #endif
@@ -248,6 +261,16 @@ def _built(controller: LQR | KoopmanMPC, precision: Precision, command: list[str
     return _Built(code, tables.sizes, int(code.koopmpc_state_size()))
 
 
+class ManyRuns(NamedTuple):
+    """Closed loops side by side: X (E, T+1, nx), U (E, T, nu), and of every step Status, Fallback and slack."""
+
+    X: Float[np.ndarray, "E T1 nx"]
+    U: Float[np.ndarray, "E T nu"]
+    status: Int[np.ndarray, "E T"]
+    fallback: Int[np.ndarray, "E T"]
+    slack: Float[np.ndarray, "E T"]
+
+
 class Compiled:
     """A controller in machine code; see `compiled`.
 
@@ -282,7 +305,8 @@ class Compiled:
         self._applied_address = self._applied.ctypes.data
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._call = self._built.code.koopmpc_call
-        self._row_shapes = (self._nr,), self._reference[0]
+        self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
+        self._count, self._told, self._is_double = 1, False, not single
 
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
@@ -315,29 +339,21 @@ class Compiled:
             start = perf_counter()
             frame = self._frame
             measured = numbers(y, "y")
-            if measured.shape != self._y.shape:
-                raise ShapeError(f"y has shape {measured.shape}, expected {self._y.shape}")
+            if measured.shape != self._y_shape:
+                raise ShapeError(f"y has shape {measured.shape}, expected {self._y_shape}")
             self._y[:] = measured
             target = numbers(reference, "reference")
-            if target.shape == self._row_shapes[0]:
-                self._row_shapes[1][:] = target
-                frame.reference.count = 1
+            if target.shape == self._row_shape:
+                self._row[:] = target
+                count = 1
             else:
-                frame.reference.count = self._rows(target, self._reference, self._nr, "reference")
-            if applied is None:
-                frame.applied = None
-            else:
-                got = numbers(applied, "applied")
-                if got.shape != self._u.shape:
-                    raise ShapeError(f"applied has shape {got.shape}, expected {self._u.shape}")
-                self._applied[:] = got
-                frame.applied = self._applied_address
-            if w is None:
-                frame.w.count = 0
-            else:
-                frame.w.count = self._disturbances(numbers(w, "w"))
+                count = self._rows(target, self._reference, self._nr, "reference")
+            if count != self._count:  # a field that is written takes as long as the C step
+                frame.reference.count = self._count = count
+            if applied is not None or w is not None or self._told:
+                self._tell(applied, w)
             self._call(self._pointer)
-            u = self._u.astype(np.float64)
+            u = self._u.copy() if self._is_double else self._u.astype(np.float64)
             if not frame.status:
                 return Move(u, Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
             return Move(
@@ -351,6 +367,20 @@ class Compiled:
             )
         finally:
             self._token.append(held)
+
+    def _tell(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
+        """Write down what acted and what disturbs, or that nothing is told."""
+        frame = self._frame
+        frame.applied, frame.w.count, self._told = None, 0, False
+        if applied is not None:
+            got = numbers(applied, "applied")
+            if got.shape != self._u.shape:
+                raise ShapeError(f"applied has shape {got.shape}, expected {self._u.shape}")
+            self._applied[:] = got
+            frame.applied, self._told = self._applied_address, True
+        if w is not None:
+            frame.w.count = self._disturbances(numbers(w, "w"))
+            self._told = True
 
     def _rows(self, rows: Float[np.ndarray, "..."], to: Float[np.ndarray, "..."], width: int, name: str) -> int:
         """Copy a preview; return how many of its rows count."""
@@ -408,18 +438,55 @@ class Compiled:
         code = None if misfit or self.precision == "float" else self._machine_of(plant)
         if code is None:
             return None
-        T = len(U)
-        slack, times, reports = np.zeros(T), np.zeros(T), np.zeros((T, 3), dtype=np.intc)
-        rows, W = np.ascontiguousarray(rows), np.zeros((1, 1)) if W is None else np.ascontiguousarray(W)
-        arrays = {"rows": rows, "W": W, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
-        whole = _Whole(T, X.shape[1], Y.shape[1], preview, W.shape[1] == self._nw and self._nw > 0)
-        for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
-            setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
-        for name, array in arrays.items():
-            assert array.flags.c_contiguous, "machine code reads contiguous arrays"
-            setattr(whole, name, array.ctypes.data)
+        rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
+        slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 3), dtype=np.intc)
+        arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
+        whole = _whole(code, len(U), arrays, W, preview=preview)
         self._built.code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
         return WholeRun(reports[:, 0], reports[:, 1], reports[:, 2], slack, times)
+
+    @alone
+    def runs(self, plant: StepMap, x0: ArrayLike, reference: ArrayLike, *, steps: int) -> ManyRuns:
+        """Run the closed loop from many states in C, each time from the beginning; nothing of a run is judged or kept.
+
+        Parameters
+        ----------
+        plant
+            x⁺ = F(x, u), y = h(x).
+        x0
+            (E, nx), a row a run.
+        reference
+            (nr,) held, or (steps+1, nr), the same for all runs; the controller gets the rows ahead.
+
+        Raises
+        ------
+        DataError
+            The plant cannot be written in C, or the controller is in single precision.
+        ShapeError
+            Sizes do not fit.
+        """
+        T = checks.count(steps, "steps")
+        starts = checks.array(x0, "x0", (None, len(plant.states)))
+        given = np.atleast_2d(checks.array(reference, "reference"))
+        if given.shape[1] != self._nr or len(given) not in (1, T + 1):
+            raise ShapeError(f"reference has shape {given.shape}, expected ({self._nr},) or ({T + 1}, {self._nr})")
+        if (len(plant.outputs), len(plant.inputs)) != (self._ny, self.nu):
+            raise ShapeError(
+                f"the plant measures {len(plant.outputs)} values and takes {len(plant.inputs)} inputs, the controller "
+                f"takes {self._ny} and returns {self.nu}"
+            )
+        code = None if self.precision == "float" else self._machine_of(plant)
+        if code is None:
+            raise DataError("the plant, or a controller of floats, cannot run in C as a whole; use km.simulate")
+        rows = np.ascontiguousarray(given[np.minimum(np.arange(T + self.horizon + 1), len(given) - 1)])
+        E = len(starts)
+        X, U = np.empty((E, T + 1, starts.shape[1])), np.empty((E, T, self.nu))
+        X[:, 0] = starts
+        slack, reports = np.zeros((E, T)), np.zeros((E, T, 3), dtype=np.intc)
+        arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
+        whole = _whole(code, T, arrays, None, preview=True)
+        self._built.code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
+        return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
     def _machine_of(self, plant: StepMap) -> ctypes.CDLL | None:
         """Return the plant in machine code, built when it is first driven."""
@@ -451,6 +518,24 @@ class Compiled:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (self.original, self.precision, self._memory)
+
+
+def _whole(
+    code: ctypes.CDLL,
+    steps: int,
+    arrays: dict[str, np.ndarray],
+    W: Float[np.ndarray, "wrows nw"] | None,
+    *,
+    preview: bool,
+) -> _Whole:
+    """Return what a whole run passes; it holds no reference to the arrays."""
+    whole = _Whole(steps, arrays["X"].shape[-1], arrays["Y"].shape[-1], preview, W is not None)
+    for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
+        setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
+    for name, array in ({"W": W} | arrays if W is not None else arrays).items():
+        assert array.flags.c_contiguous, "machine code reads contiguous arrays"
+        setattr(whole, name, array.ctypes.data)
+    return whole
 
 
 def plant_text(plant: StepMap) -> str:

@@ -260,17 +260,18 @@ def _koopman(controller: KoopmanMPC, *, single: bool) -> Tables:
         )
     saved = controller.as_data()
     own = saved.options["solver"] == "daqp"
-    twin = KoopmanMPC(
-        controller.predictor,
-        saved.cost,
-        saved.limits,
-        saved.horizon,
-        estimator=controller._estimator,
-        latency=saved.latency,
-        moves=saved.moves,
-        solver="daqp",
-        settings=saved.options["settings"] if own else None,
-    )
+    twin = controller
+    if not own:
+        twin = KoopmanMPC(
+            controller.predictor,
+            saved.cost,
+            saved.limits,
+            saved.horizon,
+            estimator=controller._estimator,
+            latency=saved.latency,
+            moves=saved.moves,
+            solver="daqp",
+        )
     predictor, plan = twin.predictor, twin._map
     tables = _shared(predictor, plan.targets, plan.track.inputs, lqr=False)
     if not own:

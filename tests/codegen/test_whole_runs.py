@@ -61,3 +61,16 @@ def test_many_runs_leave_nothing_behind_in_each_other(pendulum, controllers):
     rows = [km.simulate(plant, fast, x0=x, reference=[0.0, 0.0], steps=30).X for x in starts]
     for x, row in zip(starts[::-1], rows[::-1], strict=True):
         assert np.array_equal(km.simulate(plant, fast, x0=x, reference=[0.0, 0.0], steps=30).X, row)
+
+
+def test_runs_side_by_side_are_those_of_simulate(pendulum, controllers):
+    plant, (slow, fast) = pendulum[0], controllers
+    starts = np.random.default_rng(1).uniform(-0.8, 0.8, (5, 2))
+    found = fast.runs(plant, starts, [0.1, 0.0], steps=40)
+    for i, x in enumerate(starts):
+        run = km.simulate(plant, slow, x0=x, reference=[0.1, 0.0], steps=40)
+        np.testing.assert_allclose(found.X[i], run.X, atol=1e-6)
+        np.testing.assert_allclose(found.U[i], run.U, atol=1e-4)
+        assert found.status[i].tolist() == [status.value for status in run.status]
+    with pytest.raises(km.errors.ShapeError, match=r"reference has shape \(1, 3\)"):
+        fast.runs(plant, starts, [0.1, 0.0, 0.0], steps=40)
