@@ -138,7 +138,7 @@ class _Stream(io.FileIO):
 
 
 class Members:
-    """The arrays of a .npz file, each read when it is asked for: what nobody needs takes no memory.
+    """The arrays of a .npz file, each read when it is asked for; the others take no memory.
 
     A pickle is never opened. Before an array is allocated, its size must be what its member holds, and fit into
     memory; the checksum of a member covers all of it.

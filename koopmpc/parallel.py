@@ -202,7 +202,7 @@ def _on_own_processes(function: Callable[[Task], Any], tasks: Iterator[Task], wo
 def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], held: _HeldPool) -> Generator[Any]:
     """Yield the results of a pool's processes in order.
 
-    A worker that dies breaks the pool, and nobody knows which task it was. The first task that is due is therefore
+    A worker that dies breaks the pool, and its task is not known. The first task that is due is therefore
     done alone, where a death is its own, and the others go to a new pool.
     """
     jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
@@ -227,7 +227,7 @@ def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], held: 
                 raise value
             yield value
     finally:
-        if queue:  # what is under way is of no use to anyone
+        if queue:  # no one waits for the tasks under way
             held.close()
 
 

@@ -127,7 +127,7 @@ class _Frame(ctypes.Structure):
 
 
 class _SingleFrame(ctypes.Structure):
-    """The same where numbers are floats."""
+    """A `_Frame` in single precision."""
 
     _fields_ = (
         ("state", ctypes.c_void_p),
@@ -155,7 +155,7 @@ class _Whole(ctypes.Structure):
 
 
 class _Built(NamedTuple):
-    """What a compiler made of a controller."""
+    """A controller as the compiler built it."""
 
     code: ctypes.CDLL
     sizes: dict[str, int]

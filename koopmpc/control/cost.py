@@ -51,10 +51,10 @@ class Cost(Value):
         Weight of the changes of the inputs from step to step, ⪰ 0; a scalar or a vector is a diagonal.
     tail
         Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
-        was fitted to data until the gain rests as far as the model is accurate, for what a longer one adds are the
-        errors of such a model: until its change is a smaller share than what the model misses of its states in a step.
-        BilinearMPC and NonlinearMPC have no tail: without Q_N their end costs the Riccati solution at the equilibrium
-        nearest to r_N.
+        was fitted to data until the gain rests as far as the model is accurate, that is, until a further step changes
+        the gain by a smaller share than the model misses of its states in one step: a longer tail would only add the
+        errors of such a model. BilinearMPC and NonlinearMPC have no tail by default: without Q_N and tail their end
+        costs the Riccati solution at the equilibrium nearest to r_N.
 
     Raises
     ------

@@ -230,7 +230,7 @@ def stationary(stage: Stage, most: int) -> Gain:
 
 
 def leap(stage: Stage, most: int) -> tuple[Float[np.ndarray, "nz nz"], int]:
-    """Return P after so many steps of the difference equation, a power of two below `most`, by doubling.
+    """Return P after n steps of the difference equation, by doubling, and n, a power of two below `most`.
 
     P = Q + H after n steps, and after 2n with
         H + ΦᵀH(I + GH)⁻¹Φ,   G + Φ(I + GH)⁻¹GΦᵀ,   Φ(I + GH)⁻¹Φ,

@@ -99,7 +99,7 @@ class Savable:
         Raises
         ------
         DataError
-            A part of it is code: a StepMap, an estimator of one's own.
+            A part of it is code: a StepMap, or a user's own estimator.
         LogError
             The path cannot be written.
         """

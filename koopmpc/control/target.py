@@ -155,7 +155,7 @@ def targets(
     """Return the equilibria of z⁺ = A z + B u for tracked outputs C z and limits on u and G z.
 
     Ranks are decided by the sizes of states and inputs, so that their units mean nothing. Of all equilibria that are as
-    near to a reference, that of the least ‖u‖_R is taken.
+    near to a reference, the one with the least ‖u‖_R is taken.
 
     Parameters
     ----------

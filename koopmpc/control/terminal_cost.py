@@ -148,9 +148,9 @@ def tail_stage(
 
 
 def tail_of(stage: Stage, steps: int | None) -> Tail:
-    """Return the tail of so many steps, all of them `stage`, and its last state weighed like the others.
+    """Return the tail of this many steps, all of them `stage`; its last state is weighed like the others.
 
-    None lets it go on until it rests. K and v are those of its first step, without steps those of a step before it.
+    With None it goes on until it rests. K and v are those of its first step, without steps those of a step before it.
 
     Raises
     ------

@@ -96,7 +96,7 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     LogError
         The file is missing or no TOML.
     DataError
-        An unknown key, name or unit, NaN, a number that is none, limits that cross, lists of unequal lengths, or no
+        An unknown key, name or unit, NaN, text in place of a number, limits that cross, lists of unequal lengths, or no
         state with a weight.
     """
     file = Path(path)

@@ -37,7 +37,7 @@ def short(state: str) -> str:
 class Lifting(Value, ABC):
     """Observables z = ψ(x), x in R^nx, z in R^nz.
 
-    A family of one's own is a frozen dataclass with `observables` and `formula`; arrays then go through the
+    A user's own family is a frozen dataclass with `observables` and `formula`; arrays then go through the
     traced formula, and so do files.
     """
 

@@ -74,9 +74,9 @@ class StepRows(Value):
     u_reference
         (m, nu) inputs that hold the reference: the cost charges an input's distance from them; zeros by default.
     known
-        (m,) 1 where the controller's monitor knew the step, 0 where it did not, −1 where nobody looked, by default.
+        (m,) 1 where the controller's monitor knew the step, 0 where it did not, −1 without a monitor, by default.
     solver
-        m entries: which solver made the move, "osqp" or "daqp", "" where none was asked or nobody says, by default.
+        m entries: which solver made the move, "osqp" or "daqp", "" where none was asked or it is not known, by default.
     """
 
     X: Float[np.ndarray, "n nx"]
@@ -147,7 +147,7 @@ class StepRows(Value):
 
 def _columns_of(moves: Sequence[Move | None]) -> dict[str, Any]:
     """Return the columns of `StepRows` that moves fill; a step without a Move counts as solved, in no time."""
-    known = [getattr(m, "known", None) for m in moves]  # a Move of one's own need not say
+    known = [getattr(m, "known", None) for m in moves]  # a user's own Move may lack it
     return {
         "status": tuple([Status.OPTIMAL if m is None else m.status for m in moves]),
         "fallback": tuple([Fallback.NONE if m is None else m.fallback for m in moves]),

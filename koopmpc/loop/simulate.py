@@ -242,7 +242,7 @@ def simulate(
         iterations.append(move.iterations)
         if move.slack:
             slack[k] = move.slack
-        looked = move.known if type(move) is Move else getattr(move, "known", None)  # a Move of one's own need not say
+        looked = move.known if type(move) is Move else getattr(move, "known", None)  # a user's own Move may lack it
         if looked is not None:
             known[k] = looked
         for observer in observers:

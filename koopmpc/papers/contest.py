@@ -23,7 +23,7 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
 
 ORACLE = "nonlinear MPC"
-_LOST = 1e3  # a loop that costs more than so many times the best has diverged
+_LOST = 1e3  # times the best cost beyond which a loop has diverged
 
 
 @dataclass(frozen=True, eq=False)

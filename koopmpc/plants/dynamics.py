@@ -132,7 +132,7 @@ def output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
 
 
 def _expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
-    """Return the value as a dense column; raise where it is none, or holds symbols other than `known`."""
+    """Return the value as a dense column; raise where it is no expression, or holds symbols other than `known`."""
     if not isinstance(value, ca.SX | ca.DM):
         raise DataError(f"{name} returned a {type(value).__name__}; return one column, ca.vertcat(...)")
     column = ca.SX(value)

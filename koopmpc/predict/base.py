@@ -145,7 +145,7 @@ class Predictor(Value):
         Makes ζ of x and its past; then z₀ = ψ(ζ₀).
     scale
         (nz, nz) upper triangular R with RᵀR = Σ w z zᵀ / Σ w over the lifted states that the model was fitted to: R⁻ᵀ z
-        has root-mean-square 1 in every direction. None for a model that was given, and in files of before.
+        has root-mean-square 1 in every direction. None for a model that was given, and in older files.
     nx, nu, nz
         How many states, inputs and lifted coordinates there are.
     """

@@ -18,7 +18,7 @@ from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
 RUN = 3  # horizons that a run lasts
-STARTS = 4  # of episodes that are tried where nobody names any
+STARTS = 4  # episodes whose first states are the default starts
 ROOM = 0.5  # share of the data's range by which a run may leave the data
 
 

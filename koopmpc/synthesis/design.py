@@ -310,7 +310,7 @@ def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
     return found
 
 
-Judged = tuple[Sequence[Recipe], Sequence[Outcome]]  # the recipes of a round, and what came of each
+Judged = tuple[Sequence[Recipe], Sequence[Outcome]]  # the recipes of a round, and the outcome of each
 
 
 def _rounds(

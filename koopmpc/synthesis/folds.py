@@ -12,7 +12,7 @@ from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import spread
 
 _PARTS = 16  # of a source that a sample is taken from
-_AHEAD = 20  # steps of a horizon that nobody named
+_AHEAD = 20  # steps of the default horizon
 
 
 class Folds(NamedTuple):

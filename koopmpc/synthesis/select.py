@@ -23,7 +23,7 @@ from koopmpc.synthesis.folds import folded, sampled, usual_horizon
 from koopmpc.synthesis.selection import LeaderboardRow, Selection, choice, row_of
 from koopmpc.validate.scoring import AnyPredictor
 
-ENOUGH = 1e-2  # error of a forecast, of the states' spread, that a controller has no use to improve on
+ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 
 
@@ -87,7 +87,7 @@ def select(
     workers, scheduler
         As in `koopmpc.parallel.map_tasks`: a candidate is a task, and then a part of the source.
     progress
-        Called with what is done, how many of it are, and how many there are, None where nobody knows.
+        Called with what is done, how many of it are, and how many there are, None where that is not known.
     rng
         Deals out the episodes, draws centres and features.
 

@@ -21,7 +21,7 @@ from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
 DELAYED = 0.5  # a surrogate with delays must have less than this share of the error of the best without
-SECOND = 3.0  # a surrogate of another family may err so many times as much as the best
+SECOND = 3.0  # times the error of the best that a surrogate of another family may have
 INVARIANT = (
     0.25  # share of an increment that a state may decide which the plant does not feel: learned models err as much
 )

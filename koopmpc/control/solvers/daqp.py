@@ -184,7 +184,7 @@ class DAQP(QPSolver):
         return self._unmet
 
     def _metric(self) -> Float[np.ndarray, "n n"]:
-        """Return AᵀA of the hard rows, of all rows where none is hard, as large as P is on the mean."""
+        """Return AᵀA of the hard rows, of all rows where none is hard, with the mean diagonal of P."""
         hard = self._qp.A[self._sense != _SOFT]
         rows = hard if len(hard) else self._qp.A
         gram = rows.T @ rows

@@ -82,7 +82,7 @@ def load_episodes(
         A file is missing, is cut, or holds no episodes.
     DataError
         The suffix is another, the files have unequal dt or names, a table lacks a column or a step, a column
-        of numbers holds a cell that is none, or its sampling is unequal.
+        of numbers holds a cell that is no number, or its sampling is unequal.
 
     Warns
     -----

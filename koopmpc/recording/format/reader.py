@@ -125,7 +125,7 @@ def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ..
 
 
 def _solvers(log: LogColumns, steps: int) -> tuple[str, ...]:
-    """Return the solver of each step: the last change at or before it; logs of before have none."""
+    """Return the solver of each step: the last change at or before it; older logs have none."""
     k, _, words = log.rows(Entity.QP, "state")
     names = [NO_SOLVER, *(words.to_pylist() if len(k) else [])]
     held = np.searchsorted(k, np.arange(steps), side="right")

@@ -92,7 +92,7 @@ class LogColumns:
     def changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
         sums: dict[str, int] = json.loads(self.static(Entity.METRICS, "sums"))
-        places: dict[str, int] = json.loads(self.static(Entity.METRICS, "places") or "{}")  # logs of before have none
+        places: dict[str, int] = json.loads(self.static(Entity.METRICS, "places") or "{}")  # older logs have none
         bad = [key for key, total in sums.items() if (data := self._data(key)) is not None and crc32(data) != total]
         return bad + [key for key, total in places.items() if key not in bad and self._steps(key) not in (None, total)]
 

@@ -203,7 +203,7 @@ def _drawing(rows: Sequence[Sequence[tuple[Shape, Color]]], order: float) -> Dra
 
 
 def _points(shape: Shape) -> Float[np.ndarray, "n 2"]:
-    """Return the line that draws a shape, y up; a box is a line to and fro, a disk almost a point."""
+    """Return the line that draws a shape, y up; a box is a line there and back, a disk almost a point."""
     if isinstance(shape, Line):
         return np.asarray(shape.points, dtype=np.float64).reshape(-1, 2)
     if isinstance(shape, Disk):

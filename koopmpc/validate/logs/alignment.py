@@ -122,7 +122,7 @@ def late(log: Log) -> Iterator[LogFault]:
 
 
 def _weighed(scores: dict[tuple[Shift, ...], float], nx: int) -> Callable[[tuple[Shift, ...]], float]:
-    """Return how a shift counts: by its gain, that of an input raised, for inputs are late more often than sensors."""
+    """Return the weight of a shift: its gain, raised for an input, because inputs are late more often than sensors."""
 
     def weighed(shift: tuple[Shift, ...]) -> float:
         return scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0)

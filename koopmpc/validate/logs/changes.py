@@ -112,7 +112,7 @@ def midway(log: Log) -> Iterator[LogFault]:
         if len(which) == 1 and change.chosen:
             continue
         if which and len(log.data) == 1 and len(agreed.intersection(range(which[0], which[-1]))) > 0.2 * len(which):
-            continue  # within an episode a recorder changes once, not to and fro
+            continue  # within an episode a recorder changes once, and not back
         if which and (best is None or won > 1.02 * best[0]):
             best = (won, change, which)
     if best is None:

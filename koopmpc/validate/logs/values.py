@@ -330,7 +330,7 @@ def _spikes(log: Log, i: int, changes: np.ndarray) -> Iterator[Place]:
     calm = [np.abs(np.diff(e.X[:, i])) for e in log.data]
     for d, sizes in zip(calm, there, strict=True):
         for k in np.flatnonzero(sizes > far):
-            d[k : k + 2] = 0.0  # the jumps to and fro; all other steps tell how far a state can move
+            d[k : k + 2] = 0.0  # the jumps away and back; all other steps tell how far a state can move
     far = max(far, 1.2 * max(float(d.max(initial=0.0)) for d in calm))
     usual = 4 * float(np.quantile(np.concatenate([np.abs(E[:, i]) for E in log.residuals]), 0.97))
     for e, sizes in enumerate(there):
