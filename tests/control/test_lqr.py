@@ -106,6 +106,18 @@ def test_rates_are_clipped():
     np.testing.assert_allclose(lqr([np.nan, 0], [0, 0]).u, [0.7])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+def test_a_reference_or_a_disturbance_that_is_no_number_holds_the_last_input(value):
+    plain = linear(A, B)
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, plain.states, plain.inputs, E=[[0.1], [0.3]])
+    lqr = km.LQR(model, km.Cost([2, 1], 0.1), km.Limits(-0.5, 0.5))
+    u = lqr([0.02, 0.01], [0.0, 0.0]).u
+    for move in (lqr([0.1, 0.0], [value, 0.0]), lqr([0.1, 0.0], [0.0, 0.0], w=[value])):
+        assert move.status is km.Status.BAD_MEASUREMENT
+        np.testing.assert_array_equal(move.u, u)
+    assert lqr([0.02, 0.01], [0.0, 0.0]).status is km.Status.UNCONSTRAINED
+
+
 def test_a_measured_disturbance_moves_the_target():
     plain = linear(A, B)
     model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, plain.states, plain.inputs, E=[[0.1], [0.3]])

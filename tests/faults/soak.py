@@ -70,9 +70,9 @@ def interrupt(seed: int) -> None:
     rng = random.Random(seed)
     _, controller, _ = rng.choice(list(controllers(seed)))
     timer = threading.Timer(rng.uniform(0.0, 0.1), lambda: os.kill(os.getpid(), signal.SIGINT))
-    timer.start()
     end = time.monotonic() + 10
     try:
+        timer.start()
         while time.monotonic() < end:
             controller([rng.uniform(-2, 2), 0.0], [0.0, 0.0])
         raise AssertionError("an interrupt was swallowed")
