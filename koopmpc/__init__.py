@@ -68,6 +68,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.identify.fits.dmd import dmd as dmd
     from koopmpc.identify.fits.dmd import dmdc as dmdc
     from koopmpc.identify.fits.edmd import edmd as edmd
+    from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
     from koopmpc.identify.fits.prior import Prior as Prior
     from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
@@ -99,6 +100,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
     from koopmpc.predict import spectrum as spectrum
+    from koopmpc.predict.peers import from_peer as from_peer
     from koopmpc.predict.predictors import BilinearPredictor as BilinearPredictor
     from koopmpc.predict.predictors import LinearPredictor as LinearPredictor
     from koopmpc.predict.predictors import load_model as load_model

@@ -15,6 +15,7 @@ from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
 
+DEFAULT = ("bilinear_motor:step", "cart_pole", "cart_pole_swing", "pendulum", "van_der_pol:track")  # a minute's bench
 _PACKAGE = Path(__file__).resolve().parent.parent
 
 

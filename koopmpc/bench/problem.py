@@ -16,6 +16,7 @@ from koopmpc.data.collect import InputFunction, Uniform
 from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
+from koopmpc.loop.faults import Fault
 from koopmpc.plants.dynamics import Dynamics, Plant
 from koopmpc.plants.integrators import RK4, Euler, Integrator
 from koopmpc.plants.step_map import StepMap, discretize
@@ -73,6 +74,10 @@ class Case:
     plant
         The plant that is driven in this case, for example one with another mass, which no controller knows of. The
         training data still come from the problem's plant.
+    noise
+        Standard deviations (ny,) of the white noise that controllers measure in this case; the data are without.
+    faults
+        What is broken in this case, for example ``[km.faults.ActuatorDelay(1)]``, an input that comes a step late.
 
     Raises
     ------
@@ -85,6 +90,8 @@ class Case:
     steps: int
     limits: Limits | None = None
     plant: Dynamics | StepMap | Plant | None = None
+    noise: ArrayLike | None = None
+    faults: Sequence[Fault] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "x0", checks.array(self.x0, "Case.x0", (None,)))

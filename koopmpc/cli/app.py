@@ -59,16 +59,19 @@ def main(
 
 @app.command("list")
 def list_() -> None:
-    """Show all problems and their cases."""
-    from koopmpc.bench.library import list_problems, load_problem
+    """Show all problems with their cases, and how the best learned controller did on those that come with koopmpc."""
+    from koopmpc.bench.library import list_problems, load_problem, shipped
+    from koopmpc.bench.measured import in_words
 
-    out = _console()
+    out, own = _console(), shipped()
     for entry in list_problems():
         out.print(Text.assemble((entry.name, "bold"), "  ", entry.title))
         try:
             out.print(Text(f"  cases: {', '.join(load_problem(entry.path).cases)}"))
         except KoopmpcError as error:
             out.print(Text(f"  {error}", style="red"))
+        if entry.path in own and (words := in_words(entry.name)):
+            out.print(Text(f"  {words}", style="dim"))
 
 
 @app.command()
@@ -104,7 +107,8 @@ def run(
 
 @app.command()
 def bench(
-    problems: Annotated[list[str] | None, typer.Argument(help=_PROBLEM + " Default: all shipped problems.")] = None,
+    problems: Annotated[list[str] | None, typer.Argument(help=_PROBLEM + " Default: five, see --all.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Run all problems that come with koopmpc.")] = False,
     controller: Controllers = None,
     faults: Faults = False,
     monitor: Watched = False,
@@ -115,10 +119,11 @@ def bench(
     logs: Logs = Path("logs"),
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, on several problems."""
-    from koopmpc.bench.library import load_problem, shipped
+    from koopmpc.bench.library import DEFAULT, load_problem, shipped
 
     with _friendly():
-        chosen = [load_problem(p) for p in problems or shipped()]
+        named = shipped() if every else problems or DEFAULT
+        chosen = [load_problem(p) for p in named]
         _sweep(chosen, controller, logs, "bench", faults=faults, monitor=monitor, live=live, compiled=compiled)
 
 

@@ -123,6 +123,12 @@ class Lifting(Value, ABC):
             )
         return z
 
+    def measured(self) -> ca.Function:
+        """Return ψ of one measured state; NaN where one of its entries is NaN or beyond 1e30."""
+        x = ca.SX.sym("x", len(self.bound_states))
+        kept = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
+        return ca.Function("psi", [x], [ca.densify(self.symbolic(kept))], {"cse": True})
+
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return both liftings one under the other; an observable that both name is held once."""
         from koopmpc.lifting.algebra import Sum  # here, because that file imports this one
@@ -206,9 +212,7 @@ def buffered(lifting: Lifting) -> Buffered:
     One state that is NaN, or beyond 1e30, makes all of them NaN: a bad measurement shows in every product with z,
     and NaN, unlike inf, passes through products in silence.
     """
-    x = ca.SX.sym("x", len(lifting.bound or ()))
-    measured = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
-    return Buffered(ca.Function("psi", [x], [ca.densify(lifting.symbolic(measured))], {"cse": True}))
+    return Buffered(lifting.measured())
 
 
 def rows(lifting: Lifting, wanted: Lifting) -> Indices:

@@ -1,4 +1,4 @@
-"""Gaussian and ThinPlate: functions of the distance to given centres."""
+"""Gaussian, ThinPlate and PolynomialKernel: functions of the state and given centres."""
 
 from dataclasses import dataclass
 
@@ -135,3 +135,37 @@ class ThinPlate(Lifting):
         logarithm = np.log(Z + _TINY)
         np.multiply(Z, 0.5, out=Z)
         np.multiply(Z, logarithm, out=Z)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class PolynomialKernel(Lifting):
+    """ψ(x) = (1 + xᵀc)^degree for each centre c; with enough centres they span all monomials up to the degree.
+
+    Parameters
+    ----------
+    centers
+        (nc, nx), one centre a row.
+    degree
+        At least 1.
+    """
+
+    centers: Float[np.ndarray, "nc nx"]
+    degree: int
+
+    def __init__(self, centers: ArrayLike, degree: int, *, bound: tuple[str, ...] | None = None) -> None:
+        checks.count(degree, "degree")
+        freeze(self, centers=checked_centers(centers), degree=int(degree), bound=bound)
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"polynomial(0.5, -1; 3)"``, which hold the centre and the degree."""
+        return center_names("polynomial", self.centers, states, f"; {self.degree}")
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return (1 + xᵀc)^degree for each centre."""
+        products = [sum((x[i] * c for i, c in enumerate(center)), ca.SX(1)) for center in self.centers.tolist()]
+        return ca.vertcat(*(product**self.degree for product in products))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        np.matmul(x.T, self.centers.T, out=Z)
+        np.add(Z, 1.0, out=Z)
+        np.power(Z, self.degree, out=Z)

@@ -1,0 +1,156 @@
+"""The library of problems: each file is self-contained, and each of its controllers runs within hard limits."""
+
+import ast
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
+from koopmpc.bench.measured import BASELINE, Standing, best_learned, in_words, markdown, measured, standings
+from koopmpc.bench.results import RunRow
+from koopmpc.loop.metrics import Metrics
+
+FILES = {path.stem: path for path in km.bench.shipped()}
+MOST_LINES = 120
+STEPS = 4
+
+
+@pytest.fixture(params=sorted(FILES))
+def path(request: pytest.FixtureRequest) -> Path:
+    return FILES[request.param]
+
+
+def test_the_library_holds_what_its_page_lists():
+    assert set(measured()) <= set(FILES)
+    named = Path(__file__).parents[2].joinpath("docs", "library.md").read_text("utf-8")
+    assert [name for name in FILES if f"`{name}`" not in named] == []
+    assert markdown(measured()) in named
+
+
+def test_a_problem_is_one_short_file_that_imports_numpy_casadi_and_koopmpc_alone(path: Path):
+    text = path.read_text("utf-8")
+    assert len(text.splitlines()) <= MOST_LINES
+    found = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {
+        name
+        for node in found
+        for name in ([node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names])
+    }
+    assert {str(name).split(".")[0] for name in names} <= {"casadi", "dataclasses", "koopmpc", "numpy"}
+
+
+def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Path):
+    problem = km.load_problem(path)
+    training, large = problem.training, problem.dynamics.nx > 20
+    few = training.x0 if isinstance(training.x0, km.Uniform) else np.asarray(training.x0)[:40]
+    parts = Prepared(replace(problem, training=replace(training, x0=few, episodes=40, steps=min(training.steps, 25))))
+    first = next(iter(problem.cases))
+    for name, case in problem.cases.items():
+        limits = problem.limits_of(name)
+        low, high = limits.inputs(problem.dynamics.nu)
+        reference = np.asarray(case.reference)
+        all_of_them = ("lqr", "linear-mpc") if large else controller_names(problem.controllers)
+        for controller in all_of_them if name == first else ("lqr",) if large else ("koopman-mpc",):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", km.FitWarning)  # of models that were fitted to less than they need
+                built = CONTROLLERS[controller](parts, limits)
+            run = km.simulate(
+                parts.truth_of(name),
+                built,
+                x0=case.x0,
+                reference=reference[: STEPS + 1] if reference.ndim == 2 else reference,
+                steps=STEPS,
+                cost=problem.cost,
+                limits=limits,
+                noise=case.noise,
+                faults=case.faults,
+            )
+            assert np.isfinite(run.U).all(), (name, controller)
+            assert np.array_equal(np.clip(run.U, low, high), run.U), (name, controller)
+            assert np.isfinite(km.metrics(run).cost), (name, controller)
+
+
+def test_each_problem_draws_the_same_shapes_wherever_it_is(path: Path):
+    problem = km.load_problem(path)
+    scene = problem.scene or problem.dynamics.scene
+    rng = np.random.default_rng(0)
+    low, high = problem.limits.inputs(problem.dynamics.nu)
+    drawn = []
+    for case in problem.cases.values():
+        for spread in (0.0, 0.3):
+            shapes = scene(
+                np.asarray(case.x0) + spread * rng.standard_normal(problem.dynamics.nx), rng.uniform(low, high)
+            )
+            drawn.append([shape.name for shape in shapes])
+            assert all(isinstance(shape, km.scene.Line | km.scene.Box | km.scene.Disk) for shape in shapes)
+    assert len(drawn[0]) > 1
+    assert all(names == drawn[0] for names in drawn)
+
+
+def test_each_problem_says_where_it_is_from_and_rests_where_it_says(path: Path):
+    problem = km.load_problem(path)
+    assert problem.title.count(":") == 1
+    x, u = (np.asarray(part) for part in problem.equilibrium)
+    x_next = Prepared(problem).step_map(x, u)
+    np.testing.assert_allclose(x_next, x, atol=1e-3 * (1 + np.abs(x).max()))
+
+
+def test_a_case_has_noise_and_broken_parts_of_its_own(tmp_path: Path):
+    problem = km.load_problem("pendulum:upright")
+    case = replace(problem.cases["upright"], steps=6)
+    broken = replace(case, noise=[0.1, 0.1], faults=[km.faults.ActuatorDelay(1)])
+    problem = replace(problem, cases={"plain": case, "broken": broken}, scene=lambda x, u: [])
+    km.sweep([problem], ["lqr"], folder=tmp_path)
+    plain, run = (km.load_run(tmp_path / f"pendulum-{name}-lqr.rrd") for name in ("plain", "broken"))
+    np.testing.assert_array_equal(plain.Y, plain.X)
+    assert (run.Y != run.X).all()
+    np.testing.assert_allclose(run.X[1], Prepared(problem).step_map(run.X[0], [0.0]))  # nothing has come through yet
+
+
+def _row(problem: km.Problem, case: str, controller: str, cost: float, violation: float = 0.0) -> RunRow:
+    figures = dict.fromkeys(("tracking_rmse", "final_error"), np.zeros(2))
+    numbers = dict.fromkeys(("input_violation", "effort", "settling_time", "solve_time_p99", "solve_time_max"), 0.0)
+    time = 1e-3 if controller == "nonlinear-mpc" else 1e-5
+    measured = Metrics(
+        **figures, **numbers, cost=cost, violation=violation, solve_time_p50=time, late=0, status={}, fallback={}
+    )
+    return RunRow(problem.name, case, controller, measured)
+
+
+def test_a_standing_is_the_worst_ratio_over_the_cases_in_which_the_model_is_the_plant():
+    problem = km.load_problem("van_der_pol")
+    plain = ("rest", "reach", "track", "beyond")
+    rows = [_row(problem, case, "nonlinear-mpc", 2.0) for case in problem.cases]
+    rows += [
+        _row(problem, case, "koopman-mpc", {"reach": 2.4}.get(case, 2.1) if case in plain else 900.0)
+        for case in problem.cases
+    ]
+    rows += [_row(problem, case, "lqr", 1.0, violation=0.3) for case in problem.cases]
+    rows += [RunRow(problem.name, case, "bilinear-mpc") for case in problem.cases]
+    found = standings(rows, [problem])["van_der_pol"]
+    assert found["koopman-mpc"] == Standing(pytest.approx(1.2), False, pytest.approx(0.01))
+    assert (str(found["lqr"]), str(found["bilinear-mpc"])) == ("0.5†", "lost")
+    assert best_learned(found) == "koopman-mpc"
+    assert "| `van_der_pol` | **1.2** | 0.5† | lost |" in markdown({"van_der_pol": found})
+
+
+def test_each_problem_of_the_list_has_its_number():
+    for name, found in measured().items():
+        assert best_learned(
+            found
+        ) is None or f"× the cost of {'nonlinear-mpc' if 'nonlinear-mpc' in found else BASELINE}" in in_words(name)
+    assert in_words("no such problem") == ""
+
+
+@pytest.mark.slow
+def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(path: Path, tmp_path: Path):
+    problem, said = km.load_problem(path), measured()[path.stem]
+    best, baseline = best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else BASELINE
+    assert best is not None
+    rows = km.sweep([replace(problem, scene=lambda x, u: [])], [best, baseline], folder=tmp_path)
+    assert [row.failure for row in rows if row.failure] == []
+    assert standings(rows, [problem])[path.stem][best].ratio == pytest.approx(said[best].ratio, rel=0.05)
