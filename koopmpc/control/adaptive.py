@@ -237,10 +237,14 @@ class Guarded:
     Raises
     ------
     DataError
-        The two have another dt or number of inputs.
+        One is no controller; the two have another dt or number of inputs.
     """
 
     def __init__(self, controller: Controller, standby: Controller, *, patience: int = 3) -> None:
+        for what, one in (("the controller", controller), ("the one that stands by", standby)):
+            checks.members(
+                one, what, ("dt", "nu", "horizon", "reset"), "pass a KoopmanMPC, an LQR or another Controller"
+            )
         for name in ("dt", "nu"):
             mine, other = getattr(controller, name), getattr(standby, name)
             if mine != other:

@@ -12,7 +12,7 @@ from koopmpc import checks, disk
 from koopmpc.bench.page import Page
 from koopmpc.data.episodes import Episodes
 from koopmpc.fitting.audited import Data, evenly
-from koopmpc.fitting.fit import Say, logs_of, silent, understood
+from koopmpc.fitting.fit import Say, guessed, logs_of, silent, understood
 from koopmpc.fitting.goal import Goal, goal_template, read_goal
 from koopmpc.fitting.repair import IN_MEMORY, Divided, divided, noted, shortened
 from koopmpc.parallel import StageProgress
@@ -136,4 +136,4 @@ def _read(data: Data, memory: int, draw: np.random.Generator, reading: dict[str,
     told = {name: value for name, value in reading.items() if value is not None}
     with noted(notes):
         files, split = evenly(logs_of(data), told, partial(divided, horizon=None, rng=draw, memory=memory), notes)
-    return split, shortened(notes, files.files)
+    return split, [*shortened(notes, files.files), *guessed(files.files, told)]

@@ -1,6 +1,6 @@
 """fit_data: from a file or a folder of logs to a model file, with its report, its pictures and its Rerun log."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
@@ -33,6 +33,7 @@ from koopmpc.validate.text import labelled, written
 
 Say = Callable[[str], None]
 _ROLLOUTS = 3  # held-out episodes that are drawn
+_OWN = b"# koopmpc.episodes"  # a table that begins so was written by Episodes.save
 LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 
@@ -128,7 +129,7 @@ def fit_data(
         told = {name: value for name, value in reading.items() if value is not None}
         reads = partial(divided, horizon=horizon, rng=draw, memory=memory)
         files, split = evenly(logs_of(data), told, reads, notes)
-    about = understood(split, shortened(notes, files.files))
+    about = understood(split, [*shortened(notes, files.files), *guessed(files.files, told)])
     tell(about)
     doubts: list[str] = []
     with noted(doubts):
@@ -248,6 +249,17 @@ def logs_of(data: Data) -> Data:
     if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
         return sorted(Path(data).glob("*.rrd"))
     return data
+
+
+def guessed(files: Iterable[str | PathLike[str]], told: Mapping[str, Any]) -> list[str]:
+    """Return a sentence where names of columns alone say which are inputs: tables, and nobody told the roles."""
+    tables = [Path(file) for file in files if Path(file).suffix.lower() == ".csv"]
+    if "inputs" in told or not tables:
+        return []
+    with tables[0].open("rb") as stream:
+        if stream.read(len(_OWN)) == _OWN:  # episodes that were saved, with their roles
+            return []
+    return ["which columns are inputs was guessed from their names; --inputs u,v and --states a,b say it"]
 
 
 def understood(split: Divided, notes: list[str]) -> str:

@@ -10,7 +10,7 @@ from tests.closed_loop.controllers import CONTROLLERS, GIVEN, YARDSTICKS
 from tests.closed_loop.judge import LOST, Row, measure, worst
 from tests.closed_loop.optimum import boxes, held, optimum
 from tests.closed_loop.table import losses, saved, stored, text
-from tests.closed_loop.tasks import TASKS
+from tests.closed_loop.tasks import TASKS, TEN
 
 NONE = km.control.move.Fallback.NONE
 RUNS = [(name, start) for name, task in TASKS.items() for start in range(len(task.starts))]
@@ -23,6 +23,21 @@ def test_no_default_loses_five_percent_against_the_last_commit(task, record_prop
     record_property("closed loops", text(table, stored()))
     lost = losses(table, stored())
     assert not lost, "\n".join([*lost, text(table, stored())])
+
+
+@pytest.mark.loops
+@pytest.mark.parametrize("task", TEN)
+def test_a_design_from_data_alone_costs_at_most_a_twentieth_more_than_the_optimum(task, record_property):
+    """It keeps the limits, and it is no worse than plain DMDc with Q_N = Q where that keeps them too."""
+    table = measure([task], ["designed", "designed-linear", "dmdc"], seeds=(0,), workers=1)
+    record_property("closed loops", text(table))
+    designed, linear, dmdc = (table[task][name] for name in ("designed", "designed-linear", "dmdc"))
+    assert designed.ratio <= 1.05, text(table)
+    assert designed.violation <= 0.01, text(table)
+    if dmdc.violation <= 0.001:
+        assert designed.ratio <= 1.001 * dmdc.ratio, text(table)
+    if task != "sine":  # between three equilibria no linear model holds, and the design says so
+        assert linear.ratio <= 1.5, text(table)
 
 
 @pytest.mark.loops

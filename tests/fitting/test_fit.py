@@ -14,7 +14,7 @@ import koopmpc as km
 import koopmpc.fitting.fit
 from koopmpc.bench.sweep import RESULTS
 from koopmpc.cli.app import app
-from koopmpc.fitting.fit import fit_data
+from koopmpc.fitting.fit import fit_data, guessed
 from koopmpc.fitting.repair import divided, needed, shortened
 from tests.bench.tiny import write
 
@@ -286,6 +286,15 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
     assert "Traceback" not in result.output
     assert result.stderr.count(words) == 1
     assert not list(tmp_path.glob("logs/*"))  # no empty folder is left behind
+
+
+def test_roles_that_names_alone_tell_are_said_to_be_guessed(tmp_path):
+    folder = write_csv(cart_pole(1, steps=5), tmp_path / "csv", header="time [s],x,theta,v,omega,inflow")
+    cart_pole(1, steps=5).save(tmp_path / "own.csv")
+    (sentence,) = guessed([folder / "00.csv"], {})
+    assert "guessed from their names; --inputs u,v and --states a,b say it" in sentence
+    assert guessed([folder / "00.csv"], {"inputs": ["inflow"]}) == []
+    assert guessed([tmp_path / "own.csv"], {}) == guessed([tmp_path / "own.npz"], {}) == []
 
 
 def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):

@@ -14,6 +14,7 @@ _GRID = 0.95  # share of a sensor's different values that stand on a grid
 _COARSE = 0.5  # of a usual step, from which on a grid is coarse
 _LONG = 12  # rows without any change from which on a sensor is stuck
 _AT_LIMIT = 8  # rows at the same extreme value from which on a sensor is at its limit
+_RESTS = 0.1  # of a usual change: where the law misses less than this, a state that stands still is at rest
 _OVERLAP = 10  # rows that two episodes share
 _FAR = 3.0  # times the largest usual step: a jump
 
@@ -179,7 +180,7 @@ def _longest_usual(log: Log, i: int) -> int:
 
 
 def limits(log: Log) -> dict[int, tuple[float, ...]]:
-    """Return for each state the extreme values at which its sensor stays."""
+    """Return for each state the extreme values at which its sensor stays, though the others tell that it moves on."""
     found: dict[int, tuple[float, ...]] = {}
     for i in range(log.data.nx):
         low, high = float(log.X[:, i].min()), float(log.X[:, i].max())
@@ -187,9 +188,18 @@ def limits(log: Log) -> dict[int, tuple[float, ...]]:
             continue
         for end in (low, high):
             stays = [b - a for e in log.data for a, b in runs(e.X[:, i] == end)]
-            if sum(stays) >= max(_AT_LIMIT, 0.002 * len(log.X)) and len(stays) > 1 and np.mean(np.array(stays) > 1) > 0.2:
+            often = sum(stays) >= max(_AT_LIMIT, 0.002 * len(log.X)) and len(stays) > 1
+            if often and np.mean(np.array(stays) > 1) > 0.2 and not _at_rest(log, i, end):
                 found[i] = (*found.get(i, ()), end)
     return {i: ends for i, ends in found.items() if i not in coarse(log) and i not in slow_states(log)}
+
+
+def _at_rest(log: Log, i: int, end: float) -> bool:
+    """Return True where the one-step law has this state stand still at this value: the plant rests there."""
+    stays = [(e.X[1:, i] == end) & (e.X[:-1, i] == end) for e in log.data]
+    missed = np.concatenate([E[own, i] for E, own in zip(log.residuals, stays, strict=True)])
+    changes = np.concatenate([np.diff(e.X[:, i]) for e in log.data]) / log.size[i]
+    return bool((missed**2).sum() < _RESTS**2 * len(missed) * (changes**2).mean())
 
 
 def saturated(log: Log) -> Iterator[LogFault]:
