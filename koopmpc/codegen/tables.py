@@ -351,10 +351,8 @@ def _koopman(controller: KoopmanMPC, *, single: bool) -> Tables:
     steep = bool(len(qp.source)) and solver._steep()
     tables.sizes |= {"QP_MIXED": int(solver._mixed), "STEEP": int(steep), "FEW": FEW}
     if steep:
-        tables.notes.append(
-            "Hard rows of the QP are nearly dependent (the plant is unstable over this horizon): where Python solves "
-            "such a step by proximal points, this C takes its fallback. A shorter horizon or fewer moves avoid it."
-        )
+        values, V = np.linalg.eigh(solver._metric())
+        tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver._M @ V}
     assert na == tables.sizes["NA"]
     tables.conditioning = _amplified(tables, plan.matrix[: plan.moves, :nz])
     return tables

@@ -179,3 +179,19 @@ def test_a_closed_loop_costs_the_same(pendulum):
     costs = [km.metrics(run).cost for run in runs]
     assert abs(costs[1] / costs[0] - 1) < 1e-6
     assert list(runs[0].status) == list(runs[1].status)
+
+
+@pytest.mark.parametrize(("growth", "horizon", "more"), [(1.4, 40, {}), (1.4, 60, {"du_max": 0.3})])
+def test_an_unstable_plant_whose_hard_rows_are_nearly_dependent_is_solved_alike(growth, horizon, more):
+    A, B = np.array([[growth, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.5]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "q"), ("u",))
+    controller = km.KoopmanMPC(model, km.Cost([1.0, 1.0], 0.1), km.Limits(-1, 1, **more), horizon, solver="daqp")
+    assert controller._qps._solvers[0]._steep()
+    twin, rng, seen = km.compiled(controller), np.random.default_rng(0), set()
+    for k in range(60):
+        x = rng.uniform(-1, 1, 2) * [0.3, 1.0] * (0.5 if k % 3 else 2.0)
+        a, b = controller(x, [0.0, 0.0]), twin(x, [0.0, 0.0])
+        assert (a.status, a.fallback) == (b.status, b.fallback)
+        np.testing.assert_allclose(b.u, a.u, rtol=0, atol=1e-6)
+        seen.add(a.status.name)
+    assert "OPTIMAL" in seen

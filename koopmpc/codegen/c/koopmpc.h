@@ -100,6 +100,10 @@ typedef struct {
   int target_ints[KOOPMPC_TARGET_INTS];
   koopmpc_real qp_reals[KOOPMPC_QP_REALS]; /**< memory of the QP solver, and the rows that it ended with */
   int qp_ints[KOOPMPC_QP_INTS];
+#if KOOPMPC_STEEP
+  koopmpc_real eased[KOOPMPC_QP_M * KOOPMPC_MOVES + 4 * KOOPMPC_QP_M]; /**< rows of a problem that a weight eases */
+#endif
+  int far;        /**< whether the last solution had to be approached */
   int aimed;      /**< whether `column` is that of `reference` */
   int row;        /**< row of given input targets */
   int warm;       /**< whether `dual` is of the last step */

@@ -416,30 +416,126 @@ static int contradictory(koopmpc_state *s, koopmpc_qp_memory *qp) {
   return s->unmet = !good && end.flag == -1;
 }
 
+#if KOOPMPC_STEEP
+/**
+ * Solve by proximal points: x <- least 0.5 |x|^2 + 0.5 c |A (x - last)|^2 within the limits, A the hard rows.
+ *
+ * In plans of unstable plants some combinations of hard rows take an x a million times as large as others, and DAQP
+ * takes independent rows for dependent ones. The added weight makes them alike, and two or three steps lead to the
+ * solution. In the basis V of A'A, x = V a, each of these problems is that of a least distance.
+ */
+static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const koopmpc_real *push, int *iterations) {
+  enum { PASSES = 20 };
+  koopmpc_real *M = s->eased, *scaling = M + ROWS * MOVES, *linear = scaling + ROWS, *rho = linear + ROWS;
+  koopmpc_real *rows = rho + ROWS, weight = (koopmpc_real)1e7, least = 0, missed = KOOPMPC_HUGE, unit = 1;
+  koopmpc_real stretch[MOVES], centre[MOVES], pull[MOVES], a[MOVES];
+  const koopmpc_qp eased = {MOVES, ROWS, KOOPMPC_QP_SOFT, M, scaling, 0, koopmpc_sense, linear, rho};
+  koopmpc_status status = KOOPMPC_INFEASIBLE;
+  int active = 0;
+  koopmpc_copy(rows, push, ROWS);
+  koopmpc_fill(centre, 0, MOVES);
+  for (int pass = 0; pass < PASSES; pass++) {
+    koopmpc_qp_end end = {0, 0};
+    unit = 1 + weight;
+    for (int j = 0; j < MOVES; j++) {
+      stretch[j] = KOOPMPC_SQRT(unit / (1 + weight * koopmpc_lambda[j]));
+      pull[j] = -stretch[j] * weight * koopmpc_lambda[j] * centre[j] / unit;
+    }
+    for (int i = 0; i < ROWS; i++) {
+      koopmpc_real square = 0;
+      for (int j = 0; j < MOVES; j++) {
+        M[i * MOVES + j] = koopmpc_MV[i * MOVES + j] * stretch[j];
+        square += M[i * MOVES + j] * M[i * MOVES + j];
+      }
+      scaling[i] = square < (koopmpc_real)1e-11 ? 1 : 1 / KOOPMPC_SQRT(square);
+      for (int j = 0; j < MOVES; j++) M[i * MOVES + j] *= scaling[i];
+      linear[i] = koopmpc_linear[i] / unit;
+      rho[i] = koopmpc_rho[i] * unit;
+    }
+    for (int wider = 0; wider < 2 && end.flag <= 0; wider++) {
+      (void)set_limits(s, qp, 0);
+      for (int i = 0; i < ROWS; i++) {
+        const koopmpc_real shift = koopmpc_dot(M + i * MOVES, pull, MOVES) / scaling[i];
+        qp->low[i] += shift;
+        qp->high[i] += shift;
+      }
+      end = koopmpc_qp_solve(&eased, qp, wider ? 0 : rows, wider ? KOOPMPC_WIDER : 0, 0);
+      *iterations += end.iterations;
+    }
+    if (end.flag > 0) {
+      koopmpc_real before = missed, size = (koopmpc_real)1e-30;
+      for (int j = 0; j < MOVES; j++) a[j] = stretch[j] * (qp->primal[j] - pull[j]);
+      missed = 0;
+      for (int i = 0; i < MOVES; i++) {
+        koopmpc_real x = 0, moved = 0, pushed = 0;
+        for (int j = 0; j < MOVES; j++) {
+          x += koopmpc_V[i * MOVES + j] * a[j];
+          moved += koopmpc_V[i * MOVES + j] * koopmpc_lambda[j] * (a[j] - centre[j]);
+        }
+        for (int k = 0; k < ROWS; k++)
+          if (qp->dual[k] < 0 || qp->dual[k] > 0)
+            pushed += qp->dual[k] * unit * koopmpc_M[k * MOVES + i] / koopmpc_scaling[k];
+        qp->primal[i] = x;
+        if (koopmpc_abs(moved) > missed) missed = koopmpc_abs(moved);
+        if (koopmpc_abs(x) > size) size = koopmpc_abs(x);
+        if (koopmpc_abs(pushed) > size) size = koopmpc_abs(pushed);
+      }
+      missed *= weight / size;
+      status = missed <= KOOPMPC_ACCURACY ? KOOPMPC_OPTIMAL : KOOPMPC_MAX_ITERATIONS;
+      if (status == KOOPMPC_OPTIMAL) break;
+      koopmpc_copy(centre, a, MOVES);
+      koopmpc_copy(rows, qp->dual, ROWS);
+      if (missed > (koopmpc_real)0.1 * before) weight = weight / 10 > least ? weight / 10 : least;
+    } else {
+      status = end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
+      if (weight > (koopmpc_real)1e9) break;
+      least = weight *= 10;
+    }
+  }
+  for (int i = 0; i < ROWS; i++) {
+    qp->dual[i] *= unit;
+    active += qp->dual[i] < 0 || qp->dual[i] > 0;
+  }
+  s->far = status == KOOPMPC_OPTIMAL && 2 * active > MOVES;
+  return status;
+}
+#endif
+
 /** Find the least deviation from the plan inside the limits; its status, and how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
   koopmpc_real push[KOOPMPC_QP_M1], conflict;
   koopmpc_qp_end end;
   const int resume = s->warm && s->resumes;
+  koopmpc_status status;
   int good = 0, active = 0;
   s->resumes = 0;
   for (int i = 0; i < ROWS; i++) /* the last answer, moved on by a step */
     push[i] = s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
   if (!resume && s->unmet && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
   conflict = set_limits(s, qp, 0);
-  end = attempt(qp, resume ? 0 : push, 0, resume, &good);
-  report->iterations += end.iterations;
-  for (int i = 0; i < ROWS; i++) active += qp->dual[i] < 0 || qp->dual[i] > 0;
-  s->resumes = good && active <= KOOPMPC_FEW;
-  if (end.flag == -1 && KOOPMPC_QP_MIXED && !KOOPMPC_STEEP && contradictory(s, qp))
-    return KOOPMPC_INFEASIBLE;
-  if (!good && !(end.flag == -1 && KOOPMPC_STEEP)) {
-    (void)set_limits(s, qp, 0);
-    end = attempt(qp, 0, KOOPMPC_WIDER, 0, &good);
+  if (!resume && s->far) {
+    status = KOOPMPC_FAILED;
+  } else {
+    end = attempt(qp, resume ? 0 : push, 0, resume, &good);
     report->iterations += end.iterations;
+    for (int i = 0; i < ROWS; i++) active += qp->dual[i] < 0 || qp->dual[i] > 0;
+    s->resumes = good && active <= KOOPMPC_FEW;
+    if (end.flag == -1 && KOOPMPC_QP_MIXED && !KOOPMPC_STEEP && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
+    if (!good && !(end.flag == -1 && KOOPMPC_STEEP)) {
+      (void)set_limits(s, qp, 0);
+      end = attempt(qp, 0, KOOPMPC_WIDER, 0, &good);
+      report->iterations += end.iterations;
+    }
+    status = end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
   }
-  if (!good)
-    return end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
+#if KOOPMPC_STEEP
+  if (!good) {
+    if (resume) koopmpc_fill(push, 0, ROWS);
+    status = approach(s, qp, push, &report->iterations);
+    good = status == KOOPMPC_OPTIMAL;
+  }
+#endif
+  if (!good) return status;
   report->slack = conflict;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real dual = qp->dual[i];

@@ -6,6 +6,23 @@
 
 static koopmpc_real magnitude(koopmpc_real a) { return a < 0 ? -a : a; }
 
+#ifdef KOOPMPC_FLOAT
+enum { REFINEMENTS = 2 }; /* floats leave active rows off by their rounding */
+#else
+enum { REFINEMENTS = 1 };
+#endif
+
+/** Whether rounding may have left active rows off by more than the tolerance, as DAQP judges it. */
+static int rounded(const DAQPWorkspace *work, int transformed) {
+  koopmpc_real least = 1, off = (koopmpc_real)(DAQP_REFINE_GAIN * 2.3e-16);
+  if (transformed || REFINEMENTS > 1) return 1;
+  for (int i = 0; i < work->n_active; i++) {
+    if (work->D[i] < least) least = work->D[i];
+    if (work->sense[work->WS[i]] & DAQP_SOFT) return 0;
+  }
+  return off * off * work->fval > KOOPMPC_PRIMAL_TOL * KOOPMPC_PRIMAL_TOL * least * least;
+}
+
 enum { ROWS_CHANGED = 2 };
 enum { ACTIVE_ROWS, SINGULAR_ROW, SWAPPED };
 
@@ -121,10 +138,8 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
   mem->held[SWAPPED] = work.lam == mem->lam_star;
   end.iterations = work.iterations;
   if (end.flag <= 0) return end;
-#ifdef KOOPMPC_FLOAT
-  if (work.n_active > 0 && work.sing_ind == DAQP_EMPTY_IND) /* floats leave active rows off by their rounding */
-    for (int pass = 0; pass < 2; pass++) daqp_refine_active(&work);
-#endif
+  if (work.n_active > 0 && work.sing_ind == DAQP_EMPTY_IND && rounded(&work, qp->rinv != 0))
+    for (int pass = 0; pass < REFINEMENTS; pass++) daqp_refine_active(&work);
   for (int i = 0; i < work.n_active; i++)
     mem->dual[work.WS[i]] = work.lam_star[i] * qp->scaling[work.WS[i]];
   if (qp->rinv) {
