@@ -34,6 +34,9 @@ ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or 
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
 GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row come out as 1 ± 1e-8, three as 1 ± 1e-5
 APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
+AXES, SHORTEST, FARTHEST = 8, 60, 20.0  # of trial loops: axes of starts, least steps, standard deviations they go
+ALIKE = 0.01  # share of a law, over the data, by which others may differ and need no trial
+WORTH = 1.05  # cost of a trial loop by the least up to which the longer tail is taken
 AHEAD = 10  # horizons within which the gain of a learned model rests, or else its tail is as long as the horizon
 
 
@@ -181,8 +184,78 @@ def learned_steps(
     their mean: that of the change is ‖Lᵀ(K⁺ − K)(z − z̄)‖ over ‖LᵀK⁺(z − z̄)‖, S = L Lᵀ, so that inputs count by what
     they cost. The gain rests when the change is so small for as many steps as the model's point has entries, for a
     weight may take that long to reach an input. The tail has N steps where this takes more than 10 N, and where the
-    model does not know its errors. `inverse` takes z into the coordinates of the stage, where these are others.
+    model does not know its errors. It is shortened to a half, a quarter or none of that where the loop is better off
+    on the re-lifted model, see `believed_steps`. `inverse` takes z into the coordinates of the stage, where these are
+    others.
     """
+    scale = predictor.scale
+    if predictor.report is None or scale is None:
+        return N
+    back = np.eye(len(scale)) if inverse is None else inverse
+    return believed_steps(stage, predictor, N, _rested_steps(stage, predictor, N, back), back)
+
+
+def believed_steps(
+    stage: Stage, predictor: LinearPredictor, N: int, most: int, inverse: Float[np.ndarray, "nz nz"]
+) -> int:
+    """Return the longest tail of `most` steps, a half, a quarter or none whose loop costs at most 5 % above the least.
+
+    Without limits, N planned steps and a tail are a law u = −K z. Each law steers the re-lifted model
+    x⁺ = C (A ψ(x) + B u) for 2 N steps, at least 60. Modes of A that the lifted states do not have grow in a long
+    tail until they rule the law, and here they cost what they do on the plant: a lift afresh does not follow them. All
+    is told in deviations from the mean of the data, which so is at rest. The starts lie a standard deviation from it,
+    along the first eight principal axes of the states in units of their standard deviations. Where all laws are alike,
+    and on a model of delays or of fewer coordinates than its lifting has, it is `most`.
+    """
+    scale, lifting = predictor.scale, predictor.lifting
+    if scale is None or predictor.embedding is not None or lifting.nz != len(scale):
+        return most
+    C, nz, constant = predictor.C, len(scale), lifting.constant_index
+    lengths = sorted({most, most // 2, most // 4, 0}, reverse=True)
+    laws = _laws(stage, [n + N for n in lengths])
+    seen = scale @ inverse.T
+    if max(np.linalg.norm(seen @ (law - laws[0])[:nz]) for law in laws) <= ALIKE * np.linalg.norm(seen @ laws[0][:nz]):
+        return most
+    center = np.zeros(len(C)) if constant is None else C @ (scale.T @ scale[:, constant])
+    spread = C @ scale.T @ scale @ C.T - np.outer(center, center)
+    sizes = np.sqrt(np.where(spread.diagonal() > 0, spread.diagonal(), 1.0))
+    values, axes = np.linalg.eigh(spread / np.outer(sizes, sizes))
+    ways = (sizes[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))[:, ::-1][:, :AXES].T
+    X = np.tile(center + np.vstack([ways, -ways]), (len(laws), 1, 1))
+    V, cost = np.zeros((*X.shape[:2], stage.B.shape[1])), np.zeros(len(laws))
+    CA, CB = C @ predictor.A, np.linalg.solve(inverse.T, C.T).T @ stage.B[:nz]
+    rest = lifting(center[None])
+    with np.errstate(all="ignore"):
+        for _ in range(max(2 * N, SHORTEST)):
+            moved = lifting(X.reshape(-1, len(center))).reshape(*X.shape[:2], nz) - rest
+            xi = moved @ inverse.T
+            if len(stage.A) > nz:  # the last input is beside z
+                xi = np.concatenate([xi, V], axis=2)
+            V = -xi @ laws
+            cost += ((xi @ stage.Q) * xi).sum(axis=(1, 2)) + ((V @ stage.R) * V).sum(axis=(1, 2))
+            if stage.M is not None:
+                cost += 2 * ((xi @ stage.M) * V).sum(axis=(1, 2))
+            ahead = np.nan_to_num((moved @ CA.T + V @ CB.T) / sizes, nan=FARTHEST)
+            X = center + sizes * np.clip(ahead, -FARTHEST, FARTHEST)
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    return next(n for n, each in zip(lengths, cost, strict=True) if each <= WORTH * cost.min())
+
+
+def _laws(stage: Stage, steps: list[int]) -> Float[np.ndarray, "laws nx nu"]:
+    """Return Kᵀ after so many steps of the recursion each; NaN where P has lost its digits."""
+    found = np.full((len(steps), *stage.B.shape), np.nan)
+    P = _last(stage)
+    for n in range(1, max(steps) + 1):
+        try:
+            K, _, P = step(stage, P)
+        except (DefinitenessError, np.linalg.LinAlgError):
+            break
+        found[[i for i, wanted in enumerate(steps) if wanted == n]] = K.T
+    return found
+
+
+def _rested_steps(stage: Stage, predictor: LinearPredictor, N: int, inverse: Float[np.ndarray, "nz nz"]) -> int:
+    """Return the steps until the gain rests as far as the model is accurate, or N."""
     report, scale = predictor.report, predictor.scale
     if report is None or scale is None:
         return N
@@ -193,8 +266,7 @@ def learned_steps(
     sizes: Float[np.ndarray, " nx"] = np.linalg.norm(spread @ predictor.C.T, axis=0)
     missed: Float[np.ndarray, " n"] = report.residual[sizes > 0] / sizes[sizes > 0]
     enough = max(float(np.sqrt(np.mean(missed**2))) if missed.size else 0.0, SETTLED)
-    if inverse is not None:
-        spread = spread @ inverse.T
+    spread = spread @ inverse.T
     P = _last(stage)
     (nz, _), needed, rested = scale.shape, len(predictor.lifting.bound or ()), 0
     K = np.zeros(stage.B.T.shape)

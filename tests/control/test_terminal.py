@@ -1,5 +1,8 @@
 """The terminal cost is the tail of the same tracking problem: against LQR, against Q_N = Q, against plain least squares."""
 
+from dataclasses import dataclass
+
+import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
@@ -395,3 +398,42 @@ def run(target):
     )
     for line, expected in zip(lines, MESSAGES.values(), strict=True):
         assert line.startswith(expected)
+
+
+@dataclass(frozen=True)
+class MotorPendulum(km.Dynamics):
+    """θ'' = 15 sin θ − 0.2 θ' − 3 w cos θ, w' = 10 (u − w): an inverted pendulum with a lagging motor."""
+
+    states = ("theta", "omega", "w")
+    inputs = ("u",)
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """Return [θ', θ'', w']."""
+        return ca.vertcat(x[1], 15 * ca.sin(x[0]) - 0.2 * x[1] - 3 * x[2] * ca.cos(x[0]), 10 * (u - x[2]))
+
+
+@pytest.mark.parametrize(
+    ("dt", "noise", "degree", "R", "episodes", "seed"),
+    [
+        (0.06, 5e-3, 3, 0.014, 15, 5),  # modes of 1.23 that the plant lacks: a tail until the gain rests loses the plant
+        (0.04, 5e-3, 2, 0.31, 15, 109),
+        (0.02, 5e-3, 3, 1.5, 60, 8),  # a good model: without a tail the plant is lost
+        (0.02, 0.0, 3, 1.4, 60, 103),
+    ],
+)
+def test_the_tail_of_a_learned_model_is_as_long_as_helps_on_the_model_itself(dt, noise, degree, R, episodes, seed):
+    """Models with fast modes that the plant lacks, and good ones: none costs more than 1.2 times the linearised plant."""
+    plant, box, reference = km.discretize(MotorPendulum(), dt), km.Limits(-5, 5), np.zeros(3)
+    high = np.random.default_rng(seed).uniform(0.8, 1.2) * np.array([0.5, 0.9, 1.0])
+    hands = km.Feedback([[-9.0, -2.4, 0.0]], km.Noise(-0.3, 0.3, hold=2), u_min=-5, u_max=5)
+    clean = km.collect(plant, km.Uniform(-high, high), hands, episodes=episodes, steps=30, rng=seed)
+    size, rng = noise * np.concatenate([e.X for e in clean]).std(axis=0), np.random.default_rng(seed)
+    noisy = [km.Episode(X=e.X + size * rng.standard_normal(e.X.shape), U=e.U) for e in clean]
+    data = km.Episodes(noisy, dt, clean.states, clean.inputs)
+    model = km.edmd(data, km.State() + km.Constant() + km.Monomials(degree), ridge=1e-9)
+    cost = km.Cost(Q=[20, 1, 0.1], R=R)
+    costs = []
+    for mpc in (km.KoopmanMPC(model, cost, box, 10), km.LinearMPC(plant, reference, [0.0], cost, box, 60)):
+        run = km.simulate(plant, mpc, x0=[0.3, 0, 0], reference=reference, steps=int(4 / dt), cost=cost, limits=box)
+        costs.append(km.metrics(run).cost)
+    assert costs[0] < 1.2 * costs[1]
