@@ -1,10 +1,11 @@
-"""Random closed loops of linear controllers, from a seeded generator: their statuses, iterations and times in a table.
+"""Random closed loops, from a seeded generator: their statuses, iterations and times in a table.
 
     python -m tests.control.random_loops --count 1000 --processes 2
 
 A plant has 1 to 4 states and a spectral radius up to 1.3, a controller any of its options: limits of inputs, of their
 changes and of states, hard or soft, weights of changes, blocked moves, latency, previews of the reference and of a
-measured disturbance, an estimator, a model that is wrong by a few percent, and either solver.
+measured disturbance, an estimator, a model that is wrong by a few percent, and either solver. With --bilinear the
+same loops are those of BilinearMPC, which plans on the same models.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from itertools import repeat
 import numpy as np
 
 import koopmpc as km
+import koopmpc.plants.compiled
 
 STEPS = 40
 FAR = 1e4  # a loop ends where the state of a plant that its inputs cannot hold is this many times its start
@@ -84,7 +86,7 @@ def lifted(rng, A, B, nz, given):
     return km.LinearPredictor(whole, np.vstack([B, below]), C, lifting, 0.1, *names, **given)
 
 
-def loop(seed, solver=None, large=False):
+def loop(seed, solver=None, large=False, bilinear=False):
     """Run the loop of a seed and return its Outcome."""
     rng = np.random.default_rng(seed)
     nx, nu, N = int(rng.integers(1, 5)), int(rng.integers(1, 3)), int(rng.integers(1, 31))
@@ -126,7 +128,9 @@ def loop(seed, solver=None, large=False):
     kept = limits.rows(nx, 0)
     outcome.hard_states = bool(np.isinf(kept.softness.linear).any())
     try:
-        mpc = km.KoopmanMPC(model, km.Cost(**weights), limits, N, **options)
+        if bilinear:
+            options.pop("solver")
+        mpc = (km.BilinearMPC if bilinear else km.KoopmanMPC)(model, km.Cost(**weights), limits, N, **options)
         path = goal * np.cos(0.2 * np.arange(STEPS + N + 3))[:, None] if moving else np.tile(goal, (STEPS + N + 3, 1))
         box, pending = limits.inputs(nu), [np.clip(np.zeros(nu), *limits.inputs(nu))] * options.get("latency", 0)
         most = FAR * (1 + np.abs(x).max())
@@ -174,12 +178,12 @@ def table(outcomes):
     return lines
 
 
-def outcomes_of(seeds, processes=1, solver=None, large=False):
+def outcomes_of(seeds, processes=1, solver=None, large=False, bilinear=False):
     """Run the loops of some seeds."""
     if processes == 1:
-        return [loop(seed, solver, large) for seed in seeds]
+        return [loop(seed, solver, large, bilinear) for seed in seeds]
     with ProcessPoolExecutor(processes) as pool:
-        return list(pool.map(loop, seeds, repeat(solver), repeat(large), chunksize=20))
+        return list(pool.map(loop, seeds, repeat(solver), repeat(large), repeat(bilinear), chunksize=20))
 
 
 if __name__ == "__main__":
@@ -189,6 +193,12 @@ if __name__ == "__main__":
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--solver", choices=("osqp", "daqp"))
     parser.add_argument("--large", action="store_true", help="N = 50, nu = 2, nz = 100, nx = 4")
+    parser.add_argument(
+        "--bilinear", action="store_true", help="BilinearMPC, interpreted: a loop ends before compiling"
+    )
     given = parser.parse_args()
-    found = outcomes_of(range(given.first, given.first + given.count), given.processes, given.solver, given.large)
+    if given.bilinear:
+        koopmpc.plants.compiled.compiler = lambda: None
+    seeds = range(given.first, given.first + given.count)
+    found = outcomes_of(seeds, given.processes, given.solver, given.large, given.bilinear)
     sys.stdout.write("\n".join(table(found)) + "\n")

@@ -415,7 +415,14 @@ class MotorPendulum(km.Dynamics):
 @pytest.mark.parametrize(
     ("dt", "noise", "degree", "R", "episodes", "seed"),
     [
-        (0.06, 5e-3, 3, 0.014, 15, 5),  # modes of 1.23 that the plant lacks: a tail until the gain rests loses the plant
+        (
+            0.06,
+            5e-3,
+            3,
+            0.014,
+            15,
+            5,
+        ),  # modes of 1.23 that the plant lacks: a tail until the gain rests loses the plant
         (0.04, 5e-3, 2, 0.31, 15, 109),
         (0.02, 5e-3, 3, 1.5, 60, 8),  # a good model: without a tail the plant is lost
         (0.02, 0.0, 3, 1.4, 60, 103),
