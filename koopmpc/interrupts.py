@@ -33,9 +33,14 @@ def listening() -> Generator[None]:
     try:
         with _handled(called):
             yield
-    finally:
+    except GeneratorExit:  # it came while the block was entered, and is on its way
+        raise
+    except BaseException:
         if came:
             raise KeyboardInterrupt from None
+        raise
+    if came:
+        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.errors import DataError
+from koopmpc.interrupts import heard
 from koopmpc.loop.run import About, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.format.rrd import block_of_run, block_of_steps
@@ -84,6 +85,7 @@ class BackgroundWriter:
 _PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
 
 
+@heard  # Rerun's own code may swallow a Ctrl-C
 def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Predictor | None = None) -> None:
     """Write `run` as a complete Rerun log; `load_run(path)` equals `run` to the bit.
 
