@@ -1,13 +1,10 @@
 """A controller in machine code: the C of `export`, built with the compiler at hand, behind the Controller protocol."""
 
 import ctypes
-import platform
-import re
 import subprocess
 import warnings
-from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,9 +12,17 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
-from koopmpc.codegen.sources import sources_of
+from koopmpc.codegen.machine import (
+    CRows,
+    Frame,
+    Precision,
+    SingleFrame,
+    built_of,
+    first_error,
+    plant_text,
+    whole_call,
+)
 from koopmpc.codegen.tables import tables_of
-from koopmpc.codegen.text import Language, function, traced
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, WholeRun, alone, busy
@@ -25,141 +30,12 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.compiled import compiler, library, private_cache
 from koopmpc.plants.step_map import StepMap
 
-Precision = Literal["double", "float"]
 _STATUS, _FALLBACK = list(Status), list(Fallback)
-
-# One call with one pointer: that is what ctypes does fastest.
-_DOOR = """
-#ifdef _WIN32
-#define DOOR __declspec(dllexport)
-#else
-#define DOOR
-#endif
-typedef struct {
-  koopmpc_state *state;
-  koopmpc_real *y;
-  koopmpc_rows reference;
-  koopmpc_real *applied;
-  koopmpc_rows w;
-  koopmpc_real *u;
-  koopmpc_report report;
-} koopmpc_frame;
-DOOR void koopmpc_call(koopmpc_frame *f) {
-  koopmpc_step(f->state, f->y, &f->reference, f->applied, f->w.count ? &f->w : 0, f->u, &f->report);
-}
-DOOR long koopmpc_state_size(void) { return (long)sizeof(koopmpc_state); }
-
-/* A whole run: the controller and the plant step by step, with a clock around the controller. */
-typedef struct {
-  long steps;
-  int nx, ny, preview, measured;
-  void (*step)(const double *x, const double *u, double *next);
-  void (*measure)(const double *x, double *y);
-  const koopmpc_real *rows, *W;
-  double *X, *Y, *U, *slack, *times;
-  int *reports;
-} koopmpc_whole;
-#ifndef KOOPMPC_FLOAT
-static double koopmpc_now(void) {
-  struct timespec t;
-  clock_gettime(CLOCK_MONOTONIC, &t);
-  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
-  for (long k = 0; k < run->steps; k++) {
-    const koopmpc_rows reference = {run->rows + k * KOOPMPC_NR, run->preview ? KOOPMPC_HORIZON + 1 : 1};
-    const koopmpc_rows w = {run->measured ? run->W + k * KOOPMPC_NW : 0,
-                            run->preview && KOOPMPC_HORIZON > 0 ? KOOPMPC_HORIZON : 1};
-    double *x = run->X + k * run->nx, *u = run->U + k * KOOPMPC_NU;
-    const double start = run->times ? koopmpc_now() : 0;
-    koopmpc_step(f->state, run->Y + k * run->ny, &reference, k ? u - KOOPMPC_NU : 0, run->measured ? &w : 0, u,
-                 &f->report);
-    if (run->times) run->times[k] = koopmpc_now() - start;
-    run->reports[3 * k] = (int)f->report.status;
-    run->reports[3 * k + 1] = (int)f->report.fallback;
-    run->reports[3 * k + 2] = f->report.iterations;
-    run->slack[k] = f->report.slack;
-    run->step(x, u, x + run->nx);
-    run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
-  }
-}
-/* ManyRuns from many states, one after the other, each from the beginning; Y holds one run. */
-DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
-  for (long e = 0; e < runs; e++) {
-    koopmpc_init(f->state, KOOPMPC_NX == run->nx ? run->X : 0, 0);
-    run->measure(run->X, run->Y);
-    koopmpc_run(f, run);
-    run->X += (run->steps + 1) * run->nx;
-    run->U += run->steps * KOOPMPC_NU;
-    run->slack += run->steps;
-    run->reports += 3 * run->steps;
-  }
-}
-#endif
-"""
-_CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"
 _PLANTS = 8  # plants whose machine code a controller keeps
 
 
 class NoCompilerWarning(UserWarning):
     """No C compiler was found, or it failed: the controller stays as it was, in Python."""
-
-
-class _Rows(ctypes.Structure):
-    _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
-
-
-class _Frame(ctypes.Structure):
-    """What a call passes; the same fields as in C."""
-
-    _fields_ = (
-        ("state", ctypes.c_void_p),
-        ("y", ctypes.c_void_p),
-        ("reference", _Rows),
-        ("applied", ctypes.c_void_p),
-        ("w", _Rows),
-        ("u", ctypes.c_void_p),
-        ("status", ctypes.c_int),
-        ("fallback", ctypes.c_int),
-        ("iterations", ctypes.c_int),
-        ("slack", ctypes.c_double),
-    )
-
-
-class _SingleFrame(ctypes.Structure):
-    """A `_Frame` in single precision."""
-
-    _fields_ = (
-        ("state", ctypes.c_void_p),
-        ("y", ctypes.c_void_p),
-        ("reference", _Rows),
-        ("applied", ctypes.c_void_p),
-        ("w", _Rows),
-        ("u", ctypes.c_void_p),
-        ("status", ctypes.c_int),
-        ("fallback", ctypes.c_int),
-        ("iterations", ctypes.c_int),
-        ("slack", ctypes.c_float),
-    )
-
-
-class _Whole(ctypes.Structure):
-    """What a whole run passes; the same fields as in C."""
-
-    _fields_ = (
-        ("steps", ctypes.c_long),
-        *((name, ctypes.c_int) for name in ("nx", "ny", "preview", "measured")),
-        *((name, ctypes.c_void_p) for name in ("step", "measure", "rows", "W", "X", "Y", "U")),
-        *((name, ctypes.c_void_p) for name in ("slack", "times", "reports")),
-    )
-
-
-class _Built(NamedTuple):
-    """A controller as the compiler built it."""
-
-    code: ctypes.CDLL
-    sizes: dict[str, int]
-    state_size: int
 
 
 def compiled(controller: Controller, *, precision: Precision = "double") -> Controller:
@@ -204,63 +80,6 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
         return controller
 
 
-def first_error(error: Exception) -> str:
-    """Return the first error that a compiler printed, or what the system says."""
-    printed = getattr(error, "stderr", None) or b""
-    text = printed.decode(errors="replace") if isinstance(printed, bytes) else str(printed)
-    lines = [line for line in text.splitlines() if "error" in line.lower()]
-    return lines[0] if lines else str(error)
-
-
-def amalgamated(files: dict[str, str]) -> str:
-    """Return all sources as one, each local header where it is first included."""
-    seen: set[str] = set()
-
-    def inlined(text: str, folder: str) -> str:
-        def replaced(match: re.Match[str]) -> str:
-            name = match.group(1)
-            path = next((p for p in (folder + name, name) if p in files), "")
-            if not path:  # what DAQP includes for its own clock
-                return match.group()
-            if path in seen:
-                return ""
-            seen.add(path)
-            return inlined(files[path], path.rpartition("/")[0] + "/" if "/" in path else "")
-
-        return re.sub(r'^#include "([^"]+)"$', replaced, text, flags=re.MULTILINE)
-
-    own = [name for name in files if name.endswith(".c") and "/" not in name]
-    return "\n".join(inlined(files[name], "") for name in own)
-
-
-def machine() -> list[str]:
-    """Return the flags for this very processor, where the compiler takes them."""
-    return ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
-
-
-def _processor() -> str:
-    """Return what tells this processor from others whose machine code it may not run."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line for line in lines if line.startswith("flags")), platform.processor())
-
-
-def _built(controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> _Built:
-    single = precision == "float"
-    tables = tables_of(controller, single=single)
-    text = _CLOCK + amalgamated(sources_of(tables, single=single)) + _DOOR + f"/* {_processor()} */\n"
-    cache = private_cache()
-    try:
-        code = library(text, [*command, *machine()], cache)
-    except subprocess.SubprocessError:
-        code = library(text, command, cache)  # it may not know this processor
-    code.koopmpc_state_size.restype = ctypes.c_long
-    code.koopmpc_init.restype = code.koopmpc_call.restype = None
-    return _Built(code, tables.sizes, int(code.koopmpc_state_size()))
-
-
 class ManyRuns(NamedTuple):
     """Closed loops side by side: X (E, T+1, nx), U (E, T, nu), and of every step Status, Fallback and slack."""
 
@@ -279,7 +98,7 @@ class Compiled:
 
     def __init__(self, controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> None:
         self.original, self.precision = controller, precision
-        self._built = built = _built(controller, precision, command)
+        self._built = built = built_of(controller, precision, command)
         sizes = built.sizes
         self.dt, self.nu, self.horizon = controller.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits, self.predictor = controller.cost, controller.limits, controller.predictor
@@ -298,10 +117,10 @@ class Compiled:
         self._y, self._u, self._applied = (np.zeros(n, kind) for n in (self._ny, self.nu, self.nu))
         self._reference = np.zeros((rows, self._nr), kind)
         self._w = np.zeros((rows, max(1, self._nw)), kind)
-        frame = self._frame = _SingleFrame() if single else _Frame()
+        frame = self._frame = SingleFrame() if single else Frame()
         frame.state, frame.y, frame.u = (a.ctypes.data for a in (self._memory, self._y, self._u))
-        frame.reference = _Rows(self._reference.ctypes.data, 1)
-        frame.w = _Rows(self._w.ctypes.data, 0)
+        frame.reference = CRows(self._reference.ctypes.data, 1)
+        frame.w = CRows(self._w.ctypes.data, 0)
         self._applied_address = self._applied.ctypes.data
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._call = self._built.code.koopmpc_call
@@ -441,7 +260,7 @@ class Compiled:
         rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
         slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
-        whole = _whole(code, len(U), arrays, W, preview=preview)
+        whole = whole_call(code, len(U), arrays, W, preview=preview)
         self._built.code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
         return WholeRun(reports[:, 0], reports[:, 1], reports[:, 2], slack, times)
 
@@ -484,7 +303,7 @@ class Compiled:
         X[:, 0] = starts
         slack, reports = np.zeros((E, T)), np.zeros((E, T, 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
-        whole = _whole(code, T, arrays, None, preview=True)
+        whole = whole_call(code, T, arrays, None, preview=True)
         self._built.code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
@@ -518,42 +337,6 @@ class Compiled:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (self.original, self.precision, self._memory)
-
-
-def _whole(
-    code: ctypes.CDLL,
-    steps: int,
-    arrays: dict[str, np.ndarray],
-    W: Float[np.ndarray, "wrows nw"] | None,
-    *,
-    preview: bool,
-) -> _Whole:
-    """Return what a whole run passes; it holds no reference to the arrays."""
-    whole = _Whole(steps, arrays["X"].shape[-1], arrays["Y"].shape[-1], preview, W is not None)
-    for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
-        setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
-    for name, array in ({"W": W} | arrays if W is not None else arrays).items():
-        assert array.flags.c_contiguous, "machine code reads contiguous arrays"
-        setattr(whole, name, array.ctypes.data)
-    return whole
-
-
-def plant_text(plant: StepMap) -> str:
-    """Return ``plant_step(x, u, next)`` and ``plant_measure(x, y)`` in double precision.
-
-    Raises
-    ------
-    DataError
-        Its equations cannot be written in C.
-    """
-    nx, nu = plant.F.size1_in(0), plant.F.size1_in(1)
-    step, look = traced(plant.F, "the plant"), traced(plant.h, "what the plant measures")
-    head = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
-    return (
-        head
-        + function(step, "plant_step", {"x": nx, "u": nu}, "next", Language()).text
-        + function(look, "plant_measure", {"x": nx}, "y", Language()).text
-    )
 
 
 def _rebuilt(controller: LQR | KoopmanMPC, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.codegen.compiled import Precision
+from koopmpc.codegen.machine import Precision
 from koopmpc.codegen.sources import constants, flops, iteration_flops, shipped, sources_of
 from koopmpc.codegen.tables import Tables, tables_of
 from koopmpc.codegen.text import Language, function, traced
