@@ -1,18 +1,19 @@
-"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x)."""
+"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x), by least squares or by fits for noisy states."""
 
 from typing import Literal, Unpack
 
 import numpy as np
+from jaxtyping import Complex, Float, Int
+from scipy.linalg import sqrtm
 
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.noise import denoised, forward_backward
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
-from koopmpc.identify.solve import RegressionRows, Ridge, doubts, ridge_of, rule, solve
+from koopmpc.identify.solve import RegressionRows, Ridge, Solution, doubts, orthonormal, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.lifting.state import Constant
@@ -20,6 +21,8 @@ from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
 
 Method = Literal["ls", "tls", "fb"]
+_DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is taken
+_REAL = 1e-6  # share of the size of A below which an imaginary part is rounding
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
@@ -58,7 +61,7 @@ def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method
     if method == "tls":
         given = _denoised(regression, given, nz)
     scaled = regression.scaled
-    solution = forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled)
+    solution = _forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled)
     K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
     return FitResult(
         A=K[:nz].T,
@@ -94,7 +97,7 @@ def _reduced(
         basis = leading(given, nz, r, [])[0]
     P = np.hstack([given.P[:, :nz] @ basis, given.P[:, nz:]])
     if method == "fb":
-        solution = forward_backward(RegressionRows(P, given.T @ basis, np.zeros(r), rows.samples), r)
+        solution = _forward_backward(RegressionRows(P, given.T @ basis, np.zeros(r), rows.samples), r)
         forward, drive = basis @ solution.K[:r].T, basis @ solution.K[r:].T
     else:
         solution = solve(RegressionRows(P, given.T, given.rest, rows.samples), ridge=ridge)
@@ -119,12 +122,115 @@ def _reduced(
     )
 
 
+def _total_least_squares(
+    rows: RegressionRows, exact: Int[np.ndarray, " e"], nz: int, directions: int, *, scaled: bool
+) -> RegressionRows:
+    """Return the rows projected on the leading directions that [ψ(x) ψ(x⁺)] span together.
+
+    Least squares on the result is the total least squares solution: with D = [ψ(x) ψ(x⁺)] freed of the exact
+    columns E, D ≈ L Σ Rᵀ and `directions` singular vectors L_r, the rows are multiplied by [E, L_r]ᵀ. This assumes
+    noise that is white and equally large in all columns but E: relative to each observable's size where `scaled`,
+    else in the data's own units.
+
+    Parameters
+    ----------
+    rows
+        P = [ψ(x) u]; T begins with ψ(x⁺), all of it inside the rows (`rest` is 0).
+    exact
+        The columns of P that hold no noise: inputs, a Constant.
+    nz
+        Number of observables.
+    directions
+        Number of directions that the signal spans, the Constant not counted.
+
+    References
+    ----------
+    Hemati, Rowley, Deem & Cattafesta, "De-biasing the dynamic mode decomposition for applied Koopman spectral
+    analysis of noisy datasets", Theor. Comput. Fluid Dyn. 31, 2017; exact columns: Van Huffel & Vandewalle, "The
+    total least squares problem", SIAM 1991.
+    """
+    most = rows.samples - len(exact)
+    if directions >= most:
+        raise DataError(
+            f'method "tls" with {rows.samples} snapshot pairs cannot tell noise from {directions} directions of '
+            f"signal; pass a rank below {max(most, 1)}, or collect more"
+        )
+    noisy = np.setdiff1d(np.arange(nz), exact)
+    E = orthonormal(rows.P[:, exact], float(np.finfo(float).eps * len(rows.P)))
+    D = np.hstack([rows.P[:, noisy], rows.T[:, noisy]])
+    if scaled:
+        size = np.sqrt(np.sum(D.reshape(len(D), 2, -1) ** 2, axis=(0, 1)))
+        D = D / np.tile(np.where(size > 0, size, 1.0), 2)
+    L = np.linalg.svd(D - E @ (E.T @ D), full_matrices=False)[0][:, :directions]
+    onto = np.hstack([E, L]).T
+    return RegressionRows(onto @ rows.P, onto @ rows.T, rows.rest, rows.samples)
+
+
+def _forward_backward(rows: RegressionRows, nz: int) -> Solution:
+    """Return K = [Aᵀ; Bᵀ] of z⁺ = A z + B u with the A whose bias by noise cancels to first order.
+
+    A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]: noise shrinks both, and A_b is A⁻¹. Of the square
+    roots of A_f A_b⁻¹ the one next to A_f is taken. B is the least squares fit of z⁺ − A z by u.
+
+    Parameters
+    ----------
+    rows
+        P = [z u]; T = z⁺, all of it inside the rows (`rest` is 0).
+    nz
+        Number of columns of z.
+
+    Raises
+    ------
+    DataError
+        A_b is singular, or the square root is not real: the motion cannot be run backward from these data.
+
+    References
+    ----------
+    Dawson, Hemati, Williams & Rowley, "Characterizing and correcting for the effect of sensor noise in the
+    dynamic mode decomposition", Exp. Fluids 57, 2016.
+    """
+    now, U, ahead = rows.P[:, :nz], rows.P[:, nz:], rows.T
+    forward = solve(rows)
+    backward = solve(RegressionRows(np.hstack([ahead, U]), now, rows.rest, rows.samples))
+    A = _root_next_to(forward.K[:nz].T, backward.K[:nz].T)
+    B = solve(RegressionRows(U, ahead - now @ A.T, rows.rest, rows.samples)).K
+    return Solution(np.vstack([A.T, B]), forward.rank, 0.0)
+
+
+def _root_next_to(forward: Float[np.ndarray, "r r"], backward: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r r"]:
+    """Return (A_f A_b⁻¹)^½ with the sign of each eigenvalue that A_f has along its eigenvector."""
+    if np.linalg.cond(backward) > 1 / np.finfo(float).eps:
+        raise DataError(
+            'method "fb" needs a motion that can be run backward, and on these data a direction of ψ(x) dies in '
+            'one step; pass a rank, or method="tls"'
+        )
+    square = np.linalg.solve(backward.T, forward.T).T
+    squares, V = eigen(square)
+    A: Complex[np.ndarray, "r r"]
+    if np.linalg.cond(V) > _DEFECTIVE:
+        A = np.asarray(sqrtm(square), dtype=np.complex128)
+    else:
+        W = np.linalg.inv(V)
+        roots = np.sqrt(squares)
+        along = np.einsum("ij,jk,ki->i", W, forward, V)
+        A = (V * np.where(np.real(np.conj(roots) * along) < 0, -roots, roots)) @ W
+    real = np.real(A)
+    if not np.abs(A - real).max() <= _REAL * np.abs(A).max():
+        raise DataError(
+            'method "fb" has no real square root of A_f A_b⁻¹ on these data: an eigenvalue near 0 changed its sign '
+            'in the noise; pass a smaller rank, or method="tls"'
+        )
+    return np.ascontiguousarray(real)
+
+
 def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
     """Return the rows with the noise of ψ(x) and ψ(x⁺) projected out; the Constant and the inputs count as exact."""
     nz, one = regression.lifting.nz, Constant().bind(regression.states).names[0]
     exact = [*(i for i, name in enumerate(regression.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
     constants = sum(i < nz for i in exact)
-    return denoised(rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=regression.scaled)
+    return _total_least_squares(
+        rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=regression.scaled
+    )
 
 
 def edmd(
