@@ -54,8 +54,8 @@ class DoublePendulum(km.Dynamics):
             km.scene.Line("rail", [(-1.5, -0.08), (2.5, -0.08)], width=0.02, color=(150, 160, 170)),
             km.scene.Box("cart", (at, 0.0), (0.3, 0.14)),
             km.scene.Line("force", [(at, 0.0), (at + float(u[0]) / 20, 0.0)], width=0.04, color=(40, 120, 200)),
-            km.scene.Line("lower pole", [(at, 0.0), knee], width=0.03, color=(120, 130, 150)),
-            km.scene.Line("upper pole", [knee, tip], width=0.03, color=(120, 130, 150)),
+            km.scene.Line("lower_pole", [(at, 0.0), knee], width=0.03, color=(120, 130, 150)),
+            km.scene.Line("upper_pole", [knee, tip], width=0.03, color=(120, 130, 150)),
             km.scene.Disk("knee", knee, 0.045),
             km.scene.Disk("tip", tip, 0.045),
         ]

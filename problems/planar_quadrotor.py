@@ -44,8 +44,8 @@ class Quadrotor(km.Dynamics):
         lines = [[place(a, 0.03), place(a, 0.03 + f / 8.0)] for a, f in arms]
         return [
             km.scene.Line("ground", [(-2.0, -1.5), (4.0, -1.5)], width=0.03, color=(150, 160, 170)),
-            km.scene.Line("left thrust", lines[0], width=0.04, color=(40, 120, 200)),
-            km.scene.Line("right thrust", lines[1], width=0.04, color=(40, 120, 200)),
+            km.scene.Line("left_thrust", lines[0], width=0.04, color=(40, 120, 200)),
+            km.scene.Line("right_thrust", lines[1], width=0.04, color=(40, 120, 200)),
             km.scene.Line("arm", [place(-self.l, 0.0), place(self.l, 0.0)], width=0.06),
             km.scene.Disk("body", place(0.0, 0.0), 0.08),
         ]

@@ -45,7 +45,7 @@ class Arm(km.Dynamics):
         elbow = (self.l * float(np.cos(q1)), self.l * float(np.sin(q1)))
         hand = (elbow[0] + self.l * float(np.cos(q1 + q2)), elbow[1] + self.l * float(np.sin(q1 + q2)))
         shapes: list[km.scene.Shape] = [
-            km.scene.Line("upper arm", [(0.0, 0.0), elbow], width=0.06),
+            km.scene.Line("upper_arm", [(0.0, 0.0), elbow], width=0.06),
             km.scene.Line("forearm", [elbow, hand], width=0.05, color=(120, 130, 150)),
             km.scene.Disk("hand", hand, 0.04),
         ]

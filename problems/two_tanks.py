@@ -45,8 +45,8 @@ class Tanks(km.Dynamics):
         for name, level, foot in (("upper", float(x[0]), 26.0), ("lower", float(x[1]), 0.0)):
             wall = [(-3.0, foot + 20.0), (-3.0, foot), (3.0, foot), (3.0, foot + 20.0)]
             full = float(np.clip(level, 0.01, 25.0))
-            water = km.scene.Box(f"{name} water", (0.0, foot + full / 2), (5.6, full), color=(40, 120, 200))
-            shapes += [water, km.scene.Line(f"{name} wall", wall, width=0.3)]
+            water = km.scene.Box(f"{name}_water", (0.0, foot + full / 2), (5.6, full), color=(40, 120, 200))
+            shapes += [water, km.scene.Line(f"{name}_wall", wall, width=0.3)]
         jet = max(float(u[0]), 0.0) / 10.0 + 0.01
         return [*shapes, km.scene.Line("jet", [(-1.5, 50.0), (-1.5, 46.0)], width=jet, color=(40, 120, 200))]
 

@@ -32,8 +32,8 @@ class VanDerPol(km.Dynamics):
         """Draw the phase plane, x₁ to the right and x₂ up, with the axes, the state and the input as a bar."""
         at = (float(x[0]), float(x[1]))
         return [
-            km.scene.Line("x1 axis", [(-1.2, 0.0), (1.2, 0.0)], width=0.01, color=(150, 160, 170)),
-            km.scene.Line("x2 axis", [(0.0, -1.2), (0.0, 1.2)], width=0.01, color=(150, 160, 170)),
+            km.scene.Line("x1_axis", [(-1.2, 0.0), (1.2, 0.0)], width=0.01, color=(150, 160, 170)),
+            km.scene.Line("x2_axis", [(0.0, -1.2), (0.0, 1.2)], width=0.01, color=(150, 160, 170)),
             km.scene.Line("u", [at, (at[0], at[1] + 0.3 * float(u[0]))], width=0.03, color=(40, 120, 200)),
             km.scene.Disk("state", at, 0.05),
         ]

@@ -41,7 +41,7 @@ def test_a_function_of_numbers_is_enough_for_koopman_mpc_and_says_where_it_is_no
 
     fitted = km.edmd(_data(), km.State() + km.Monomials(2))
     psi = Numeric(
-        lambda X: np.column_stack([X, X[:, 0] ** 2, X[:, 0] * X[:, 1], X[:, 1] ** 2]), ["a", "b", "aa", "ab", "bb"]
+        lambda X: np.column_stack([X, X[:, 0] ** 2, X[:, 0] * X[:, 1], X[:, 1] ** 2]), ("a", "b", "aa", "ab", "bb")
     )
     model = km.LinearPredictor(fitted.A, fitted.B, fitted.C, psi, 0.1, ["a [m]", "b [m/s]"], ["u [N]"])
     assert np.abs(_controlled(model).X[-1]).max() < 1e-3
@@ -49,7 +49,7 @@ def test_a_function_of_numbers_is_enough_for_koopman_mpc_and_says_where_it_is_no
         model.step_map()
     with pytest.raises(km.errors.DataError, match="which no file holds"):
         model.save(tmp_path / "model.npz")
-    wrong = Numeric(lambda X: X, ["a", "b", "c"]).bind(["a", "b"])
+    wrong = Numeric(lambda X: X, ("a", "b", "c")).bind(["a", "b"])
     with pytest.raises(km.errors.DataError, match=r"returns shape \(1, 2\) for 1 states, expected \(1, 3\)"):
         wrong([0.0, 0.0])
 
