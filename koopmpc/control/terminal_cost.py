@@ -34,7 +34,7 @@ ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or 
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
 GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row come out as 1 ± 1e-8, three as 1 ± 1e-5
 APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
-AXES, SHORTEST, FARTHEST = 8, 60, 20.0  # of trial loops: axes of starts, least steps, standard deviations they go
+AXES, LOOPS, FARTHEST = 8, 3, 20.0  # of trial loops: axes of starts, horizons, standard deviations that states go
 ALIKE = 0.01  # share of a law, over the data, by which others may differ and need no trial
 WORTH = 1.05  # cost of a trial loop by the least up to which the longer tail is taken
 AHEAD = 10  # horizons within which the gain of a learned model rests, or else its tail is as long as the horizon
@@ -201,7 +201,7 @@ def believed_steps(
     """Return the longest tail of `most` steps, a half, a quarter or none whose loop costs at most 5 % above the least.
 
     Without limits, N planned steps and a tail are a law u = −K z. Each law steers the re-lifted model
-    x⁺ = C (A ψ(x) + B u) for 2 N steps, at least 60. Modes of A that the lifted states do not have grow in a long
+    x⁺ = C (A ψ(x) + B u) for 3 N steps. Modes of A that the lifted states do not have grow in a long
     tail until they rule the law, and here they cost what they do on the plant: a lift afresh does not follow them. All
     is told in deviations from the mean of the data, which so is at rest. The starts lie a standard deviation from it,
     along the first eight principal axes of the states in units of their standard deviations. Where all laws are alike,
@@ -226,7 +226,7 @@ def believed_steps(
     CA, CB = C @ predictor.A, np.linalg.solve(inverse.T, C.T).T @ stage.B[:nz]
     rest = lifting(center[None])
     with np.errstate(all="ignore"):
-        for _ in range(max(2 * N, SHORTEST)):
+        for _ in range(LOOPS * N):
             moved = lifting(X.reshape(-1, len(center))).reshape(*X.shape[:2], nz) - rest
             xi = moved @ inverse.T
             if len(stage.A) > nz:  # the last input is beside z
