@@ -220,3 +220,15 @@ def test_nested_text_in_a_model_is_refused(tmp_path: Path, depth: int, kind: str
     rezipped(path, tree=member.getvalue())
     with pytest.raises(km.errors.LogError, match=r"model\.npz"):
         km.load_model(path)
+
+
+def test_a_table_from_before_there_were_checksums_is_read(tmp_path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "data.parquet"
+    episodes().save(path)
+    table = pq.read_table(path)
+    kept = {key: value for key, value in table.schema.metadata.items() if key != b"koopmpc.check"}
+    assert len(kept) == len(table.schema.metadata) - 1
+    pq.write_table(table.replace_schema_metadata(kept), path)
+    assert km.load_episodes(path) == episodes()
