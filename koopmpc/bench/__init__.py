@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from koopmpc.bench.results import RunRow as RunRow
     from koopmpc.bench.results import reached as reached
     from koopmpc.bench.results import row_to_view as row_to_view
-    from koopmpc.bench.sweep import FAULTS as FAULTS
+    from koopmpc.bench.single import FAULTS as FAULTS
     from koopmpc.bench.table import results_table as results_table
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,14 +1,20 @@
 """The ten controllers of the bench, and what they share of one problem: step map, plant, data and models."""
 
+import dataclasses
+import json
 import time
 import warnings
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import disk
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
 from koopmpc.control.adaptive import Adaptive
@@ -23,18 +29,20 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import Equilibria
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.nonlinear.problem import learned_map
-from koopmpc.data.collect import collect
+from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import FitWarning, ProblemError
+from koopmpc.errors import DataError, FitWarning, ProblemError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.plants.dynamics import Dynamics, Plant
 from koopmpc.plants.step_map import SimulatedPlant, StepMap, discretize
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor, load_model
 from koopmpc.synthesis.design import design
-from koopmpc.synthesis.designed import Design, made
+from koopmpc.synthesis.designed import AnyMPC, Design, load_controller, made
+
+Found = TypeVar("Found")
 
 
 class Prepared:
@@ -48,13 +56,60 @@ class Prepared:
         What is controlled.
     monitored
         Whether controllers of learned models say at each step whether it is like the data.
+    seed
+        Added to the seed of the training data.
+    kept
+        The folder of `keep`, where what was learned is read instead of learned again.
     """
 
-    def __init__(self, problem: Problem, *, monitored: bool = False) -> None:
-        self.problem, self._monitored = problem, monitored
+    def __init__(self, problem: Problem, seed: int = 0, kept: Path | None = None, *, monitored: bool = False) -> None:
+        self.problem, self.seed, self._monitored = problem, seed, monitored
+        self._controllers: dict[tuple[str, str], Controller] = {}
+        self._kept = None if kept is None else kept / f"{problem.name}-{seed}"
         self._designs: list[tuple[Limits, Design]] = []
         self.training_time = 0.0
         self._held: dict[str, Float[np.ndarray, "T nu"]] = {}
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Learn what these controllers need, and write it into the folder `kept`, for all workers.
+
+        What cannot be written as data is learned by each worker itself.
+        """
+        kept, names = self._kept, set(names)
+        if kept is None:
+            return
+        numbers = {"training_time": 0.0, "spread": self.spread.tolist()}
+        with suppress(DataError):
+            if names & {"koopman-lqr", "koopman-mpc", "offset-free", "adaptive"}:
+                self.model.save(kept.with_name(f"{kept.name}-linear.npz"))
+                numbers["training_time"] = self.training_time
+            if names & {"bilinear-mpc", "bilinear-offset"}:
+                self.bilinear.save(kept.with_name(f"{kept.name}-bilinear.npz"))
+            if "designed" in names:
+                for case in self.problem.cases:
+                    self.design(self.problem.limits_of(case)).save(kept.with_name(f"{kept.name}-{case}.npz"))
+        with disk.writing(kept.with_name(f"{kept.name}.json")) as stream:
+            stream.write(json.dumps(numbers).encode())
+
+    @cached_property
+    def _numbers(self) -> dict[str, Any]:
+        """What `keep` wrote beside the models."""
+        return {} if self._kept is None else _read(self._kept.with_name(f"{self._kept.name}.json"), _json) or {}
+
+    @cached_property
+    def spread(self) -> Float[np.ndarray, " ny"]:
+        """Standard deviation of each measured output in the training data."""
+        known = self._numbers.get("spread")
+        return np.vstack([e.X for e in self.data]).std(axis=0) if known is None else np.array(known)
+
+    def controller(self, name: str, case: str) -> Controller:
+        """Return the controller of this name for the limits of a case; it is built once, and `simulate` resets it.
+
+        One that learns while it runs is built for each run.
+        """
+        if (name, case) not in self._controllers or name == "adaptive":
+            self._controllers[name, case] = CONTROLLERS[name](self, self.problem.limits_of(case))
+        return self._controllers[name, case]
 
     @cached_property
     def step_map(self) -> StepMap:
@@ -71,6 +126,43 @@ class Prepared:
         plant = self.problem.cases[case].plant
         return self.truth if plant is None else self._driven(plant)
 
+    def off(self, case: str, wrong: float, start: int) -> StepMap | Plant:
+        """Return the plant of a case with each parameter times 1 + e, e uniform in ±`wrong`.
+
+        Raises
+        ------
+        ProblemError
+            The plant is no Dynamics whose fields are numbers.
+        """
+        problem = self.problem
+        given = (problem.cases[case].plant, problem.plant)
+        own = next((plant for plant in given if plant is not None), problem.dynamics)
+        fields = dataclasses.fields(own) if isinstance(own, Dynamics) and dataclasses.is_dataclass(own) else ()
+        values = {f.name: getattr(own, f.name) for f in fields if type(getattr(own, f.name)) in (int, float)}
+        if not values:
+            raise ProblemError(
+                f"{problem.name}:{case}: its plant has no numbers as fields, so none can be wrong; leave out wrong=, or"
+                " make the plant a dataclass with its parameters as fields"
+            )
+        e = np.random.default_rng([start, 1]).uniform(-wrong, wrong, len(values)).tolist()
+        changed = {name: value * (1.0 + share) for (name, value), share in zip(values.items(), e, strict=True)}
+        return self._driven(dataclasses.replace(cast("Any", own), **changed))
+
+    def start(self, case: str, start: int) -> Float[np.ndarray, " nx"]:
+        """Return an initial state: the case's own for 0, else one of the box that training data begin in."""
+        given = np.asarray(self.problem.cases[case].x0, dtype=np.float64)
+        if start == 0:
+            return given
+        begin = self.problem.training.x0
+        rng = np.random.default_rng([start, 2])
+        ends = (
+            np.vstack([begin.low, begin.high])
+            if isinstance(begin, Uniform)
+            else np.atleast_2d(np.array(begin, dtype=np.float64))
+        )
+        low, high = np.asarray(ends.min(axis=0)), np.asarray(ends.max(axis=0))
+        return low + (high - low) * rng.random(len(low))
+
     def _driven(self, plant: Dynamics | StepMap | Plant | None) -> StepMap | Plant:
         if plant is None:
             return self.step_map
@@ -85,14 +177,14 @@ class Prepared:
         zero. They are found once and serve all controllers.
         """
         if case not in self._held:
-            self._held[case] = self._find(case)
+            self._held[case] = self.inputs_that_hold(case, self.truth_of(case))
         return self._held[case]
 
-    def _find(self, case: str) -> Float[np.ndarray, "T nu"]:
+    def inputs_that_hold(self, case: str, truth: StepMap | Plant) -> Float[np.ndarray, "T nu"]:
+        """Return the same for another plant that is driven."""
         problem, steps = self.problem, self.problem.cases[case].steps
-        truth = self.truth_of(case)
-        truth = truth.step_map if isinstance(truth, SimulatedPlant) else truth
-        plant = truth if isinstance(truth, StepMap) else self.step_map
+        known = truth.step_map if isinstance(truth, SimulatedPlant) else truth
+        plant = known if isinstance(known, StepMap) else self.step_map
         given = problem.cost.given_inputs(plant.nu)
         if given is not None:
             return given[np.minimum(np.arange(steps), len(given) - 1)]
@@ -115,12 +207,15 @@ class Prepared:
             training.excitation,
             episodes=training.episodes,
             steps=training.steps,
-            rng=training.seed,
+            rng=training.seed + self.seed,
         )
 
     @cached_property
     def model(self) -> LinearPredictor:
         """z⁺ = A z + B u fitted to the data; `training_time` [s] is how long data and fit took."""
+        if (kept := self._learned("linear")) is not None:
+            self.training_time = self._numbers.get("training_time", 0.0)
+            return cast("LinearPredictor", kept)
         start = time.perf_counter()
         model = edmd(self.data, self.problem.lifting, ridge=self.problem.ridge)
         self.training_time = time.perf_counter() - start
@@ -155,7 +250,28 @@ class Prepared:
     @cached_property
     def bilinear(self) -> BilinearPredictor:
         """z⁺ = A z + B u + Σ uᵢ Nᵢ z fitted to the same data with the same lifting."""
+        if (kept := self._learned("bilinear")) is not None:
+            return cast("BilinearPredictor", kept)
         return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True)
+
+    def kept_design(self, limits: Limits) -> AnyMPC | None:
+        """Return the designed controller for these limits that `keep` wrote; None where it did not."""
+        case = next((case for case in self.problem.cases if self.problem.limits_of(case) == limits), None)
+        if self._kept is None or case is None:
+            return None
+        return _read(self._kept.with_name(f"{self._kept.name}-{case}.npz"), load_controller)
+
+    def _learned(self, kind: str) -> LinearPredictor | BilinearPredictor | None:
+        """Return the model that `keep` wrote; None where it did not."""
+        return None if self._kept is None else _read(self._kept.with_name(f"{self._kept.name}-{kind}.npz"), load_model)
+
+
+def _read(path: Path, read: Callable[[Path], Found]) -> Found | None:
+    return read(path) if path.is_file() else None
+
+
+def _json(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_bytes())
 
 
 Build = Callable[[Prepared, Limits], Controller]
@@ -214,7 +330,8 @@ def _adaptive(parts: Prepared, limits: Limits) -> Controller:
 
 def _designed(parts: Prepared, limits: Limits) -> Controller:
     """What `design` makes of the data; one design serves all cases with these limits."""
-    saved = parts.design(limits).controller.as_data()
+    kept = parts.kept_design(limits)
+    saved = (parts.design(limits).controller if kept is None else kept).as_data()
     if parts.watched is not None:
         saved = replace(saved, monitor=Monitor.of(saved.model, parts.watched))
     return made(saved, "the design")

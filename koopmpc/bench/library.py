@@ -124,7 +124,7 @@ def _load(path: Path) -> Problem:
     if not isinstance(loaded, Problem):
         got = "nothing of that name" if loaded is None else f"a {type(loaded).__name__}"
         raise ProblemError(f"{path} must define `problem = km.Problem(...)`, but holds {got}; see a file in problems/")
-    return replace(loaded, name=path.stem, title=_first_line(module.__doc__))
+    return replace(loaded, name=path.stem, title=_first_line(module.__doc__)).of_file(str(path))
 
 
 def _line(error: BaseException, path: Path) -> str:

@@ -132,6 +132,8 @@ class Problem:
         scene(x, u) → shapes, always with the same names; recordings draw them.
     name, title
         The file's stem and the first line of its docstring; `load_problem` fills them in.
+    file
+        The file that the problem was loaded from, "" where it was made or changed in Python: worker processes load it.
 
     Raises
     ------
@@ -162,6 +164,7 @@ class Problem:
     scene: Scene | None = None
     name: str = "problem"
     title: str = ""
+    file: str = field(default="", init=False)  # `replace` leaves it out, for the file no longer holds that problem
 
     def __post_init__(self) -> None:
         nx, nu = self.dynamics.nx, self.dynamics.nu
@@ -223,7 +226,12 @@ class Problem:
                 f"problem {self.name!r} has no case {case!r}{nearest(case, self.cases)}; "
                 f"its cases are {', '.join(self.cases)}"
             )
-        return replace(self, cases={case: self.cases[case]})
+        return replace(self, cases={case: self.cases[case]}).of_file(self.file)
+
+    def of_file(self, file: str) -> "Problem":
+        """Return this problem, with the file that holds it."""
+        object.__setattr__(self, "file", file)
+        return self
 
     def limits_of(self, case: str) -> Limits:
         """Return the limits that hold in this case."""

@@ -1,8 +1,8 @@
 # pyright: basic
 """RunRow: the figures of one run of the bench, whether it ended as it should, and results.parquet."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,13 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.loop.metrics import Metrics, tracking_error
 from koopmpc.loop.run import Run
 
+RESULTS = "results.parquet"  # beside the logs of the runs
 ORACLE = "nonlinear-mpc"
 REACHED = 0.05  # the band around the reference, as a share of the first weighted error
 _TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
+
+
+KEY = ("problem", "case", "controller", "fault", "noise", "wrong", "seed", "start")
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,20 @@ class RunRow:
         Why the run did not end as it should; None where it did. Poor control is no failure.
     fault
         Name of the injected fault; None where there was none.
+    start
+        0 for the case's own initial state, else the number of the drawn one.
+    seed
+        What was added to the seed of the training data.
+    noise
+        Standard deviation of the measurement noise, as a share of that of each output in the training data.
+    wrong
+        Largest share by which the parameters of the driven plant differ from those that controllers know.
+    x0
+        The initial state.
+    elapsed
+        Time of the whole run: controller, loop, figures and log [s].
+    cold_p50, cold_p99
+        Median and 99 % quantile of a step after 4 ms of sleep [s], NaN where they were not measured.
     """
 
     problem: str
@@ -49,6 +67,26 @@ class RunRow:
     log: Path | None = None
     failure: str | None = None
     fault: str | None = None
+    start: int = 0
+    seed: int = 0
+    noise: float = 0.0
+    wrong: float = 0.0
+    x0: tuple[float, ...] = ()
+    elapsed: float = 0.0
+    cold_p50: float = float("nan")
+    cold_p99: float = float("nan")
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What makes this run another than all others of its sweep."""
+        return tuple(getattr(self, name) for name in KEY)
+
+    @property
+    def name(self) -> str:
+        """The name of its log, without the suffix; what is as usual is left out."""
+        parts = [self.problem, self.case, self.controller, self.fault]
+        parts += [f"{sign}{value:g}" for sign, value in zip("nwsx", self.key[4:], strict=True) if value]
+        return "-".join(part for part in parts if part is not None)
 
 
 def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
@@ -56,7 +94,7 @@ def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
 
     Without such a comparison it is the first run of koopman-mpc, else the first run that has a log.
     """
-    logged = [row for row in rows if row.log is not None and row.fault is None]
+    logged = [row for row in rows if row.log is not None and not any(row.key[3:])]
     koopman = [row for row in logged if row.controller == "koopman-mpc"]
     oracle = {(row.problem, row.case): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics}
 
@@ -101,12 +139,12 @@ def reached(run: Run) -> bool:
     return bool((last <= REACHED * scale).all() and np.isfinite(last).all())
 
 
-_NAMES = ("problem", "case", "controller", "fault")
 _FIGURES: dict[str, type] = {
     "cost": float,
     "tracking_rmse": np.ndarray,
     "final_error": np.ndarray,
     "violation": float,
+    "violation_share": float,
     "input_violation": float,
     "effort": float,
     "settling_time": float,
@@ -116,6 +154,12 @@ _FIGURES: dict[str, type] = {
     "late": int,
     "unknown": int,
 }
+_KINDS: dict[str, type] = {
+    "problem": str, "case": str, "controller": str, "fault": str, "noise": float, "wrong": float, "seed": int,
+    "start": int, "x0": np.ndarray, **_FIGURES, "status": Status, "fallback": Fallback, "reached": bool,
+    "training_time": float, "elapsed": float, "cold_p50": float, "cold_p99": float, "log": str, "failure": str,
+}  # fmt: skip
+_ROWS = 5000  # in a group of the table
 
 
 def write_results(rows: Sequence[RunRow], path: Path) -> None:
@@ -123,25 +167,47 @@ def write_results(rows: Sequence[RunRow], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    number, whole, text, vector = pa.float64(), pa.int64(), pa.string(), pa.list_(pa.float64())
-    kinds = {float: number, int: whole, np.ndarray: vector}
-    columns: list[tuple[str, Any]] = [(name, text) for name in _NAMES]
-    for name, kind in _FIGURES.items():
-        columns.append((name, kinds[kind]))
-    columns += [("status", pa.struct([(s.name, whole) for s in Status]))]
-    columns += [("fallback", pa.struct([(f.name, whole) for f in Fallback]))]
-    columns += [("reached", pa.bool_()), ("training_time", number), ("log", text), ("failure", text)]
-    table = pa.Table.from_pylist([_record(row) for row in rows], schema=pa.schema(columns))
-    with disk.writing(path) as stream:
-        pq.write_table(table, stream, write_page_checksum=True)
+    plain = {
+        str: pa.string(),
+        float: pa.float64(),
+        int: pa.int64(),
+        bool: pa.bool_(),
+        np.ndarray: pa.list_(pa.float64()),
+    }
+    counts = {kind: pa.struct([(each.name, pa.int64()) for each in kind]) for kind in (Status, Fallback)}
+    schema = pa.schema([(name, (plain | counts)[kind]) for name, kind in _KINDS.items()])
+    with disk.writing(path) as stream, pq.ParquetWriter(stream, schema, write_page_checksum=True) as writer:
+        for first in range(0, max(len(rows), 1), _ROWS):
+            records = [record_of(row) for row in rows[first : first + _ROWS]]
+            for record in records:
+                for kind, name in ((Status, "status"), (Fallback, "fallback")):
+                    if record[name] is not None:
+                        record[name] = {each.name: record[name].get(each.name, 0) for each in kind}
+            writer.write_table(pa.Table.from_pylist(records, schema=schema))
 
 
-def _record(row: RunRow) -> dict[str, Any]:
-    """Return the row as a record of the table; the figures of a run that raised are missing."""
-    record: dict[str, Any] = {name: getattr(row, name) for name in (*_NAMES, "failure")}
-    record |= {"reached": row.reached, "training_time": row.training_time, "log": row.log and row.log.name}
+def record_of(row: RunRow) -> dict[str, Any]:
+    """Return the row as numbers, names and lists; the figures of a run that raised are None."""
+    record: dict[str, Any] = {name: getattr(row, name, None) for name in _KINDS}
+    record |= {"log": row.log and row.log.name, "x0": list(row.x0)}
     if row.metrics is not None:
-        record |= {name: getattr(row.metrics, name) for name in _FIGURES}
-        record["status"] = {s.name: row.metrics.status.get(s.name, 0) for s in Status}
-        record["fallback"] = {f.name: row.metrics.fallback.get(f.name, 0) for f in Fallback}
+        record |= {name: getattr(row.metrics, name) for name in (*_FIGURES, "status", "fallback")}
+        record |= {name: record[name].tolist() for name, kind in _FIGURES.items() if kind is np.ndarray}
+        record |= {name: dict(record[name]) for name in ("status", "fallback")}
+        record["solver"] = dict(row.metrics.solver)
     return record
+
+
+def row_of(record: Mapping[str, Any], folder: Path) -> RunRow:
+    """Return the row that `record_of` made this record of; its log lies in `folder`."""
+    figures = None
+    if record["status"] is not None:
+        values: dict[str, Any] = {name: record[name] for name in (*_FIGURES, "status", "fallback", "solver")}
+        values |= {name: np.array(values[name]) for name, kind in _FIGURES.items() if kind is np.ndarray}
+        figures = Metrics(**values)
+    own = {name: value for name, value in record.items() if name in _OWN}
+    log = None if record["log"] is None else folder / record["log"]
+    return RunRow(**own, metrics=figures, log=log, x0=tuple(record["x0"]))
+
+
+_OWN = tuple(field.name for field in fields(RunRow) if field.name not in ("metrics", "log", "x0"))

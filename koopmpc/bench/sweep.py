@@ -1,57 +1,66 @@
-"""sweep: run every controller on every case of every problem; each run makes a log and a row of results."""
+"""sweep: problems × controllers × starts × seeds × noise × wrong parameters × faults, into a store that survives."""
 
-import traceback
+import hashlib
+import pickle
+import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 import numpy as np
 
-from koopmpc import disk
-from koopmpc.bench.controllers import CONTROLLERS, LEARNED, Prepared, controller_names
-from koopmpc.bench.problem import Case, Problem
-from koopmpc.bench.results import RunRow, failures, reached, write_results
-from koopmpc.codegen.compiled import Compiled
-from koopmpc.codegen.compiled import compiled as built
+from koopmpc import checks
+from koopmpc.bench.controllers import LEARNED, Prepared, controller_names
+from koopmpc.bench.library import load_problem
+from koopmpc.bench.problem import Problem
+from koopmpc.bench.results import RunRow
+from koopmpc.bench.single import FAULTS, row_of_run
+from koopmpc.bench.store import ROWS, Journal, load_rows, next_batch, opened, table_written
 from koopmpc.control.limits import Limits
-from koopmpc.control.move import Controller
-from koopmpc.errors import DataError, FullDiskError, ProblemError
-from koopmpc.loop.faults import (
-    ActuatorDelay,
-    ActuatorLoss,
-    DroppedSamples,
-    Fault,
-    FrozenSensor,
-    NaNSensor,
-    SolverFailure,
-)
-from koopmpc.loop.metrics import metrics
-from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
-from koopmpc.recording.format.reader import load_run
-from koopmpc.recording.recorder import Recorder, record
+from koopmpc.errors import ProblemError
+from koopmpc.parallel import map_tasks
 from koopmpc.recording.viewer import find_viewer, why_none
 
-RESULTS = "results.parquet"  # beside the logs of the runs
-FAULTS: dict[str, Fault] = {
-    "nan-sensor": NaNSensor(probability=0.1),
-    "frozen-sensor": FrozenSensor(begin=10, end=15),
-    "dropped-samples": DroppedSamples(0.2),
-    "actuator-loss": ActuatorLoss(0.5),
-    "actuator-delay": ActuatorDelay(1),
-    "solver-failure": SolverFailure(0.2),
-}
+MODELS = "models"  # beside the logs: what was learned
+_BATCHES, _LARGEST = 40, 50  # batches for each worker, and runs in a batch, at most
+_EACH = 100  # up to so many runs each is a batch of its own
+_SHARE = 100.0  # results.parquet is written again after so many times the time that it takes
+_DEATHS = 3  # workers that a run may take with it
 
 
-class _Task(NamedTuple):
-    """One run: the names of its case, its controller and its fault."""
+class _Grid(NamedTuple):
+    """What is the same for all batches: how to find the problems, and where and how runs are written."""
 
+    name: str  # another one for each call of `sweep`, so that no worker takes another's controllers
+    problems: dict[str, "Problem | bytes | str"]
+    folder: Path
+    log_starts: int
+    live: bool
+    monitor: bool
+    compiled: bool
+
+
+class _Lesson(NamedTuple):
+    """The models that these controllers need, of one problem, one of whose cases is named, and one seed."""
+
+    grid: _Grid
     case: str
-    controller: str
-    fault: str | None
+    seed: int
+    controllers: tuple[str, ...]
+
+
+class _Batch(NamedTuple):
+    """Runs that a worker does one after the other; their lines go to the file of this number."""
+
+    grid: _Grid
+    number: int
+    rows: list[RunRow]
 
 
 def sweep(
@@ -59,13 +68,23 @@ def sweep(
     controllers: Sequence[str] | None = None,
     *,
     folder: str | Path,
+    starts: int = 1,
+    seeds: int = 1,
+    noise: Sequence[float] = (0.0,),
+    wrong: Sequence[float] = (0.0,),
     faults: bool = False,
     monitor: bool = False,
-    live: bool = False,
     compiled: bool = False,
+    log_starts: int = 1,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    live: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[RunRow]:
     """Run each controller on each case of each problem, and judge all by the same cost and limits.
+
+    Runs that are finished are kept: call it again with the same arguments, after a crash or kill -9, and it goes on.
+    All controllers meet the same initial states, noise and wrong parameters.
 
     Parameters
     ----------
@@ -75,18 +94,31 @@ def sweep(
         Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc, bilinear-offset, nonlinear-mpc,
         adaptive and designed; by default the controllers that each problem names, where it names none the first eight.
     folder
-        Receives <problem>-<case>-<controller>.rrd for each run, and results.parquet; it is made where it is missing.
+        Receives sweep.json, a line for each run in rows/, results.parquet, models/, and for runs that are logged
+        <problem>-<case>-<controller>.rrd. Workers on other machines must reach it by the same path.
+    starts
+        Initial states of each case: its own, and starts − 1 drawn from the box in which training data begin.
+    seeds
+        Sets of training data, each of its own seed; a model is learned once for each.
+    noise
+        Standard deviations of the measurement noise, as shares of that of each output in the training data.
+    wrong
+        Largest shares by which the parameters of the driven plant, the number fields of its Dynamics, are off.
     faults
         Whether to run each case again under each of `FAULTS`; their logs end in <controller>-<fault>.rrd.
     monitor
         Whether MPC of learned models says at each step whether it is like the data; `metrics` counts those that are
         not, and the logs keep them.
-    live
-        Whether to stream each run to a Rerun viewer; one is opened where none is up. Without a viewer there is one
-        UserWarning, and the runs are recorded all the same.
     compiled
         Whether to run those controllers in C that `km.compiled` can build; the others stay in Python. A run's metadata
         say which it was.
+    log_starts
+        How many starts of each case have logs; a run that failed has one too.
+    workers, scheduler
+        As in `map_tasks`: local processes, or a Dask cluster at tcp://host:port.
+    live
+        Whether to stream each run to a Rerun viewer; one is opened where none is up. Without a viewer there is one
+        UserWarning, and the runs are recorded all the same. Runs of this process only.
     progress
         Called with (name of the run, runs done, runs in all).
 
@@ -98,39 +130,105 @@ def sweep(
     Raises
     ------
     ProblemError
-        There is no such controller, or a case is given twice.
+        There is no such controller, a case is given twice, the folder holds another sweep, or a problem cannot be sent.
     FullDiskError
-        The disk is full; the runs that are finished, and their results.parquet, are kept.
+        The disk is full; the runs that are finished are kept.
     """
-    asked, problems, folder = controller_names(controllers), list(problems), Path(folder)
+    problems, folder = list(problems), Path(folder)
+    rows = _rows(problems, controllers, starts, seeds, noise, wrong, faults)
+    alone = scheduler is None and (workers is None or workers == 1)
+    if live and not alone:
+        raise ProblemError("live= shows runs of this process; leave out workers= and scheduler=")
+    sent = {f"{p.name}:{case}": p if alone else _sendable(p) for p in problems for case in p.cases}
+    if live and find_viewer() is None:
+        live = False
+        warnings.warn(f"{why_none()}; the runs are recorded all the same", UserWarning, stacklevel=2)
+    asked: dict[str, Any] = {
+        "problems": [_print_of(problem) for problem in problems],
+        "controllers": list(dict.fromkeys(row.controller for row in rows)),
+        "starts": starts,
+        "seeds": seeds,
+        "noise": list(map(float, noise)),
+        "wrong": list(map(float, wrong)),
+        "faults": faults,
+        "monitor": monitor,
+        "compiled": compiled,
+    }
+    with opened(folder, asked):
+        done = {row.key: row for row in load_rows(folder)}
+        left = [row for row in rows if row.key not in done]
+        grid = _Grid(uuid4().hex, dict(sent), folder.resolve(), log_starts, live, monitor, compiled)
+        where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
+        told = _Told(progress, len(done), len(rows))
+        told.say(left[0].name if left else "done", 0)
+        due = time.monotonic()
+        try:
+            wanted = [row for row in left if row.controller in LEARNED or row.noise]
+            models = {
+                (row.problem, row.seed): (grid, f"{row.problem}:{row.case}", row.seed) for row in reversed(wanted)
+            }
+            names = tuple(asked["controllers"])
+            for _ in map_tasks(_learn, [_Lesson(*model, names) for model in reversed(models.values())], **where):
+                pass
+            for finished in map_tasks(_do, _batches(grid, left, workers or 1, next_batch(folder)), **where):
+                done |= {row.key: replace(row, log=row.log and folder / row.log.name) for row in finished}
+                told.say(finished[-1].name if len(done) < len(rows) else "done", len(finished))
+                if (begin := time.monotonic()) >= due:
+                    table_written(folder, _in_order(rows, done))
+                    due = begin + _SHARE * (time.monotonic() - begin)
+        except BaseException:  # Ctrl-C, above all: runs of the batch under way are finished, too
+            done = {row.key: row for row in load_rows(folder)}
+            raise
+        finally:
+            table_written(folder, _in_order(rows, done))
+    return _in_order(rows, done)
+
+
+class _Told:
+    """Runs done so far, and who is told."""
+
+    def __init__(self, progress: Callable[[str, int, int], None] | None, done: int, total: int) -> None:
+        self.progress, self.done, self.total = progress, done, total
+
+    def say(self, what: str, more: int) -> None:
+        self.done += more
+        if self.progress is not None:
+            self.progress(what.replace("-", ":", 1), self.done, self.total)
+
+
+def _rows(
+    problems: Sequence[Problem],
+    controllers: Sequence[str] | None,
+    starts: int,
+    seeds: int,
+    noise: Sequence[float],
+    wrong: Sequence[float],
+    faults: bool,
+) -> list[RunRow]:
+    """Return the runs that are asked for, without their figures."""
+    asked = controller_names(controllers)
     cases = [f"{problem.name}:{case}" for problem in problems for case in problem.cases]
     twice = next((case for case in cases if cases.count(case) > 1), None)
     if twice is not None:
         raise ProblemError(f"{twice} comes twice, and its logs would have one name; run it once, or rename a file")
-    folder.mkdir(parents=True, exist_ok=True)
-    if live and find_viewer() is None:
-        live = False
-        warnings.warn(f"{why_none()}; the runs are recorded all the same", UserWarning, stacklevel=2)
-    tasks = [
-        (problem, _Task(case, name, fault))
-        for problem in problems
-        for case in problem.cases
-        for fault in (None, *(possible_faults(problem.limits_of(case)) if faults else ()))
-        for name in (asked if controllers else controller_names(problem.controllers))
-    ]
+    for name, shares in (("noise", noise), ("wrong", wrong)):
+        values = checks.array(shares, name, (None,))
+        if not len(values) or (values < 0).any() or len(set(values.tolist())) != len(values):
+            raise ProblemError(f"{name} is {list(shares)}; pass shares of zero or more, each once, such as [0, 0.01]")
     rows: list[RunRow] = []
-    parts: Prepared | None = None
-    for problem, task in tasks:
-        if parts is None or parts.problem is not problem:
-            parts = Prepared(problem, monitored=monitor)
-        if progress is not None:
-            progress(f"{problem.name}:{' '.join(filter(None, task))}", len(rows), len(tasks))
-        rows.append(_row(parts, task, folder, live, compiled))
-        write_results(rows, folder / RESULTS)  # after every run, for the next one may be interrupted
-    if not tasks:
-        write_results(rows, folder / RESULTS)
-    if progress is not None:
-        progress("done", len(tasks), len(tasks))
+    for problem, case in ((each, case) for each in problems for case in each.cases):
+        names = asked if controllers else controller_names(problem.controllers)
+        broken = (None, *(possible_faults(problem.limits_of(case)) if faults else ()))
+        for fault, n, w, seed, name in product(broken, noise, wrong, range(checks.count(seeds, "seeds")), names):
+            if seed and name not in LEARNED:
+                continue  # it learns nothing, so all seeds are one
+            row = RunRow(problem.name, case, name, fault=fault, noise=float(n), wrong=float(w), seed=seed)
+            rows.extend(replace(row, start=start) for start in range(checks.count(starts, "starts")))
+    if any(row.wrong for row in rows):
+        for problem in problems:
+            parts = Prepared(problem)
+            for case in problem.cases:
+                parts.off(case, 0.0, 0)  # raises where there is nothing to be wrong
     return rows
 
 
@@ -140,116 +238,78 @@ def possible_faults(limits: Limits) -> tuple[str, ...]:
     return tuple(name for name in FAULTS if limited or name != "actuator-loss")
 
 
-def _row(parts: Prepared, task: _Task, folder: Path, live: bool, compiled: bool) -> RunRow:
-    """Run one task, compute its figures, write its log and read it back; an exception becomes the row's failure."""
-    problem, (case, name, fault) = parts.problem.name, task
-    log = folder / ("-".join((problem, *filter(None, task))) + ".rrd")
+def _print_of(problem: Problem) -> dict[str, Any]:
+    """Return what tells one problem from another, and how to load it again."""
+    file = Path(problem.file) if problem.file else None
+    text = repr((problem.dynamics, problem.dt, problem.horizon, problem.cost, problem.limits)).encode()
+    content = file.read_bytes() if file is not None and file.is_file() else text
+    return {"file": problem.file, "cases": list(problem.cases), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _sendable(problem: Problem) -> bytes | str:
+    """Return the problem as a worker gets it: its file, or a pickle.
+
+    Raises
+    ------
+    ProblemError
+        It has no file, and does not pickle.
+    """
+    if problem.file:
+        return problem.file
     try:
-        run = _run(parts, task, live, compiled)
-        judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[case].steps)
-    except FullDiskError:
-        raise
-    except Exception as error:  # the other runs go on; the exit code says that one failed
-        return RunRow(problem, case, name, failure=_described(error, log), fault=fault)
-    try:
-        found += _recorded(run, log)
-        if load_run(log) != run:
-            found.append(f"{log.name} does not read back equal to the run")
-    except FullDiskError:
-        raise
-    except Exception as error:  # the figures of the run are kept without its log
-        found.append(_described(error, log))
-    kept = log if log.exists() else None
-    training = parts.training_time if name in LEARNED else 0.0
-    return RunRow(problem, case, name, *judged, training, kept, "; ".join(found) or None, fault)
-
-
-def _described(error: Exception, log: Path) -> str:
-    """Return the error in one line, and write its traceback beside the log."""
-    trace = log.with_suffix(".txt")
-    with disk.writing(trace) as stream:
-        stream.write("".join(traceback.format_exception(error)).encode())
-    return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
-
-
-def _recorded(run: Run, log: Path) -> list[str]:
-    """Write the log; where its scene cannot be drawn, write it without the scene and return why."""
-    try:
-        record(run, log)
-    except FullDiskError:
-        raise
+        return pickle.dumps(problem)
     except Exception as error:
-        if run.scene is None:
-            raise
-        record(replace(run, scene=None), log)
-        return [f"the log is without its scene: drawing scene(x, u) raised {_described(error, log)}"]
-    return []
+        raise ProblemError(
+            f"the problem {problem.name!r} cannot be sent to worker processes ({error}); save it in a file and load it "
+            "with km.load_problem, or run with workers=1"
+        ) from error
 
 
-def _run(parts: Prepared, task: _Task, live: bool, compiled: bool) -> Run:
-    """Return the run of one controller on one case."""
-    problem, case, plant = parts.problem, parts.problem.cases[task.case], parts.truth_of(task.case)
-    limits = problem.limits_of(task.case)
-    controller = CONTROLLERS[task.controller](parts, limits)
-    if compiled:
-        with suppress(DataError):  # what cannot be written in C stays in Python
-            controller = built(controller)
-    injected = () if task.fault is None else (FAULTS[task.fault],)
-    in_c = {"compiled": isinstance(controller, Compiled)} if compiled else {}
-    held = parts.u_reference(task.case)
-    _warm_up(controller, parts, case)
-    about: dict[str, Any] = {
-        "cost": problem.cost,
-        "limits": limits,
-        "angles": tuple(problem.angles),
-        "metadata": _metadata(problem, task, injected) | in_c,
-    }
-    scene = problem.scene or getattr(plant, "scene", None)
-
-    def closed_loop(*observers: StepObserver) -> Run:
-        run = simulate(
-            plant,
-            controller,
-            x0=case.x0,
-            reference=case.reference,
-            steps=case.steps,
-            u_reference=held,
-            noise=case.noise,
-            faults=(*case.faults, *injected),
-            observers=observers,
-            plans=True,
-            **about,
-        )
-        return replace(run, scene=scene)
-
-    if not live:
-        return closed_loop()
-    names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
-    with Recorder(live=True, **names, **about, scene=scene, model=predictor_of(controller)) as viewer:
-        return closed_loop(viewer)
+@lru_cache(maxsize=8)
+def _prepared(grid_name: str, sent: "Problem | bytes | str", seed: int, folder: Path, monitored: bool) -> Prepared:
+    """Return the parts of a problem, once for each process and call of `sweep`."""
+    problem = sent if isinstance(sent, Problem) else load_problem(sent) if isinstance(sent, str) else pickle.loads(sent)
+    return Prepared(problem, seed, folder / MODELS, monitored=monitored)
 
 
-def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
-    """Call the controller twice and reset it, so that the cost of first calls is no part of a step's time."""
-    y = parts.step_map.measure(case.x0)
-    reference = np.atleast_1d(np.asarray(case.reference))
-    row = reference if reference.ndim == 1 else reference[0]
-    ahead = np.tile(row, (controller.horizon + 1, 1))
-    controller.reset(case.x0)
-    for _ in range(2):
-        controller(y, ahead)
-    controller.reset(case.x0)
+def _learn(lesson: _Lesson) -> None:
+    """Learn the models of one problem and seed for all workers; where that raises, its runs say so."""
+    grid = lesson.grid
+    parts = _prepared(grid.name, grid.problems[lesson.case], lesson.seed, grid.folder, grid.monitor)
+    with suppress(Exception):  # whatever the data or a plant of the user raise
+        parts.keep(lesson.controllers)
 
 
-def _metadata(problem: Problem, task: _Task, injected: Sequence[Fault]) -> dict[str, Any]:
-    training = problem.training
-    known: dict[str, Any] = {
-        "problem": problem.name,
-        "title": problem.title,
-        "case": task.case,
-        "controller": task.controller,
-        "horizon": problem.horizon,
-        "ridge": problem.ridge,
-        "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed},
-    }
-    return known | ({"fault": task.fault, "faults": [str(broken) for broken in injected]} if injected else {})
+def _batches(grid: _Grid, rows: Sequence[RunRow], workers: int, first: int) -> "list[_Batch]":
+    """Return the runs in batches: sending one takes a tenth of a millisecond, about as long as a short run."""
+    size = 1 if len(rows) <= _EACH else min(max(1, len(rows) // (_BATCHES * workers)), _LARGEST)
+    taken = iter(rows)
+    parts = iter(lambda: list(islice(taken, size)), [])
+    return [_Batch(grid, first + i, part) for i, part in enumerate(parts)]
+
+
+def _do(batch: _Batch) -> list[RunRow]:
+    """Do the runs of a batch; those that a worker which died had finished are not run again."""
+    grid = batch.grid
+    finished: list[RunRow] = []
+    with Journal(grid.folder / ROWS / f"{batch.number:06d}.jsonl") as journal:
+        for row in batch.rows:
+            if row.key in journal.rows:
+                finished.append(journal.rows[row.key])
+                continue
+            died = journal.begin(row)
+            if died + 1 >= _DEATHS:
+                done = replace(row, failure=f"its worker process died {died} times")
+            else:
+                sent = grid.problems[f"{row.problem}:{row.case}"]
+                parts = _prepared(grid.name, sent, row.seed, grid.folder, grid.monitor)
+                logged = row.start < grid.log_starts
+                done = row_of_run(parts, row, grid.folder, logged=logged, live=grid.live, compiled=grid.compiled)
+            journal.end(done)
+            finished.append(done)
+    return finished
+
+
+def _in_order(rows: Sequence[RunRow], done: dict[tuple[Any, ...], RunRow]) -> list[RunRow]:
+    """Return the finished runs, in the order in which they were asked for."""
+    return [done[row.key] for row in rows if row.key in done]

@@ -11,7 +11,7 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.bench.page import Page
-from koopmpc.bench.sweep import RESULTS
+from koopmpc.bench.results import RESULTS
 from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError

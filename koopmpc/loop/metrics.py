@@ -231,6 +231,27 @@ def _violation(run: Run) -> tuple[float, float]:
     return float(beyond.max(initial=0.0)), float((beyond / size).max(initial=0.0))
 
 
+def beyond(run: Run) -> Float[np.ndarray, " T1"]:
+    """Return by how much each x_k, with u_{k−1} − u_{k−2}, is beyond the state, output or rate limit it breaks most.
+
+    x_0 is given, so its row is 0. In the unit of that limit.
+    """
+    most = np.zeros(len(run.X))
+    if run.limits is None:
+        return most
+    values, ny = _states(run)[1:], 0
+    if run.limits.of is not None:
+        outputs = run.limits.of.bind(run.states)(values)
+        ny, values = outputs.shape[1], np.hstack([values, outputs])
+    ends = run.limits.ends(values.shape[1] - ny, ny)
+    most[1:] = [_excess(row[None], *ends).max(initial=0.0) for row in values]
+    rates = run.limits.rates(run.U.shape[1])
+    if rates is not None:
+        changed = [_excess(row[None], *rates).max(initial=0.0) for row in np.diff(run.U, axis=0)]
+        most[2:] = np.maximum(most[2:], changed)
+    return most
+
+
 def _excess(
     values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:

@@ -58,3 +58,13 @@ def test_every_fault_is_in_the_documentation():
     text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
     for fault in km.bench.FAULTS.values():
         assert f"| `{type(fault).__name__}(" in text
+
+
+def test_the_line_of_the_page_on_sweeps_runs(tmp_path, monkeypatch):
+    text = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text()
+    (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    found = {"km": km}
+    exec(source, found)
+    assert len(found["rows"]) == 6
+    assert (tmp_path / "logs" / "sweep" / "results.parquet").exists()

@@ -172,7 +172,7 @@ def test_an_input_that_is_not_finite_is_a_failure(swept, tmp_path, monkeypatch):
 
 
 def test_a_log_that_differs_is_a_failure(swept, tmp_path, monkeypatch):
-    monkeypatch.setattr("koopmpc.bench.sweep.load_run", lambda path: None)
+    monkeypatch.setattr("koopmpc.bench.single.load_run", lambda path: None)
     (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure == "tiny-far-lqr.rrd does not read back equal to the run"
 
@@ -200,7 +200,7 @@ def test_a_log_that_cannot_be_written_takes_no_figures_and_is_not_offered(swept,
     def full(run, path, **drawn):
         raise OSError("no space left")
 
-    monkeypatch.setattr("koopmpc.bench.sweep.record", full)
+    monkeypatch.setattr("koopmpc.bench.single.record", full)
     (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure.startswith("OSError: no space left (the whole traceback is in ")
     assert row.metrics is not None
@@ -246,7 +246,7 @@ class Unseen(km.Recorder):
 def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
     problem, rows, _, _ = swept
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
-    monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
+    monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
     (row,) = km.sweep([problem.select("far")], ["koopman-mpc"], folder=tmp_path, live=True)
     assert row.failure is None
     live = km.load_run(row.log)
@@ -350,7 +350,7 @@ def test_all_controllers_meet_the_same_faults(faulty):
 
 def test_a_live_faulty_run_leaves_the_same_log(swept, faulty, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
-    monkeypatch.setattr("koopmpc.bench.sweep.Recorder", Unseen)
+    monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
     rows = km.sweep([swept[0].select("far")], ["koopman-mpc"], folder=tmp_path, live=True, faults=True)
     assert [row.failure for row in rows] == [None] * (1 + len(km.bench.FAULTS))
     for row in rows:

@@ -1,0 +1,197 @@
+"""One run of a sweep: a controller on a case, its figures, and its log; what it raises becomes its row."""
+
+import time
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koopmpc import disk
+from koopmpc.bench.controllers import LEARNED, Prepared
+from koopmpc.bench.problem import Case
+from koopmpc.bench.results import RunRow, failures, reached
+from koopmpc.codegen.compiled import Compiled
+from koopmpc.codegen.compiled import compiled as built
+from koopmpc.control.move import Controller
+from koopmpc.errors import DataError, FullDiskError
+from koopmpc.loop.faults import (
+    ActuatorDelay,
+    ActuatorLoss,
+    DroppedSamples,
+    Fault,
+    FrozenSensor,
+    NaNSensor,
+    SolverFailure,
+)
+from koopmpc.loop.metrics import metrics
+from koopmpc.loop.run import Run
+from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
+from koopmpc.recording.format.reader import load_run
+from koopmpc.recording.recorder import Recorder, record
+
+FAULTS: dict[str, Fault] = {
+    "nan-sensor": NaNSensor(probability=0.1),
+    "frozen-sensor": FrozenSensor(begin=10, end=15),
+    "dropped-samples": DroppedSamples(0.2),
+    "actuator-loss": ActuatorLoss(0.5),
+    "actuator-delay": ActuatorDelay(1),
+    "solver-failure": SolverFailure(0.2),
+}
+_COLD_STEPS, _SLEEP = 25, 0.004  # steps that are timed with cold caches, and the sleep before each [s]
+
+
+def row_of_run(
+    parts: Prepared, row: RunRow, folder: Path, *, logged: bool, live: bool = False, compiled: bool = False
+) -> RunRow:
+    """Run what `row` names, and return it with its figures; an exception becomes the row's failure.
+
+    A run that is `logged`, or that failed, is written to a log, which is read back; one that is logged is also timed
+    with cold caches.
+    """
+    begin = time.perf_counter()
+    log = folder / f"{row.name}.rrd"
+    row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
+    try:
+        run = closed_loop(parts, row, plans=logged, live=live, compiled=compiled)
+        judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[row.case].steps)
+    except FullDiskError:
+        raise
+    except Exception as error:  # the other runs go on; the exit code says that one failed
+        return replace(row, failure=_described(error, log), elapsed=time.perf_counter() - begin)
+    if logged or found:
+        try:
+            found += _recorded(run, log)
+            if load_run(log) != run:
+                found.append(f"{log.name} does not read back equal to the run")
+        except FullDiskError:
+            raise
+        except Exception as error:  # the figures of the run are kept without its log
+            found.append(_described(error, log))
+    usual = logged and row.fault is None and not row.noise and not row.wrong
+    cold = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
+    return replace(
+        row,
+        metrics=judged[0],
+        reached=judged[1],
+        training_time=parts.training_time if row.controller in LEARNED else 0.0,
+        log=log if log.exists() else None,
+        failure="; ".join(found) or None,
+        elapsed=time.perf_counter() - begin,
+        cold_p50=cold[0],
+        cold_p99=cold[1],
+    )
+
+
+def _described(error: Exception, log: Path) -> str:
+    """Return the error in one line, and write its traceback beside the log."""
+    trace = log.with_suffix(".txt")
+    with disk.writing(trace) as stream:
+        stream.write("".join(traceback.format_exception(error)).encode())
+    return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
+
+
+def _recorded(run: Run, log: Path) -> list[str]:
+    """Write the log; where its scene cannot be drawn, write it without the scene and return why."""
+    try:
+        record(run, log)
+    except FullDiskError:
+        raise
+    except Exception as error:
+        if run.scene is None:
+            raise
+        record(replace(run, scene=None), log)
+        return [f"the log is without its scene: drawing scene(x, u) raised {_described(error, log)}"]
+    return []
+
+
+def closed_loop(parts: Prepared, row: RunRow, *, plans: bool, live: bool = False, compiled: bool = False) -> Run:
+    """Return the run that `row` names, from its x0."""
+    problem, case = parts.problem, parts.problem.cases[row.case]
+    plant = parts.off(row.case, row.wrong, row.start) if row.wrong else parts.truth_of(row.case)
+    held = parts.inputs_that_hold(row.case, plant) if row.wrong else parts.u_reference(row.case)
+    controller = parts.controller(row.controller, row.case)
+    if compiled:
+        with suppress(DataError):  # what cannot be written in C stays in Python
+            controller = built(controller)
+    in_c = {"compiled": isinstance(controller, Compiled)} if compiled else {}
+    monitored = {"monitor": True} if parts.watched is not None else {}
+    injected = () if row.fault is None else (FAULTS[row.fault],)
+    _warm_up(controller, parts, case)
+    about: dict[str, Any] = {
+        "cost": problem.cost,
+        "limits": problem.limits_of(row.case),
+        "angles": tuple(problem.angles),
+        "metadata": _metadata(parts, row, injected) | in_c | monitored,
+    }
+    own = 0.0 if case.noise is None else np.asarray(case.noise, dtype=np.float64)
+    noise = np.hypot(own, row.noise * parts.spread) if row.noise else case.noise
+    scene = problem.scene or getattr(plant, "scene", None)
+
+    def observed(*observers: StepObserver) -> Run:
+        run = simulate(
+            plant,
+            controller,
+            x0=row.x0,
+            reference=case.reference,
+            steps=case.steps,
+            u_reference=held,
+            noise=noise,
+            faults=(*case.faults, *injected),
+            rng=row.start,
+            observers=observers,
+            plans=plans,
+            **about,
+        )
+        return replace(run, scene=scene)
+
+    if not live:
+        return observed()
+    names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
+    with Recorder(live=True, **names, **about, scene=scene, model=predictor_of(controller)) as viewer:
+        return observed(viewer)
+
+
+def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
+    """Call the controller twice and reset it, so that the cost of first calls is no part of a step's time."""
+    y = parts.step_map.measure(case.x0)
+    reference = np.atleast_1d(np.asarray(case.reference))
+    row = reference if reference.ndim == 1 else reference[0]
+    ahead = np.tile(row, (controller.horizon + 1, 1))
+    controller.reset(case.x0)
+    for _ in range(2):
+        controller(y, ahead)
+    controller.reset(case.x0)
+
+
+def _cold(controller: Controller, run: Run) -> tuple[float, float]:
+    """Return median and 99 % quantile of the first steps, asked for again with a sleep before each [s]."""
+    times: list[float] = []
+    controller.reset(run.X[0] if np.isfinite(run.X[0]).all() else None)
+    for k in range(min(run.steps, _COLD_STEPS)):
+        time.sleep(_SLEEP)
+        begin = time.perf_counter()
+        controller(run.Y[k], run.reference[k : k + controller.horizon + 1], run.U[k - 1] if k else None)
+        times.append(time.perf_counter() - begin)
+    p50, p99 = np.quantile(times, [0.5, 0.99])
+    return float(p50), float(p99)
+
+
+def _metadata(parts: Prepared, row: RunRow, injected: Sequence[Fault]) -> dict[str, Any]:
+    problem, training = parts.problem, parts.problem.training
+    known: dict[str, Any] = {
+        "problem": problem.name,
+        "title": problem.title,
+        "case": row.case,
+        "controller": row.controller,
+        "horizon": problem.horizon,
+        "ridge": problem.ridge,
+        "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed + row.seed},
+    }
+    sweep = {name: getattr(row, name) for name in ("start", "seed", "noise", "wrong") if getattr(row, name)}
+    known |= {"file": problem.file} if problem.file else {}
+    known |= {"sweep": sweep} if sweep else {}
+    return known | ({"fault": row.fault, "faults": [str(broken) for broken in injected]} if injected else {})

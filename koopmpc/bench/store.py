@@ -1,0 +1,198 @@
+"""The store of a sweep: what was asked for, a line for each finished run, and the table that is made of them.
+
+A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way. The
+table, results.parquet, is written beside and renamed, now and then and at the end; the lines are what counts.
+"""
+
+import errno
+import json
+import os
+import platform
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, cast
+
+from koopmpc import disk
+from koopmpc.bench.results import RESULTS, RunRow, record_of, row_of, write_results
+from koopmpc.errors import LogError, ProblemError
+
+MANIFEST, ROWS = "sweep.json", "rows"
+FORMAT = "koopmpc-sweep-1"
+
+
+class Journal:
+    """The lines of one batch of runs: `begin` says that a run begins, `end` what came out of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows, self._begun = {row.key: row for row in _rows_in(path)}, _begun_in(path)
+
+    def __enter__(self) -> "Journal":
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self.path.open("ab", buffering=0)
+            if self._file.tell():
+                self._write(b"\n")  # the last line was torn, perhaps, when a worker was killed
+        except OSError as error:
+            raise disk.refused(self.path, error) from error
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self._file.close()
+
+    def begin(self, row: RunRow) -> int:
+        """Write that this run begins, and return how often it has begun in this batch before."""
+        self._write(json.dumps({"begins": row.name}).encode() + b"\n")
+        return self._begun.count(row.name)
+
+    def end(self, row: RunRow) -> None:
+        """Write what came out of a run."""
+        self._write(json.dumps(record_of(row)).encode() + b"\n")
+
+    def _write(self, line: bytes) -> None:
+        try:
+            if self._file.write(line) != len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise disk.refused(self.path, error) from error
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the whole lines; one that was torn is left out, for its run is done again."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return
+    for line in data.split(b"\n"):
+        try:
+            found: object = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(found, dict):
+            yield cast("dict[str, Any]", found)
+
+
+def _rows_in(path: Path) -> Iterator[RunRow]:
+    return (row_of(line, path.parent.parent) for line in _lines(path) if "begins" not in line)
+
+
+def _begun_in(path: Path) -> list[str]:
+    return [line["begins"] for line in _lines(path) if "begins" in line]
+
+
+def load_rows(folder: str | Path) -> list[RunRow]:
+    """Return the finished runs of a sweep's folder, each once.
+
+    Raises
+    ------
+    LogError
+        The folder holds no sweep.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST).is_file():
+        raise LogError(f"{folder} holds no sweep: there is no {MANIFEST} in it; pass the folder of `koopmpc bench`")
+    found: dict[tuple[Any, ...], RunRow] = {}
+    for path in sorted((folder / ROWS).glob("*.jsonl")):
+        for row in _rows_in(path):
+            found.setdefault(row.key, row)
+    return list(found.values())
+
+
+def next_batch(folder: Path) -> int:
+    """Return the first number that no batch of this folder has."""
+    return 1 + max((int(path.stem) for path in (folder / ROWS).glob("*.jsonl") if path.stem.isdigit()), default=-1)
+
+
+@contextmanager
+def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
+    """Claim the folder for the sweep that is asked for, and yield its manifest; a sweep that was broken off goes on.
+
+    Raises
+    ------
+    ProblemError
+        The folder holds another sweep, or another process is at work in it.
+    """
+    path = folder / MANIFEST
+    asked = json.loads(json.dumps(asked))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = path.open("a+b")
+    except OSError as error:
+        raise disk.refused(path, error) from error
+    with file:
+        _claim(file.fileno(), folder)
+        file.seek(0)
+        text = file.read()
+        try:
+            known: dict[str, Any] = json.loads(text) if text.strip() else {}
+        except ValueError as error:
+            raise ProblemError(f"{path} is damaged; pass another folder, or remove it: {error}") from error
+        if known and known["asked"] != asked:
+            names = [name for name in asked if known["asked"].get(name) != asked[name]]
+            raise ProblemError(f"{folder} holds another sweep, of other {', '.join(names)}; pass another folder")
+        if not known:
+            known = {"format": FORMAT, "asked": asked, "machine": machine()}
+            file.truncate(0)
+            file.write(json.dumps(known, indent=1).encode())
+            file.flush()
+        yield known
+
+
+def _claim(number: int, folder: Path) -> None:
+    """Lock the manifest, as long as this process lives."""
+    with suppress(ImportError):  # Windows has no fcntl
+        import fcntl
+
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ProblemError(
+                f"another process runs a sweep in {folder}; wait for it, or pass another folder"
+            ) from error
+
+
+def manifest_of(folder: str | Path) -> dict[str, Any]:
+    """Return what was asked for in a sweep's folder, and on which machine.
+
+    Raises
+    ------
+    LogError
+        The folder holds no sweep, or the file is damaged.
+    """
+    path = Path(folder) / MANIFEST
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise LogError(
+            f"{folder} holds no sweep: {MANIFEST} is missing or damaged; pass that of `koopmpc bench`"
+        ) from error
+
+
+def machine() -> dict[str, Any]:
+    """Return what step times depend on: processor, cores, load, threads of BLAS, and versions."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    packages = ("koopmpc", "numpy", "scipy", "casadi", "osqp", "daqp")
+    return {
+        "processor": _processor(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": round(load, 2),
+        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS") or os.environ.get("OMP_NUM_THREADS"),
+        "versions": {name: version(name) for name in packages},
+    }
+
+
+def _processor() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def table_written(folder: Path, rows: list[RunRow]) -> None:
+    """Write results.parquet of these runs."""
+    write_results(rows, folder / RESULTS)

@@ -1,0 +1,156 @@
+"""What all commands share: the console, folders of calls, progress, and errors as one line."""
+
+import os
+import re
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from koopmpc.cli.ending import ENDING
+from koopmpc.errors import FitWarning, FullDiskError, KoopmpcError, LogError
+
+
+def split(names: str) -> list[str]:
+    """Return the names in ``"a, b"``; an empty text has none."""
+    return [name.strip() for name in names.split(",") if name.strip()]
+
+
+def program() -> list[str]:
+    """Return the command that calls this program from here: its name if that is on PATH, else its path."""
+    beside = shutil.which("koopmpc", path=str(Path(sys.executable).parent))
+    if beside is None:
+        return [near(sys.executable), "-m", "koopmpc"]
+    known = shutil.which("koopmpc")
+    return ["koopmpc" if known is not None and Path(known).samefile(beside) else near(beside)]
+
+
+def near(path: str) -> str:
+    """Return the path, relative to the current folder where that is shorter."""
+    try:
+        return min(os.path.relpath(path), path, key=len)
+    except ValueError:  # on another drive
+        return path
+
+
+@contextmanager
+def bar(first: str, *, rate: bool = False) -> Generator[Callable[[str, int, int | None], None]]:
+    """Show a progress bar on stderr and yield the function that moves it: (what, done, total).
+
+    With `rate` it shows how many are done in a second, and how long the rest takes at that rate.
+    """
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    class Rate(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text("" if task.speed is None else f"{task.speed:.3g}/s")
+
+    more = (Rate(), TimeRemainingColumn()) if rate else ()
+    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), *more)
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(first, total=None)
+        yield lambda what, done, total: shown.update(task, description=what[:40], completed=done, total=total)
+
+
+def console() -> Console:
+    """Return the console of stdout, 100 columns wide where it is no terminal."""
+    out = Console()
+    return out if out.is_terminal else Console(width=100)
+
+
+def new_folder(logs: Path, what: str) -> Path:
+    """Make and return logs/<time>-<what>; a number follows where two calls share a second.
+
+    Raises
+    ------
+    LogError
+        `what` is a path, or no folder can be made there.
+    """
+    if not what or Path(what).name != what:
+        raise LogError(f"--name is {what!r}, and ends the name of one folder; leave out what makes it a path")
+    stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}-{what}"
+    tries = 0
+    while True:
+        folder = logs / (stem if tries == 0 else f"{stem}-{tries}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            tries += 1
+        except OSError as error:
+            raise LogError(
+                f"--logs {logs}: no folder can be made there, {error.strerror}; pass a folder that you may write to"
+            ) from error
+        else:
+            ENDING.folder = folder
+            return folder
+
+
+@contextmanager
+def folder_of(logs: Path, what: str) -> Generator[Path]:
+    """Yield a new folder; an error of koopmpc takes it away again where nothing was written."""
+    folder = new_folder(logs, what)
+    try:
+        yield folder
+    except KoopmpcError:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+
+
+def new_file(path: Path, text: str) -> Path:
+    """Write a file that is not there yet, and return its path."""
+    try:
+        with path.open("x") as stream:
+            stream.write(text)
+    except FileExistsError as error:
+        raise LogError(f"{path} is there already; move it away first, or pass it with --goal") from error
+    except OSError as error:
+        raise LogError(f"{path} cannot be written: {error.strerror}") from error
+    return path
+
+
+_OPTION = re.compile(r"\b(dt|states|inputs|resample|horizon|workers|scheduler)=")
+_SUBJECT = re.compile(r"(^|: )(dt|resample|horizon|workers|scheduler|runs)(?= is )")
+
+
+def as_options(message: str) -> str:
+    """Return the message with the options of this program in place of Python's arguments."""
+    told = _OPTION.sub(lambda found: f"--{found.group(1)} ", message).replace(" ;", ";").replace(" ,", ",")
+    return _SUBJECT.sub(r"\1--\2", told)
+
+
+@contextmanager
+def friendly() -> Generator[None]:
+    """Show each warning and error of koopmpc as one message on stderr; an error exits with 2, a full disk with 1."""
+    err, shown = Console(stderr=True), set[str]()
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if str(message) not in shown:
+            err.print(Text.assemble((f"{category.__name__}: ", "yellow"), as_options(str(message))), soft_wrap=True)
+        shown.add(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", FitWarning)
+        warnings.showwarning = show
+        try:
+            yield
+        except KoopmpcError as error:
+            err.print(Text.assemble((f"{type(error).__name__}: ", "red"), as_options(str(error))), soft_wrap=True)
+            raise typer.Exit(1 if isinstance(error, FullDiskError) else 2) from error

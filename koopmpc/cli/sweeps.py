@@ -1,0 +1,192 @@
+"""Commands that run, compare and look back: run, bench, report, compare, inspect, replay."""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from koopmpc.cli.console import bar, console, friendly, new_folder, program
+from koopmpc.cli.ending import ENDING
+from koopmpc.errors import DataError, LogError
+
+if TYPE_CHECKING:
+    from koopmpc.bench.problem import Problem
+
+_PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
+Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
+Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
+Watched = Annotated[
+    bool, typer.Option("--monitor", help="Count the steps at which a learned model is beyond its data.")
+]
+Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
+Controllers = Annotated[
+    list[str] | None,
+    typer.Option("--controller", "-c", help="One of the ten; may be repeated. Default: those that suit any plant."),
+]
+
+
+def run(
+    problem: Annotated[str, typer.Argument(help=_PROBLEM)],
+    controller: Controllers = None,
+    faults: Faults = False,
+    monitor: Watched = False,
+    live: Live = False,
+    logs: Logs = Path("logs"),
+) -> None:
+    """Run controllers in closed loop on one problem; one log a run, and a table."""
+    from koopmpc.bench.library import load_problem
+
+    with friendly():
+        loaded = load_problem(problem)
+        _sweep([loaded], controller, None, logs, loaded.name, faults=faults, monitor=monitor, live=live)
+
+
+def bench(
+    problems: Annotated[list[str] | None, typer.Argument(help=_PROBLEM + " Default: five, see --all.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Run all problems that come with koopmpc.")] = False,
+    controller: Controllers = None,
+    starts: Annotated[int, typer.Option("--starts", help="Initial states of each case, its own among them.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", help="Sets of training data.")] = 1,
+    noise: Annotated[str, typer.Option("--noise", help="Shares of each output's spread: 0,0.01")] = "0",
+    wrong: Annotated[str, typer.Option("--wrong", help="How wrong the plant's parameters are: 0,0.2")] = "0",
+    faults: Faults = False,
+    monitor: Watched = False,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="Run in C the controllers that C is written for.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option("--workers", help="Local processes.")] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="tcp://host:port of a Dask cluster.")] = None,
+    live: Live = False,
+    logs: Logs = Path("logs"),
+    resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the sweep in this folder.")] = None,
+) -> None:
+    """Compare the controllers that each problem names, else the eight that suit any, from one start or many."""
+    from koopmpc.bench.library import DEFAULT, load_problem, shipped
+    from koopmpc.bench.store import manifest_of
+
+    with friendly():
+        where = {"workers": workers, "scheduler": scheduler, "live": live}
+        if resume is not None:
+            asked: dict[str, Any] = manifest_of(resume)["asked"]
+            loaded = [
+                load_problem(each["file"] if len(each["cases"]) > 1 else f"{each['file']}:{each['cases'][0]}")
+                for each in asked.pop("problems")
+            ]
+            _sweep(loaded, asked.pop("controllers"), resume, logs, "bench", **asked, **where)
+            return
+        loaded = [load_problem(problem) for problem in (shipped() if every else problems or DEFAULT)]
+        grid = {
+            "starts": starts,
+            "seeds": seeds,
+            "noise": _shares(noise, "--noise"),
+            "wrong": _shares(wrong, "--wrong"),
+        }
+        _sweep(
+            loaded, controller, None, logs, "bench", **grid, faults=faults, monitor=monitor, compiled=compiled, **where
+        )
+
+
+def report(folder: Annotated[Path, typer.Argument(help="The folder of a sweep.")]) -> None:
+    """Write report.html, report.md and summary.csv of a sweep, of the runs that are finished."""
+    from koopmpc.bench.report import write_report
+
+    with friendly():
+        console().print(Text(str(write_report(folder))), soft_wrap=True)
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(help="A folder of a sweep, or a log: what is known to be good.")],
+    b: Annotated[Path, typer.Argument(help="The same kind: what is new.")],
+    threshold: Annotated[float, typer.Option("--threshold", help="Share by which B may be worse than A.")] = 0.02,
+    times: Annotated[bool, typer.Option("--times", help="Step times count too, not only costs.")] = False,
+) -> None:
+    """Compare two sweeps, or two logs, run by run; exit 1 where B is worse than A by more than the threshold."""
+    from koopmpc.bench.compare import compared
+
+    with friendly():
+        found = compared(a, b, threshold=threshold, times=times)
+    console().print(found.table)
+    console().print(Text(str(found)))
+    if found.regressions:
+        raise typer.Exit(1)
+
+
+def inspect(
+    logs: Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote, or folders of them.")],
+    where: Annotated[str | None, typer.Option("--where", help='Only these, for example "violation > 0.01".')] = None,
+    repair: Annotated[bool, typer.Option("--repair", help="Write <name>.repaired.rrd of a log that was cut.")] = False,
+) -> None:
+    """Say what ran, recompute its metrics from the log alone, and name its worst moments with their times."""
+    from koopmpc.bench.inspect import inspected, inspection_table
+
+    out = console()
+    with friendly():
+        found = list(inspected(logs, where, repair=repair))
+        if len(found) == 1 and found[0].refused is not None:
+            raise LogError(found[0].refused)
+    shown = [each for each in found if each.refused is None]
+    if len(found) > 1:
+        out.print(inspection_table(found))
+    for each in shown if len(shown) == 1 or len(logs) == len(shown) <= 3 else ():
+        out.print(Text.assemble((each.title, "bold"), f"\n{each}"), soft_wrap=True)
+    for each in found:
+        if each.refused is not None:
+            out.print(Text(f"{each.path}: {each.refused}", style="red"), soft_wrap=True)
+        elif each.repaired is not None:
+            out.print(Text(f"repaired: {each.repaired}"), soft_wrap=True)
+    if not shown and len(found) and where is None:
+        raise typer.Exit(2)
+
+
+def replay(log: Annotated[Path, typer.Argument(help="A log of `koopmpc run` or `koopmpc bench`.")]) -> None:
+    """Run again what a log holds, and say whether it is the same to the bit; exit 1 where it is not."""
+    from koopmpc.bench.inspect import replayed
+
+    with friendly():
+        found = replayed(log)
+    console().print(Text(str(found)), soft_wrap=True)
+    if found.differences:
+        raise typer.Exit(1)
+
+
+def _sweep(
+    problems: "Sequence[Problem]",
+    controllers: list[str] | None,
+    folder: Path | None,
+    logs: Path,
+    what: str,
+    **asked: Any,
+) -> None:
+    """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
+    from koopmpc.bench.controllers import controller_names
+    from koopmpc.bench.report import summary_table, write_report
+    from koopmpc.bench.results import row_to_view
+    from koopmpc.bench.sweep import sweep
+    from koopmpc.bench.table import results_table
+
+    controller_names(controllers)
+    folder = new_folder(logs, what) if folder is None else folder
+    ENDING.folder = folder
+    with bar("", rate=True) as progress:
+        rows = sweep(problems, controllers, folder=folder, progress=progress, **asked)
+    out = console()
+    single = all(row.start == row.seed == row.noise == row.wrong == 0 for row in rows)
+    out.print(results_table(rows) if single else summary_table(rows))
+    if not single:
+        out.print(Text(f"\nreport: {write_report(folder)}"), soft_wrap=True)
+    out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
+    shown = row_to_view(rows)
+    if shown is not None:
+        out.print(Text(f"look at a run: {shlex.join([*program(), 'view', str(shown.log)])}"), soft_wrap=True)
+    if any(row.failure is not None for row in rows):
+        raise typer.Exit(1)
+
+
+def _shares(text: str, option: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise DataError(f"{option} is {text!r}; pass numbers with commas between them, such as 0,0.01") from error

@@ -1,0 +1,116 @@
+"""inspect and replay: what a log says by itself, worst moments with their times, conditions, and the same run again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.bench.inspect import Where, inspected, replayed, worst_moments
+from tests.bench.tiny import write
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inspected")
+    problem = km.load_problem(write(folder))
+    return km.sweep(
+        [problem], ["lqr", "koopman-mpc"], folder=folder / "logs", faults=True, starts=2, log_starts=2
+    ), folder
+
+
+def test_a_log_says_what_ran_and_its_metrics_by_itself(swept):
+    rows, folder = swept
+    found = {each.path: each for each in inspected([folder / "logs"])}
+    assert set(found) == {row.log for row in rows}
+    for row in rows:
+        own = found[row.log]
+        assert own.metrics == row.metrics
+        assert own.title.split()[:3] == [row.problem, row.case, row.controller]
+        assert own.values["reached"] == row.reached
+
+
+def test_the_worst_moments_are_where_they_happened(swept):
+    row = next(row for row in swept[0] if row.fault == "solver-failure" and row.controller == "koopman-mpc")
+    run = km.load_run(row.log)
+    times = run.solve_time.copy()
+    times[3] = 9.0
+    run = replace(run, solve_time=times, limits=km.Limits(x_max=[0.4]), known=np.arange(run.steps) // 2 % 2)
+    moments = worst_moments(run)
+    assert [moment.k for moment in moments] == sorted(moment.k for moment in moments)
+    at = {
+        kind: [m.k for m in moments if kind in m.what]
+        for kind in ("slowest", "violation", "unknown", "fallback", "later")
+    }
+    assert at["slowest"] == at["later"] == [3]
+    assert at["violation"] == [1 + int(np.argmax(run.X[1:, 0]))] or run.X[1:].max() <= 0.4
+    fell = [k for k in range(run.steps) if run.fallback[k].value and not (k and run.fallback[k - 1].value)]
+    assert at["fallback"][:5] == fell[:5]
+    assert at["unknown"][:5] == list(range(0, run.steps, 4))[:5]
+    assert all(moment.time == moment.k * run.dt for moment in moments)
+
+
+def test_conditions_choose_logs(swept):
+    rows, folder = swept
+    chosen = {each.path for each in inspected([folder / "logs"], "cost > 2 and controller == 'lqr' or not reached")}
+    assert chosen == {row.log for row in rows if (row.metrics.cost > 2 and row.controller == "lqr") or not row.reached}
+    assert Where("0 < -cost <= 3").holds({"cost": -2.0})
+    for bad, said in (
+        ("cost >", "is no comparison"),
+        ("price > 1", "there is no figure 'price'"),
+        ("cost > 'a'", "compares"),
+        ("__import__('os').system('true')", "holds more than comparisons"),
+        ("cost + 1 > 2", "holds more than comparisons"),
+    ):
+        with pytest.raises(km.errors.DataError, match=said):
+            Where(bad).holds({"cost": 1.0})
+
+
+def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused(tmp_path):
+    run = km.simulate(
+        km.load_problem("pendulum") and km.discretize(km.load_problem("pendulum").dynamics, 0.05),
+        km.LQR(
+            km.LinearPredictor.local(km.discretize(km.load_problem("pendulum").dynamics, 0.05), [0, 0], [0]),
+            km.Cost(1, 1),
+        ),
+        x0=[0.1, 0],
+        reference=[0, 0],
+        steps=600,
+        cost=km.Cost(1, 1),
+    )
+    km.record(run, tmp_path / "whole.rrd")
+    data = (tmp_path / "whole.rrd").read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(data[: int(0.8 * len(data))])
+    (tmp_path / "none.rrd").write_bytes(b"RRF2" + bytes(100))
+    found = {each.path.name: each for each in inspected([tmp_path], repair=True)}
+    assert found["whole.rrd"].cut is None
+    assert found["none.rrd"].refused is not None
+    cut = found["cut.rrd"]
+    assert cut.cut is not None
+    assert 0 < cut.values["steps"] < 600
+    repaired = km.load_run(cut.repaired)
+    np.testing.assert_array_equal(repaired.X, run.X[: repaired.steps + 1])
+    (again,) = inspected([cut.repaired])
+    assert again.cut is None
+    assert again.metrics == cut.metrics
+    with pytest.raises(km.errors.LogError, match="there is no log in"):
+        list(inspected([tmp_path / "missing" / ".."])) if (tmp_path / "missing").mkdir() else list(
+            inspected([tmp_path / "missing"])
+        )
+
+
+def test_every_run_of_a_sweep_replays_to_the_bit(swept):
+    for row in swept[0]:
+        assert replayed(row.log).differences == (), row.name
+
+
+def test_a_problem_that_has_changed_since_is_told(swept, tmp_path):
+    rows = km.sweep([km.load_problem(write(tmp_path))], ["lqr"], folder=tmp_path / "logs")
+    write(tmp_path, **{"Q=1.0": "Q=3.0"})
+    differences = replayed(rows[0].log).differences
+    assert any(each.startswith("U from step 0") for each in differences)
+    assert "cost: the problem has changed since" in differences
+    run = km.load_run(rows[0].log)
+    km.record(replace(run, metadata={}), tmp_path / "own.rrd")
+    with pytest.raises(km.errors.LogError, match="does not say which problem, case and controller ran"):
+        replayed(tmp_path / "own.rrd")

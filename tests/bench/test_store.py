@@ -1,0 +1,273 @@
+"""A sweep's store: many starts, seeds and noises, workers, kill -9, and two sweeps that do not mix."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import koopmpc as km
+from koopmpc.bench.compare import compared
+from koopmpc.bench.report import median_interval, write_report
+from koopmpc.bench.store import load_rows
+from tests.bench.tiny import write
+
+TWO = ["lqr", "koopman-mpc"]
+GRID = {"starts": 12, "seeds": 2, "noise": [0.0, 0.05]}
+
+
+def figures(rows):
+    """What is the same in each run of the same: all but times and paths."""
+    times = {"solve_time_p50": 0.0, "solve_time_p99": 0.0, "solve_time_max": 0.0, "late": 0}
+    return {row.key: (replace(row.metrics, **times), row.reached, row.x0, row.failure) for row in rows}
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    return km.load_problem(write(tmp_path_factory.mktemp("problem")))
+
+
+@pytest.fixture(scope="module")
+def whole(problem, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    return km.sweep([problem], TWO, folder=folder, **GRID), folder
+
+
+def test_every_combination_runs_once_and_what_learns_nothing_has_one_seed(whole):
+    rows, folder = whole
+    assert len(rows) == len({row.key for row in rows}) == 2 * 2 * 12 * (1 + 2)
+    assert all(row.failure is None for row in rows)
+    stored = pq.read_table(folder / "results.parquet").to_pylist()
+    assert [(line["controller"], line["start"], line["noise"], line["cost"]) for line in stored] == [
+        (row.controller, row.start, row.noise, row.metrics.cost) for row in rows
+    ]
+    assert figures(load_rows(folder)) == figures(rows)
+
+
+def test_all_controllers_meet_the_same_starts_and_the_same_noise(whole):
+    rows, _ = whole
+    starts = {}
+    for row in rows:
+        starts.setdefault((row.case, row.start), set()).add(row.x0)
+    assert all(len(found) == 1 for found in starts.values())
+    assert len({x0 for found in starts.values() for x0 in found}) == 11 + 2
+    loud = {row.key: row.metrics.cost for row in rows}
+    differ = [loud[key] != loud[(*key[:4], 0.05, *key[5:])] for key in loud if key[4] == 0.0]
+    assert np.mean(differ) > 0.7  # an input that stays at its limit is the same with noise
+
+
+def test_runs_of_a_seed_share_a_model_of_their_own_data(whole):
+    rows, folder = whole
+    costs = {row.key: row.metrics.cost for row in rows if row.controller == "koopman-mpc"}
+    assert all(cost != costs[(*key[:6], 1 - key[6], key[7])] for key, cost in costs.items())
+    assert sorted(path.name for path in (folder / "models").glob("*.npz")) == ["tiny-0-linear.npz", "tiny-1-linear.npz"]
+
+
+def test_workers_give_what_one_process_gives_and_learn_once(problem, whole, tmp_path):
+    rows = km.sweep([problem], TWO, folder=tmp_path, workers=2, **GRID)
+    assert figures(rows) == figures(whole[0])
+    assert [row.key for row in rows] == [row.key for row in whole[0]]
+    assert len({row.training_time for row in rows if row.controller == "koopman-mpc" and row.seed == 0}) == 1
+
+
+def test_what_is_finished_is_not_run_again(problem, whole, tmp_path, monkeypatch):
+    ran = []
+
+    def counted(parts, row, folder, **more):
+        if len(ran) == 30:
+            raise KeyboardInterrupt
+        ran.append(row.key)
+        return original(parts, row, folder, **more)
+
+    from koopmpc.bench import sweep as room
+
+    original = room.row_of_run
+    monkeypatch.setattr("koopmpc.bench.sweep.row_of_run", counted)
+    with pytest.raises(KeyboardInterrupt):
+        km.sweep([problem], TWO, folder=tmp_path, **GRID)
+    assert pq.read_table(tmp_path / "results.parquet").num_rows <= 30 == len(load_rows(tmp_path))
+    ran.append(None)
+    rows = km.sweep([problem], TWO, folder=tmp_path, **GRID)
+    assert figures(rows) == figures(whole[0])
+    assert len(ran) - 1 == len(set(ran) - {None}) == len(rows)
+
+
+def test_a_torn_line_is_run_again_and_nothing_else(problem, whole, tmp_path):
+    km.sweep([problem], TWO, folder=tmp_path, **GRID)
+    journal = sorted((tmp_path / "rows").glob("*.jsonl"))[-1]
+    journal.write_bytes(journal.read_bytes()[:-40])
+    assert len(load_rows(tmp_path)) == len(whole[0]) - 1
+    assert figures(km.sweep([problem], TWO, folder=tmp_path, **GRID)) == figures(whole[0])
+
+
+def test_another_sweep_is_refused_in_the_same_folder(problem, whole, tmp_path):
+    with pytest.raises(
+        km.errors.ProblemError, match=r"holds another sweep, of other controllers, starts; pass another"
+    ):
+        km.sweep([problem], ["lqr"], folder=whole[1], **{**GRID, "starts": 3})
+    changed = km.load_problem(write(tmp_path, "tiny", **{"Q=1.0": "Q=2.0"}))
+    with pytest.raises(km.errors.ProblemError, match=r"holds another sweep, of other problems; pass another folder"):
+        km.sweep([changed], TWO, folder=whole[1], **GRID)
+
+
+def test_two_sweeps_at_once_in_one_folder_are_refused(problem, tmp_path):
+    def second(*told):
+        with pytest.raises(km.errors.ProblemError, match="another process runs a sweep in"):
+            km.sweep([problem], ["lqr"], folder=tmp_path)
+
+    assert len(km.sweep([problem], ["lqr"], folder=tmp_path, progress=second)) == 2
+
+
+def test_wrong_parameters_move_the_plant_and_no_controller(tmp_path):
+    problem = km.load_problem("pendulum:upright")
+    rows = km.sweep([problem], TWO, folder=tmp_path, wrong=[0.0, 0.1], starts=2)
+    costs = {row.key: row.metrics.cost for row in rows}
+    assert all(cost != costs[(*key[:5], 0.1, *key[6:])] for key, cost in costs.items() if key[5] == 0.0)
+    with pytest.raises(km.errors.ProblemError, match="its plant has no numbers as fields"):
+        km.sweep([km.load_problem(write(tmp_path))], ["lqr"], folder=tmp_path / "none", wrong=[0.1])
+
+
+def test_a_problem_that_cannot_be_sent_says_so(problem, tmp_path):
+    local = replace(problem, scene=lambda x, u: [])
+    with pytest.raises(km.errors.ProblemError, match=r"cannot be sent to worker processes .* save it in a file"):
+        km.sweep([local], ["lqr"], folder=tmp_path, workers=2)
+
+
+def killed_and_resumed(problem, folder, moments, grid):
+    """Start the sweep in a process of its own, kill it at each moment [s], and end it in peace."""
+    code = (
+        "import koopmpc as km, sys\n"
+        "if __name__ == '__main__':\n"
+        f"    km.sweep([km.load_problem({problem.file!r})], {TWO!r}, folder={str(folder)!r}, workers=2, **{grid!r})\n"
+    )
+    script = Path(f"{folder}.py")
+    script.write_text(code)
+    for moment in moments:
+        before = {row.key for row in load_rows(folder)} if (folder / "sweep.json").exists() else set()
+        process = subprocess.Popen([sys.executable, script], start_new_session=True)
+        time.sleep(moment)
+        process.kill()
+        process.wait()
+        if (folder / "sweep.json").exists():
+            assert before <= {row.key for row in load_rows(folder)}
+    deadline = time.monotonic() + 20  # workers end with their parent
+    while time.monotonic() < deadline:
+        try:
+            return km.sweep([problem], TWO, folder=folder, **grid)
+        except km.errors.ProblemError as error:
+            if "another process" not in str(error):
+                raise
+            time.sleep(0.2)
+    raise AssertionError("a worker of a killed sweep still holds the folder")
+
+
+def once_each(folder):
+    """Return how many lines the store has for each run."""
+    found = [
+        line
+        for path in (folder / "rows").glob("*.jsonl")
+        for line in path.read_bytes().split(b"\n")
+        if b'"cost"' in line
+    ]
+    return len(found)
+
+
+def test_a_sweep_that_was_killed_goes_on_where_it_was(problem, whole, tmp_path):
+    rows = killed_and_resumed(problem, tmp_path / "killed", [4.0], GRID)
+    assert figures(rows) == figures(whole[0])
+    assert once_each(tmp_path / "killed") == len(rows)
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments_lose_nothing_and_repeat_nothing(problem, tmp_path):
+    grid = {**GRID, "starts": 300}
+    undisturbed = km.sweep([problem], TWO, folder=tmp_path / "peace", **grid)
+    moments = np.random.default_rng(0).uniform(1.0, 8.0, 20).tolist()
+    rows = killed_and_resumed(problem, tmp_path / "killed", moments, grid)
+    assert figures(rows) == figures(undisturbed)
+    assert once_each(tmp_path / "killed") == len(rows)
+
+
+def test_a_worker_that_is_killed_costs_its_current_run_alone(tmp_path):
+    source = {
+        "return -0.5 * x[0]": "import os; os.kill(os.getpid(), 9) if os.environ.get('X') else 0\n        return -0.5 * x[0]"
+    }
+    deadly = km.load_problem(write(tmp_path, **source))
+    os.environ["X"] = "1"
+    try:
+        rows = km.sweep([deadly], ["lqr"], folder=tmp_path / "deadly", workers=2)
+    finally:
+        del os.environ["X"]
+    assert [row.failure for row in rows] == ["its worker process died 2 times"] * 2
+
+
+def test_ctrl_c_leaves_a_store_that_reads(problem, tmp_path):
+    script = tmp_path / "swept.py"
+    grid = {**GRID, "starts": 2000}
+    script.write_text(
+        f"import koopmpc as km\nkm.sweep([km.load_problem({problem.file!r})], {TWO!r}, folder={str(tmp_path / 'f')!r}, **{grid!r})\n"
+    )
+    process = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and once_each(tmp_path / "f") < 5:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    process.wait(60)
+    rows = load_rows(tmp_path / "f")
+    assert 0 < len(rows) < 24000
+    assert pq.read_table(tmp_path / "f" / "results.parquet").num_rows == len(rows)
+
+
+def test_the_interval_of_a_median_holds_it_as_often_as_it_says():
+    rng = np.random.default_rng(3)
+    for n in (15, 2001, 40000):
+        inside = 0
+        for _ in range(100):
+            middle, low, high = median_interval(rng.exponential(size=n), rng)
+            assert low <= middle <= high
+            inside += low <= np.log(2.0) <= high
+        assert 85 <= inside <= 100
+
+
+def test_a_report_is_one_file_with_every_case_and_controller(whole):
+    page = write_report(whole[1]).read_text()
+    for word in ("tiny:near", "tiny:far", *TWO, "noise 0.05", "<svg", "tiny-near-lqr.rrd"):
+        assert word in page
+    assert "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
+        "http://creativecommons.org", ""
+    )
+    assert "https://" not in page.replace("https://matplotlib.org", "")
+    assert "<script" not in page
+    text = (whole[1] / "report.md").read_text()
+    assert "## tiny:near" in text
+    lines = (whole[1] / "summary.csv").read_text().splitlines()
+    assert len(lines) == 1 + 2 * 2 * 2
+    costs = [row.metrics.cost for row in whole[0] if row.key[:5] == ("tiny", "near", "lqr", None, 0.0)]
+    (line,) = (line for line in lines if line.startswith("tiny:near,–,lqr"))
+    assert float(line.split(",")[6]) == np.median(costs)
+
+
+def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, tmp_path):
+    same = compared(whole[1], whole[1])
+    assert not same.regressions
+    assert {pair.ratio for pair in same.pairs} == {1.0}
+    worse = replace(problem, limits=km.Limits(u_min=-0.3, u_max=0.3)).of_file(problem.file)
+    km.sweep([worse], TWO, folder=tmp_path, **GRID)
+    found = compared(whole[1], tmp_path)
+    assert {pair.what.split()[1] for pair in found.regressions} >= {"near"}
+    assert all(pair.p < 0.05 or pair.lost for pair in found.regressions)
+    assert not compared(tmp_path, whole[1]).regressions
+    assert not compared(whole[1], tmp_path, threshold=1e6).regressions or any(p.lost for p in found.regressions)
+
+
+def test_two_logs_are_compared_and_strangers_are_refused(whole):
+    log = whole[1] / "tiny-near-lqr.rrd"
+    assert not compared(log, log).regressions
+    with pytest.raises(km.errors.LogError, match="have no run in common"):
+        compared(log, whole[1] / "tiny-far-lqr.rrd")
