@@ -26,8 +26,8 @@ from koopmpc.values import Value
 
 LEAST = 1e-9  # ridge: without one, observables that are almost dependent get weights that no controller has digits for
 _STARTS = 256  # forecasts a fold
-_ALIKE = 1.02  # a larger ridge with errors so little above is worth having
 EXACT = 1e-6  # relative errors below are what rounding and the least ridge leave
+DELAYED = 0.5  # a model with delays must have less than this share of the error of the best without
 _LOST = 100.0  # a prediction that is so many spreads off is no prediction
 
 
@@ -97,28 +97,23 @@ class Tried(Value):
 
     @property
     def scores(self) -> Float[np.ndarray, "ridges folds"]:
-        """Root-mean-square of the errors over the horizon, of each fold."""
-        return np.sqrt(np.mean(self.errors**2, axis=2))
+        """Geometric mean of the errors over the horizon, of each fold.
+
+        On an unstable plant errors grow from step to step, and a root-mean-square would be that of the last steps: a
+        tame model could win that spoils the next step, and with it every gain. Here each step counts alike.
+        """
+        with np.errstate(divide="ignore"):
+            return np.exp(np.log(np.maximum(self.errors, EXACT)).mean(axis=2))
 
     def best(self, floor: float) -> int:
-        """Return the index of the largest ridge from `floor` on whose worst fold is within 2 % of the best ridge's.
+        """Return the index of the ridge with the least geometric mean of the scores of all folds.
 
-        Where every ridge is below the floor, the largest one stands for it.
+        `floor` is the least ridge of a model with delays, whose observables are almost functions of each other; where
+        every ridge is below it, the largest one stands for it.
         """
-        worst, first = self.scores.max(axis=1), np.searchsorted(self.ridges[:-1], floor)
-        alike = max(_ALIKE * worst[first:].min(), EXACT)
-        return max(i for i in range(int(first), len(worst)) if worst[i] <= alike)
-
-    def nearest(self, floor: float) -> int:
-        """Return the index of the ridge from `floor` on with the least geometric mean of all errors.
-
-        On an unstable plant the last steps decide a mean over the horizon, and there a large ridge, which makes the
-        model tame, can win although it spoils the next step, and with it every gain. Here each step counts alike.
-        """
-        first = int(np.searchsorted(self.ridges[:-1], floor))
+        first = int(np.searchsorted(self.ridges[:-1], floor)) if self.candidate.delays else 0
         with np.errstate(divide="ignore"):
-            mean = np.log(np.maximum(self.errors[first:], EXACT)).mean(axis=(1, 2))
-        return first + int(np.argmin(mean))
+            return first + int(np.argmin(np.log(self.scores[first:]).mean(axis=1)))
 
 
 def tried(trial: Trial) -> Tried:

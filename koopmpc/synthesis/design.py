@@ -288,8 +288,7 @@ class _FreeInputs:
 def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
     """Return the recipes of the first round: the five best models of each kind, and plain linear ones with Q_N = Q.
 
-    Linear models, whose runs take little time, are tried with two ridges: that of the least error over the horizon, and
-    that of the least error at each step; plain ones also with next to none, as a textbook fits them.
+    Plain linear models are tried with next to no ridge too, as a textbook fits them.
     """
     places = [tried.best(floor) for tried in results]
     worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
@@ -300,10 +299,9 @@ def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
         candidate, ridges = results[i].candidate, results[i].ridges
         found.extend(Recipe(candidate, ridges[place], tail=tail) for place in sorted(indices))
 
-    for i in [i for i in ranked if not results[i].candidate.bilinear][:_SCREENED]:
-        add(i, {places[i], results[i].nearest(floor)})
-    for i in [i for i in ranked if results[i].candidate.bilinear][:_SCREENED]:
-        add(i, {places[i]})
+    for bilinear in (False, True):
+        for i in [i for i in ranked if results[i].candidate.bilinear == bilinear][:_SCREENED]:
+            add(i, {places[i]})
     for i, one in enumerate(results):
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
             add(i, {0, places[i]}, tail=0)

@@ -43,10 +43,12 @@ def select(
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
 ) -> Selection:
-    """Choose the model with min over models of max over folds of the h-step error, h = 1 … horizon, and fit it to all.
+    """Choose the model with min over models of max over folds of the mean log error, h = 1 … horizon steps ahead.
 
     Each candidate is fitted to all folds but one and rolled out over that one, over the whole horizon, for a model
-    with small one-step errors need not predict a horizon well. An error is relative to the state's standard
+    with small one-step errors need not predict a horizon well. Its score is the geometric mean of its errors over the
+    horizon, so that the next step counts as much as the last one, where the errors of an unstable plant are largest;
+    the winner is fitted to all data. An error is relative to the state's standard
     deviation, so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such
     model is taken while there is another. The models are ranked by their worst fold, and of all within one standard
     error of the best the smallest is taken (Breiman et al. 1984).
@@ -69,10 +71,11 @@ def select(
         At least 2.
     ridges
         Weights to try, on unit-norm columns; those below 1e-9 are raised to it. By default 1e-9 to 1e-3 by decades,
-        from ε² on, ε the share of the states' size that the best candidate misses in one step: what the data hold of
-        noise, or of what no candidate knows. Noise ε in the regressors adds M ε² rms² = ε² ‖p‖² to the diagonal of
-        PᵀP, which is a ridge ε² on columns of unit norm. With less, delays and other observables that are almost
-        functions of each other get large weights of opposite signs, which cancel on the training data alone.
+        for models with delays from ε² on, ε the share of the states' size that the best candidate misses in one
+        step: what the data hold of noise, or of what no candidate knows. Noise ε in the regressors adds
+        M ε² rms² = ε² ‖p‖² to the diagonal of PᵀP, which is a ridge ε² on columns of unit norm. With less, a state and
+        its past, which are almost functions of each other, get large weights of opposite signs, which cancel on the
+        training data alone.
     delays
         Past steps to try in an embedding.
     bilinear

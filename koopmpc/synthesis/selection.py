@@ -9,7 +9,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.synthesis.cross_validation import EXACT, Tried
+from koopmpc.synthesis.cross_validation import DELAYED, EXACT, Tried
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.validate.text import table, written
 from koopmpc.values import Value
@@ -143,7 +143,7 @@ class Selection(Value):
         legend = (
             f"Errors are root-mean-squares over the states, each relative to its standard deviation, {horizon} steps = "
             f"{horizon * self.predictor.dt:.3g} s: the median over {self.folds} folds at each number of steps ahead, "
-            "and in the worst fold over the whole horizon. → marks the chosen model, the smallest one within one "
+            "and their geometric mean over the horizon in the worst fold. → marks the chosen model, the smallest one within one "
             "standard error of the best"
         )
         legend += "." if self.chosen == self.chosen_linear else "; l marks the best linear model."
@@ -191,9 +191,14 @@ def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None, alike: flo
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
     Errors below `alike` count as equal; by default these are errors of rounding and of the least ridge. Where every
-    forecast ran away, it is the smallest model of all.
+    forecast ran away, it is the smallest model of all. Models with delays are taken only where they halve the error, as
+    they do where some of the state is not measured: elsewhere the past tells a linear model which input the data
+    would have applied next, and a controller applies others.
     """
     places = [i for i, row in enumerate(rows) if kind is None or row.kind == kind]
+    present = [i for i in places if not rows[i].delays]
+    if present and not min(rows[i].worst for i in places) < DELAYED * min(rows[i].worst for i in present):
+        places = present
     best = min((rows[i] for i in places), key=lambda row: row.worst)
     near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, alike)]
     return min(near, key=lambda i: (rows[i].size, rows[i].worst))

@@ -14,13 +14,12 @@ from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import Asked
-from koopmpc.synthesis.cross_validation import Tried
+from koopmpc.synthesis.cross_validation import DELAYED, Tried
 from koopmpc.synthesis.recipes import Recipe
 from koopmpc.validate.scoring import AnyPredictor, score
 from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
-DELAYED = 0.5  # a surrogate with delays must have less than this share of the error of the best without
 SECOND = 3.0  # times the error of the best that a surrogate of another family may have
 INVARIANT = (
     0.25  # share of an increment that a state may decide which the plant does not feel: learned models err as much

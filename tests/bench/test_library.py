@@ -14,7 +14,7 @@ from tests.bench.tiny import SOURCE, write
 
 def test_a_bench_runs_five_problems_and_with_all_every_shipped_one(monkeypatch, tmp_path):
     ran = []
-    monkeypatch.setattr("koopmpc.cli.app._sweep", lambda problems, *_, **__: ran.append([p.name for p in problems]))
+    monkeypatch.setattr("koopmpc.cli.sweeps._sweep", lambda problems, *_, **__: ran.append([p.name for p in problems]))
     for arguments in (["bench"], ["bench", "--all"]):
         assert CliRunner().invoke(app, arguments).exit_code == 0
     assert ran[0] == ["bilinear_motor", "cart_pole", "cart_pole_swing", "pendulum", "van_der_pol"]

@@ -97,7 +97,7 @@ def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(written: Path, t
 def head(run: km.Run, steps: int) -> km.Run:
     """Return the first steps of a run."""
     ends = ("X", "Y", "reference")
-    moves = ("U", "status", "fallback", "solve_time", "iterations", "u_reference", "slack", "known")
+    moves = ("U", "status", "fallback", "solve_time", "iterations", "u_reference", "slack", "known", "solver")
     return replace(
         run,
         **{name: getattr(run, name)[: steps + 1] for name in ends},
