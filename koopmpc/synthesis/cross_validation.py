@@ -25,6 +25,8 @@ from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 from koopmpc.values import Value
 
 LEAST = 1e-9  # ridge: without one, observables that are almost dependent get weights that no controller has digits for
+_TINY = 1e-15  # of an error that is zero
+_ALIKE = 1.02  # a larger ridge with errors so little above is worth having
 _STARTS = 256  # forecasts a fold
 EXACT = 1e-6  # relative errors below are what rounding and the least ridge leave
 DELAYED = 0.5  # a model with delays must have less than this share of the error of the best without
@@ -102,18 +104,19 @@ class Tried(Value):
         On an unstable plant errors grow from step to step, and a root-mean-square would be that of the last steps: a
         tame model could win that spoils the next step, and with it every gain. Here each step counts alike.
         """
-        with np.errstate(divide="ignore"):
-            return np.exp(np.log(np.maximum(self.errors, EXACT)).mean(axis=2))
+        return np.exp(np.log(np.maximum(self.errors, _TINY)).mean(axis=2))
 
     def best(self, floor: float) -> int:
-        """Return the index of the ridge with the least geometric mean of the scores of all folds.
+        """Return the index of the largest ridge whose mean score over the folds is within 2 % of the least one.
 
-        `floor` is the least ridge of a model with delays, whose observables are almost functions of each other; where
-        every ridge is below it, the largest one stands for it.
+        Where the data hold noise, ridges below it make no difference, and a larger one makes the model calmer. `floor`
+        is the least ridge of a model with delays, whose observables are almost functions of each other; where every
+        ridge is below it, the largest one stands for it.
         """
         first = int(np.searchsorted(self.ridges[:-1], floor)) if self.candidate.delays else 0
-        with np.errstate(divide="ignore"):
-            return first + int(np.argmin(np.log(self.scores[first:]).mean(axis=1)))
+        mean = np.exp(np.log(self.scores).mean(axis=1))
+        alike = max(_ALIKE * mean[first:].min(), EXACT)
+        return max(i for i in range(first, len(mean)) if mean[i] <= alike)
 
 
 def tried(trial: Trial) -> Tried:
