@@ -51,7 +51,7 @@ def select(
     the winner is fitted to all data. An error is relative to the state's standard
     deviation, so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such
     model is taken while there is another. The models are ranked by their worst fold, and of all within one standard
-    error of the best the smallest is taken (Breiman et al. 1984).
+    error of the best the smallest is taken (Breiman et al. 1984), one with delays only where that halves the error.
 
     A source larger than memory is chosen on a sample of it, whole episodes from evenly spread parts; the winner is
     then fitted to all of it, part by part.

@@ -42,7 +42,7 @@ class LeaderboardRow(Value):
     first, middle, last
         Error 1, h/2 and h steps ahead, h the horizon; the median over the folds.
     median, worst
-        Error over the whole horizon: median over the folds, and the worst of them.
+        Geometric mean of the errors over the horizon: median over the folds, and the worst of them.
     deviation
         Standard error of the mean over the folds.
     radius
@@ -143,8 +143,8 @@ class Selection(Value):
         legend = (
             f"Errors are root-mean-squares over the states, each relative to its standard deviation, {horizon} steps = "
             f"{horizon * self.predictor.dt:.3g} s: the median over {self.folds} folds at each number of steps ahead, "
-            "and their geometric mean over the horizon in the worst fold. → marks the chosen model, the smallest one within one "
-            "standard error of the best"
+            "and their geometric mean over the horizon in the worst fold. → marks the chosen model, the smallest one "
+            "within one standard error of the best"
         )
         legend += "." if self.chosen == self.chosen_linear else "; l marks the best linear model."
         hidden = len(self.leaderboard) - len(shown)

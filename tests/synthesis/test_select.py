@@ -174,8 +174,7 @@ def test_on_an_unstable_plant_the_next_step_is_not_given_up_for_the_last_one():
     made = []
     for _ in range(60):
         X, U = [rng.uniform([0.8, -1.0], [1.2, 1.0])], []
-        for k in range(50):
-            noise = rng.uniform(-0.12, 0.12) if k % 2 == 0 else noise  # noqa: F821  # held for two steps
+        for noise in np.repeat(rng.uniform(-0.12, 0.12, 25), 2):
             U.append([np.clip(1 + 3.5 * (X[-1][0] - 1) + 0.6 * X[-1][1] + noise, 0.3, 1.8)])
             X.append(levitated(X[-1], U[-1]))
         made.append(km.Episode(X=np.array(X), U=np.array(U)))
