@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.inspect import Where, inspected, replayed, worst_moments
 from tests.bench.tiny import write
 
 
@@ -21,7 +20,7 @@ def swept(tmp_path_factory):
 
 def test_a_log_says_what_ran_and_its_metrics_by_itself(swept):
     rows, folder = swept
-    found = {each.path: each for each in inspected([folder / "logs"])}
+    found = {each.path: each for each in km.bench.inspected([folder / "logs"])}
     assert set(found) == {row.log for row in rows}
     for row in rows:
         own = found[row.log]
@@ -36,7 +35,7 @@ def test_the_worst_moments_are_where_they_happened(swept):
     times = run.solve_time.copy()
     times[3] = 9.0
     run = replace(run, solve_time=times, limits=km.Limits(x_max=[0.4]), known=np.arange(run.steps) // 2 % 2)
-    moments = worst_moments(run)
+    moments = km.bench.worst_moments(run)
     assert [moment.k for moment in moments] == sorted(moment.k for moment in moments)
     at = {
         kind: [m.k for m in moments if kind in m.what]
@@ -52,9 +51,11 @@ def test_the_worst_moments_are_where_they_happened(swept):
 
 def test_conditions_choose_logs(swept):
     rows, folder = swept
-    chosen = {each.path for each in inspected([folder / "logs"], "cost > 2 and controller == 'lqr' or not reached")}
+    chosen = {
+        each.path for each in km.bench.inspected([folder / "logs"], "cost > 2 and controller == 'lqr' or not reached")
+    }
     assert chosen == {row.log for row in rows if (row.metrics.cost > 2 and row.controller == "lqr") or not row.reached}
-    assert Where("0 < -cost <= 3").holds({"cost": -2.0})
+    assert km.bench.Where("0 < -cost <= 3").holds({"cost": -2.0})
     for bad, said in (
         ("cost >", "is no comparison"),
         ("price > 1", "there is no figure 'price'"),
@@ -63,7 +64,7 @@ def test_conditions_choose_logs(swept):
         ("cost + 1 > 2", "holds more than comparisons"),
     ):
         with pytest.raises(km.errors.DataError, match=said):
-            Where(bad).holds({"cost": 1.0})
+            km.bench.Where(bad).holds({"cost": 1.0})
 
 
 def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused(tmp_path):
@@ -82,7 +83,7 @@ def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused
     data = (tmp_path / "whole.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(data[: int(0.8 * len(data))])
     (tmp_path / "none.rrd").write_bytes(b"RRF2" + bytes(100))
-    found = {each.path.name: each for each in inspected([tmp_path], repair=True)}
+    found = {each.path.name: each for each in km.bench.inspected([tmp_path], repair=True)}
     assert found["whole.rrd"].cut is None
     assert found["none.rrd"].refused is not None
     cut = found["cut.rrd"]
@@ -90,27 +91,27 @@ def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused
     assert 0 < cut.values["steps"] < 600
     repaired = km.load_run(cut.repaired)
     np.testing.assert_array_equal(repaired.X, run.X[: repaired.steps + 1])
-    (again,) = inspected([cut.repaired])
+    (again,) = km.bench.inspected([cut.repaired])
     assert again.cut is None
     assert again.metrics == cut.metrics
     with pytest.raises(km.errors.LogError, match="there is no log in"):
-        list(inspected([tmp_path / "missing" / ".."])) if (tmp_path / "missing").mkdir() else list(
-            inspected([tmp_path / "missing"])
+        list(km.bench.inspected([tmp_path / "missing" / ".."])) if (tmp_path / "missing").mkdir() else list(
+            km.bench.inspected([tmp_path / "missing"])
         )
 
 
 def test_every_run_of_a_sweep_replays_to_the_bit(swept):
     for row in swept[0]:
-        assert replayed(row.log).differences == (), row.name
+        assert km.bench.replayed(row.log).differences == (), row.name
 
 
 def test_a_problem_that_has_changed_since_is_told(swept, tmp_path):
     rows = km.sweep([km.load_problem(write(tmp_path))], ["lqr"], folder=tmp_path / "logs")
     write(tmp_path, **{"Q=1.0": "Q=3.0"})
-    differences = replayed(rows[0].log).differences
+    differences = km.bench.replayed(rows[0].log).differences
     assert any(each.startswith("U from step 0") for each in differences)
     assert "cost: the problem has changed since" in differences
     run = km.load_run(rows[0].log)
     km.record(replace(run, metadata={}), tmp_path / "own.rrd")
     with pytest.raises(km.errors.LogError, match="does not say which problem, case and controller ran"):
-        replayed(tmp_path / "own.rrd")
+        km.bench.replayed(tmp_path / "own.rrd")

@@ -13,9 +13,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.compare import compared
-from koopmpc.bench.report import median_interval, write_report
-from koopmpc.bench.store import load_rows
 from tests.bench.tiny import write
 
 TWO = ["lqr", "koopman-mpc"]
@@ -47,7 +44,7 @@ def test_every_combination_runs_once_and_what_learns_nothing_has_one_seed(whole)
     assert [(line["controller"], line["start"], line["noise"], line["cost"]) for line in stored] == [
         (row.controller, row.start, row.noise, row.metrics.cost) for row in rows
     ]
-    assert figures(load_rows(folder)) == figures(rows)
+    assert figures(km.bench.load_rows(folder)) == figures(rows)
 
 
 def test_all_controllers_meet_the_same_starts_and_the_same_noise(whole):
@@ -91,7 +88,7 @@ def test_what_is_finished_is_not_run_again(problem, whole, tmp_path, monkeypatch
     monkeypatch.setattr("koopmpc.bench.sweep.row_of_run", counted)
     with pytest.raises(KeyboardInterrupt):
         km.sweep([problem], TWO, folder=tmp_path, **GRID)
-    assert pq.read_table(tmp_path / "results.parquet").num_rows <= 30 == len(load_rows(tmp_path))
+    assert pq.read_table(tmp_path / "results.parquet").num_rows <= 30 == len(km.bench.load_rows(tmp_path))
     ran.append(None)
     rows = km.sweep([problem], TWO, folder=tmp_path, **GRID)
     assert figures(rows) == figures(whole[0])
@@ -102,7 +99,7 @@ def test_a_torn_line_is_run_again_and_nothing_else(problem, whole, tmp_path):
     km.sweep([problem], TWO, folder=tmp_path, **GRID)
     journal = sorted((tmp_path / "rows").glob("*.jsonl"))[-1]
     journal.write_bytes(journal.read_bytes()[:-40])
-    assert len(load_rows(tmp_path)) == len(whole[0]) - 1
+    assert len(km.bench.load_rows(tmp_path)) == len(whole[0]) - 1
     assert figures(km.sweep([problem], TWO, folder=tmp_path, **GRID)) == figures(whole[0])
 
 
@@ -149,13 +146,13 @@ def killed_and_resumed(problem, folder, moments, grid):
     script = Path(f"{folder}.py")
     script.write_text(code)
     for moment in moments:
-        before = {row.key for row in load_rows(folder)} if (folder / "sweep.json").exists() else set()
+        before = {row.key for row in km.bench.load_rows(folder)} if (folder / "sweep.json").exists() else set()
         process = subprocess.Popen([sys.executable, script], start_new_session=True)
         time.sleep(moment)
         process.kill()
         process.wait()
         if (folder / "sweep.json").exists():
-            assert before <= {row.key for row in load_rows(folder)}
+            assert before <= {row.key for row in km.bench.load_rows(folder)}
     deadline = time.monotonic() + 20  # workers end with their parent
     while time.monotonic() < deadline:
         try:
@@ -219,7 +216,7 @@ def test_ctrl_c_leaves_a_store_that_reads(problem, tmp_path):
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     process.wait(60)
-    rows = load_rows(tmp_path / "f")
+    rows = km.bench.load_rows(tmp_path / "f")
     assert 0 < len(rows) < 24000
     assert pq.read_table(tmp_path / "f" / "results.parquet").num_rows == len(rows)
 
@@ -229,14 +226,14 @@ def test_the_interval_of_a_median_holds_it_as_often_as_it_says():
     for n in (15, 2001, 40000):
         inside = 0
         for _ in range(100):
-            middle, low, high = median_interval(rng.exponential(size=n), rng)
+            middle, low, high = km.bench.median_interval(rng.exponential(size=n), rng)
             assert low <= middle <= high
             inside += low <= np.log(2.0) <= high
         assert 85 <= inside <= 100
 
 
 def test_a_report_is_one_file_with_every_case_and_controller(whole):
-    page = write_report(whole[1]).read_text()
+    page = km.bench.write_report(whole[1]).read_text()
     for word in ("tiny:near", "tiny:far", *TWO, "noise 0.05", "<svg", "tiny-near-lqr.rrd"):
         assert word in page
     assert "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
@@ -254,20 +251,22 @@ def test_a_report_is_one_file_with_every_case_and_controller(whole):
 
 
 def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, tmp_path):
-    same = compared(whole[1], whole[1])
+    same = km.bench.compared(whole[1], whole[1])
     assert not same.regressions
     assert {pair.ratio for pair in same.pairs} == {1.0}
     worse = replace(problem, limits=km.Limits(u_min=-0.3, u_max=0.3)).of_file(problem.file)
     km.sweep([worse], TWO, folder=tmp_path, **GRID)
-    found = compared(whole[1], tmp_path)
+    found = km.bench.compared(whole[1], tmp_path)
     assert {pair.what.split()[1] for pair in found.regressions} >= {"near"}
     assert all(pair.p < 0.05 or pair.lost for pair in found.regressions)
-    assert not compared(tmp_path, whole[1]).regressions
-    assert not compared(whole[1], tmp_path, threshold=1e6).regressions or any(p.lost for p in found.regressions)
+    assert not km.bench.compared(tmp_path, whole[1]).regressions
+    assert not km.bench.compared(whole[1], tmp_path, threshold=1e6).regressions or any(
+        p.lost for p in found.regressions
+    )
 
 
 def test_two_logs_are_compared_and_strangers_are_refused(whole):
     log = whole[1] / "tiny-near-lqr.rrd"
-    assert not compared(log, log).regressions
+    assert not km.bench.compared(log, log).regressions
     with pytest.raises(km.errors.LogError, match="have no run in common"):
-        compared(log, whole[1] / "tiny-far-lqr.rrd")
+        km.bench.compared(log, whole[1] / "tiny-far-lqr.rrd")

@@ -8,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.results import failures
 from tests.bench.test_table import printed
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
@@ -266,10 +265,10 @@ def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):
 
 def test_missing_steps_and_statuses_are_failures(swept):
     run = km.load_run(next(row.log for row in swept[1] if row.case == "far"))
-    assert failures(run, 6) == []
-    assert failures(run, 7) == ["it took 6 of 7 steps"]
-    assert failures(replace(run, status=run.status[:-1]), 6) == ["5 of 6 steps have a status"]
-    assert failures(replace(run, U=np.full_like(run.U, np.inf)), 6) == ["u is [inf] at step 0"]
+    assert km.bench.failures(run, 6) == []
+    assert km.bench.failures(run, 7) == ["it took 6 of 7 steps"]
+    assert km.bench.failures(replace(run, status=run.status[:-1]), 6) == ["5 of 6 steps have a status"]
+    assert km.bench.failures(replace(run, U=np.full_like(run.U, np.inf)), 6) == ["u is [inf] at step 0"]
 
 
 def test_reached_is_a_band_of_five_percent_over_the_last_tenth(swept):
