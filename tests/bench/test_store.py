@@ -208,6 +208,7 @@ def test_ctrl_c_leaves_a_store_that_reads(problem, tmp_path):
     script = tmp_path / "swept.py"
     grid = {**GRID, "starts": 2000}
     script.write_text(
+        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it\n"
         f"import koopmpc as km\nkm.sweep([km.load_problem({problem.file!r})], {TWO!r}, folder={str(tmp_path / 'f')!r}, **{grid!r})\n"
     )
     process = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL)
