@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.bench.page import Page
 from koopmpc.control.move import Move, Status
 from koopmpc.errors import LogError
 from koopmpc.lifting.state import State
@@ -18,6 +17,7 @@ from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSenso
 from koopmpc.loop.metrics import duration
 from koopmpc.loop.simulate import simulate
 from koopmpc.parallel import StageProgress
+from koopmpc.recording.page import Page
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, made, saved_controller
 from koopmpc.synthesis.judging import Fenced, LostError
 from koopmpc.validate.text import percent, table, written

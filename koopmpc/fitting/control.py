@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks, disk
-from koopmpc.bench.page import Page
 from koopmpc.data.episodes import Episodes
 from koopmpc.fitting.audited import Data, evenly
 from koopmpc.fitting.fit import Say, guessed, logs_of, silent, understood
 from koopmpc.fitting.goal import Goal, goal_template, read_goal
 from koopmpc.fitting.repair import IN_MEMORY, Divided, divided, noted, shortened
 from koopmpc.parallel import StageProgress
+from koopmpc.recording.page import Page
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import Design
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.bench.page import Page
 from koopmpc.bench.results import RESULTS
 from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
@@ -25,6 +24,7 @@ from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
+from koopmpc.recording.page import Page
 from koopmpc.synthesis.select import select
 from koopmpc.synthesis.selection import Selection
 from koopmpc.validate.report import TrustReport, trust

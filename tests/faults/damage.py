@@ -10,8 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.page import Page
 from koopmpc.bench.results import RunRow, write_results
+from koopmpc.recording.page import Page
 from koopmpc.recording.views.curves import Curves, record_curves
 from tests.recording.runs import make_run
 

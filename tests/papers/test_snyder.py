@@ -8,8 +8,6 @@ import pytest
 from scipy.special import ellipk
 
 import koopmpc as km
-from koopmpc.bench import page as pages
-from koopmpc.bench.page import Page
 from koopmpc.papers.contest import ORACLE, Prediction
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict
@@ -17,6 +15,8 @@ from koopmpc.papers.snyder import report, theory
 from koopmpc.papers.snyder.claims import of_figures, of_text
 from koopmpc.papers.snyder.paper import held_change, rebuilt
 from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains
+from koopmpc.recording import page as pages
+from koopmpc.recording.page import Page
 
 PAGE = Path(__file__).parents[2] / "docs" / "snyder.md"
 # Relative reconstruction errors in %, computed independently: (setting, observables, full rank).

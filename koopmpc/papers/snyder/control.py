@@ -7,7 +7,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.bench.page import Page
 from koopmpc.control.limits import Limits
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
@@ -24,6 +23,7 @@ from koopmpc.papers.reconstruction import Setting, percent, unwarned
 from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Shaking, gains
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import StepMap, discretize
+from koopmpc.recording.page import Page
 
 Runs = Mapping[str, Mapping[tuple[str, bool], Run]]  # by title of the task, then as `Contest.runs`
 DRAWN = ("LQR, linearisation", "MPC, Fourier 1", "MPC, monomials 3", ORACLE)

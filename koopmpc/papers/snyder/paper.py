@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from koopmpc.bench.page import Page
 from koopmpc.papers.reconstruction import Reconstruction, Setting
 from koopmpc.papers.registry import Paper, Reproduction
 from koopmpc.papers.snyder import control, report, theory
 from koopmpc.papers.snyder.claims import Fits, of_figures, of_text
 from koopmpc.papers.snyder.settings import OBSERVABLES, SHAKINGS, TASKS, all_settings
+from koopmpc.recording.page import Page
 from koopmpc.recording.views.curves import record_curves
 
 RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine

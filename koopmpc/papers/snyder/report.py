@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from koopmpc.bench.page import Page
 from koopmpc.data.collect import collect
 from koopmpc.data.excitation import Noise
 from koopmpc.figures.comparisons import reconstruction
@@ -17,6 +16,7 @@ from koopmpc.papers.snyder.claims import Fits
 from koopmpc.papers.snyder.settings import FIGURES, VARIANTS, gains
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize
+from koopmpc.recording.page import Page
 
 OPENING = """\
 G. Snyder and Z. Song, *Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Complex, Float
 
-from koopmpc.bench.page import Page
 from koopmpc.data.episodes import Episodes
 from koopmpc.figures.comparisons import reconstruction
 from koopmpc.figures.plane import eigenfunctions
@@ -20,6 +19,7 @@ from koopmpc.papers.reconstruction import Reconstruction, Setting, percent, rebu
 from koopmpc.papers.snyder.claims import Fits
 from koopmpc.papers.snyder.settings import OBSERVABLES, TARGET
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+from koopmpc.recording.page import Page
 
 CAUSES = """\
 Under LQR the state settles at (1, 0, π, 0). Its motion about that point has four eigenvalues of its own, and

@@ -4,7 +4,7 @@ import matplotlib.figure
 import pytest
 
 import koopmpc as km
-from koopmpc.bench.page import Page
+from koopmpc.recording.page import Page
 
 
 def test_a_report_holds_its_parts_in_order_and_its_pictures_beside_it(tmp_path):
