@@ -272,8 +272,11 @@ def explain(
 
 
 @app.command()
-def reproduce(paper: Annotated[str, typer.Argument(help="The paper: snyder.")], logs: Logs = Path("logs")) -> None:
-    """Reproduce a paper: its figures, its numbers, and a verdict on each of its claims."""
+def reproduce(
+    paper: Annotated[str, typer.Argument(help="Name of the paper, as snyder; a wrong one lists all.")],
+    logs: Logs = Path("logs"),
+) -> None:
+    """Reproduce a paper: its figures, its numbers, and a verdict on each claim; 1 where a required number is missed."""
     from time import perf_counter
 
     from koopmpc.papers.registry import find_paper, verdict_table
@@ -289,6 +292,8 @@ def reproduce(paper: Annotated[str, typer.Argument(help="The paper: snyder.")], 
         for path in (outcome.report, outcome.recording):
             out.print(Text(str(path)), soft_wrap=True)
         out.print(Text(f"done in {perf_counter() - start:.0f} s"))
+    if outcome.failed:
+        raise typer.Exit(1)
 
 
 for command in (sweeps.run, sweeps.bench, sweeps.report, sweeps.compare, sweeps.inspect, sweeps.replay):

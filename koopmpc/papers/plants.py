@@ -5,6 +5,7 @@ decomposition", 2021; the cart-pole with damping is that of Brunton & Kutz, "Dat
 2019, section 8.7.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -140,3 +141,52 @@ def inputs_of(data: Episodes, names: tuple[str, ...], K: ArrayLike, x_ref: Array
     target = checks.vector(x_ref, "x_ref", data.nx)
     known = [Episode(X=e.X, U=-(e.X[:-1] - target) @ matrix.T) for e in data]
     return Episodes(known, data.dt, data.states, names)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """ẋ = f(x, u(x)) from one start: X (T+1, nx), U (T+1, nu), and the cost so far J (T+1,) = ∫ l(x, u) dt."""
+
+    X: Float[np.ndarray, "T1 nx"]
+    U: Float[np.ndarray, "T1 nu"]
+    J: Float[np.ndarray, " T1"]
+
+    @property
+    def cost(self) -> float:
+        """J of the whole run."""
+        return float(self.J[-1])
+
+
+def closed_loop(
+    dynamics: Dynamics,
+    law: Callable[[ca.SX], ca.SX],
+    stage: Callable[[ca.SX, ca.SX], ca.SX],
+    x0: ArrayLike,
+    *,
+    dt: float,
+    seconds: float,
+) -> ClosedLoop:
+    """Integrate ẋ = f(x, u), J̇ = l(x, u) under the continuous feedback u = law(x).
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    law, stage
+        u(x) and l(x, u), in CasADi operations.
+    x0
+        (nx,).
+    dt
+        Sample time [s], of `SUBSTEPS` RK4 steps.
+    seconds
+        Length of the run [s].
+    """
+    nx = dynamics.nx
+    x, none = ca.SX.sym("x", nx + 1), ca.SX.sym("none", 0)
+    u = ca.SX(ca.vertcat(law(x[:nx])))
+    rate = ca.vertcat(right_side(dynamics)(x[:nx], u), stage(x[:nx], u))
+    F = RK4(SUBSTEPS).step(ca.Function("f", [x, none], [rate]), dt)
+    step_map = StepMap(F, dt, states=(*dynamics.states, "J"), inputs=())
+    found = step_map.rollout([*checks.array(x0, "x0", (nx,)), 0.0], np.empty((round(seconds / dt), 0)))
+    U = np.array(ca.Function("u", [x], [u]).map(len(found))(found.T)).T
+    return ClosedLoop(found[:, :nx], U, found[:, nx])

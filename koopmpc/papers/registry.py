@@ -1,20 +1,29 @@
-"""The papers that can be reproduced, and how their claims are judged.
+"""The papers that can be reproduced: what each says, how its claims are judged, and the page that is written.
 
-A paper is a folder here whose paper.py defines `paper`. docs/<name>.md is the report.md of its reproduction, and
-docs/<name>/ holds the pictures: copy both after a change.
+A paper is a module here, or a folder, that defines `paper`. docs/papers/ holds the pages and pictures that
+`koopmpc reproduce` writes: copy both after a change.
 """
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 from rich.table import Table
 
 from koopmpc.bench.table import plain_table
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
+from koopmpc.figures.plots import Plot, plots
+from koopmpc.recording.page import Page
+from koopmpc.recording.views.curves import record_curves
+
+PAPERS = ("snyder", "brunton")
+
+Tell = Callable[[str], None]  # is called with what runs now
 
 
 class Verdict(Enum):
@@ -27,53 +36,138 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a paper in our words: where it stands, the verdict, and the reason for it."""
+    """One claim of a paper in our words: where it stands, the verdict, and the reason for it, or our figure.
+
+    `required` claims are numbers that a correct library must reproduce: the command fails where one does not hold.
+    """
 
     where: str
     says: str
     verdict: Verdict
     why: str
+    required: bool = False
 
 
-def judged(where: str, says: str, *, holds: bool, why: str, in_part: bool = False) -> Claim:
+def judged(where: str, says: str, *, holds: bool, why: str, in_part: bool = False, required: bool = False) -> Claim:
     """Return the claim with its verdict: it holds, else it holds in part, else it does not hold."""
     verdict = Verdict.HOLDS if holds else Verdict.IN_PART if in_part else Verdict.FAILS
-    return Claim(where, says, verdict, why)
+    return Claim(where, says, verdict, why, required)
+
+
+def compared(where: str, paper: float, ours: float, spread: float, unit: str = "", digits: int = 6) -> Claim:
+    """Return the required claim that our figure is the paper's: |ours − paper| ≤ spread."""
+    says = f"{paper:.{digits}g} ± {spread:.2g}{unit and ' ' + unit}"
+    return judged(where, says, holds=abs(ours - paper) <= spread, why=f"{ours:.{digits + 1}g}", required=True)
 
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
     """Return a table with one line for each claim."""
     lines = plain_table(title, padding=(0, 1, 0, 0))
-    for heading in ("where", "claim", "verdict", "why"):
+    for heading in ("where", "the paper", "verdict", "ours, or why"):
         lines.add_column(heading)
     for claim in claims:
         lines.add_row(claim.where, claim.says, claim.verdict.value, claim.why)
     return lines
 
 
-PAPERS = ("snyder",)
+def verdicts(page: Page, claims: Sequence[Claim]) -> None:
+    """Add the same table to a page."""
+    page.table(
+        ("where", "the paper", "verdict", "ours, or why"),
+        [(c.where, c.says, f"**{c.verdict.value}**", c.why) for c in claims],
+    )
+
+
+def summary(claims: Sequence[Claim]) -> str:
+    """Return how many claims hold, hold in part and do not hold, as words."""
+    count = Counter(claim.verdict for claim in claims)
+    plural = {Verdict.HOLDS: "hold", Verdict.IN_PART: "hold in part", Verdict.FAILS: "do not hold"}
+    return ", ".join(f"{count[verdict]} {word}" for verdict, word in plural.items())
+
+
+def show(
+    page: Page, name: str, caption: str, dt: float, columns: Sequence[str], values: Mapping[str, np.ndarray]
+) -> None:
+    """Draw curves over time, a panel for each column and a line for each name; the recording gets them too.
+
+    Parameters
+    ----------
+    page
+        The page.
+    name, caption
+        Name of the picture's file, and what it shows; the caption is the title of the recording's tab.
+    dt
+        Sample time [s].
+    columns
+        Names with units.
+    values
+        By name, (T, columns) each; curves may differ in length.
+    """
+    drawn = [
+        Plot("time [s]", column, {curve: (dt * np.arange(len(X)), X[:, i]) for curve, X in values.items()})
+        for i, column in enumerate(columns)
+    ]
+    page.picture(name, caption, plots(drawn))
+    longest = max(len(X) for X in values.values())
+    held = {c: np.pad(X, ((0, longest - len(X)), (0, 0)), constant_values=np.nan) for c, X in values.items()}
+    page.curve(caption, dt, columns, held)
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """A paper done again: each claim with its verdict, and the paths of the report and of the recording."""
+    """A paper done again: each claim with its verdict, and the paths of the page and of the recording."""
 
     claims: tuple[Claim, ...]
     report: Path
     recording: Path
 
+    @property
+    def failed(self) -> tuple[Claim, ...]:
+        """The required claims that do not hold."""
+        return tuple(claim for claim in self.claims if claim.required and claim.verdict is not Verdict.HOLDS)
+
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper: its name and title, and the function that reproduces it.
+    """A paper: its name, its title, and the work that reproduces it.
 
-    `reproduce(folder, quick, progress)` writes report.md, the figures in the folder of the paper's name and one .rrd.
-    `quick` keeps every part but shortens what takes long; the tests use it. `progress` is called with what runs now.
+    Attributes
+    ----------
+    name, title
+        As in the command, and as a heading.
+    work
+        Called with a page, whether to be quick, and `progress`: adds tables, pictures and at least one curve to the
+        page, and returns the claims. A quick one keeps every part and shortens what takes long; the tests use it.
+    about
+        What the paper is, equations and settings first, in paragraphs with a blank line between them. The page then
+        begins with the title, these, and the table of all claims; without it the work writes the whole page.
     """
 
     name: str
     title: str
-    reproduce: Callable[[Path, bool, Callable[[str], None]], Reproduction]
+    work: Callable[[Page, bool, Tell], Sequence[Claim]]
+    about: str | None = None
+
+    def reproduce(self, folder: Path, quick: bool, progress: Tell) -> Reproduction:
+        """Write <name>.md, the pictures in the folder <name>, and <name>.rrd with all curves."""
+        page = Page(folder, beside=self.name)
+        claims = tuple(self.work(page, quick, progress))
+        if self.about is not None:
+            body, page.parts = page.parts, []
+            page.text(f"# {self.title}", *self.about.split("\n\n"))
+            page.text(f"`koopmpc reproduce {self.name}` writes this page. Of {len(claims)} claims {summary(claims)}.")
+            verdicts(page, claims)
+            page.parts += body
+        progress("page and recording")
+        written, recording = page.write(f"{self.name}.md"), folder / f"{self.name}.rrd"
+        record_curves(page.curves, recording, application=f"koopmpc-reproduce-{self.name}", page=page.words)
+        return Reproduction(claims, written, recording)
+
+
+def short(name: str, text: str | None, work: Callable[[Page, bool, Tell], Sequence[Claim]]) -> Paper:
+    """Return a paper whose title and opening are the docstring of its module, `text`."""
+    title, _, about = (text or name).partition("\n\n")
+    return Paper(name, title.rstrip("."), work, about)
 
 
 def find_paper(name: str) -> Paper:
@@ -86,4 +180,4 @@ def find_paper(name: str) -> Paper:
     """
     if name not in PAPERS:
         raise ProblemError(f"there is no paper {name!r}{nearest(name, PAPERS)}; there are {', '.join(PAPERS)}")
-    return import_module(f"koopmpc.papers.{name}.paper").paper
+    return import_module(f"koopmpc.papers.{name}").paper

@@ -12,7 +12,7 @@ from koopmpc.cli.app import app
 from koopmpc.papers import registry
 from koopmpc.papers.contest import ORACLE, costs
 from koopmpc.papers.reconstruction import percent
-from koopmpc.papers.registry import Claim, Paper, Reproduction, Verdict, find_paper, judged
+from koopmpc.papers.registry import Claim, Verdict, compared, find_paper, judged, short, show
 from koopmpc.papers.snyder.control import contest, predictions
 from koopmpc.papers.snyder.settings import SHAKINGS, all_settings
 
@@ -73,21 +73,28 @@ def test_an_unknown_paper_is_refused_and_the_nearest_is_suggested():
     assert "there is no paper 'nobody'" in result.output
 
 
-def test_the_command_prints_verdicts_and_paths(tmp_path, monkeypatch):
-    def reproduce(folder, quick, progress):
+@pytest.mark.parametrize(("ours", "code"), [(3.14, 0), (3.15, 1)])
+def test_the_command_prints_verdicts_and_paths_and_fails_where_a_required_number_is_missed(
+    tmp_path, monkeypatch, ours, code
+):
+    def work(page, quick, progress):
         assert not quick
         progress("working")
-        claims = (Claim("abstract", "it works", Verdict.IN_PART, "half of it"),)
-        return Reproduction(claims, folder / "report.md", folder / "x.rrd")
+        show(page, "curve", "A curve", 0.1, ("x",), {"a": np.zeros((5, 1)), "b": np.ones((3, 1))})
+        return [Claim("abstract", "it works", Verdict.FAILS, "half of it"), compared("π", 3.14159, ours, 0.005)]
 
+    paper = short("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
     monkeypatch.setattr(registry, "PAPERS", ("mine",))
-    monkeypatch.setattr(
-        registry, "import_module", lambda name: type("M", (), {"paper": Paper("mine", "Mine", reproduce)})
-    )
+    monkeypatch.setattr(registry, "import_module", lambda name: type("M", (), {"paper": paper}))
     result = CliRunner().invoke(app, ["reproduce", "mine", "--logs", str(tmp_path)])
-    assert result.exit_code == 0, result.output
-    for word in ("Mine", "it works", "holds in part", "half of it", "report.md", "x.rrd", "done in"):
+    assert result.exit_code == code, result.output
+    for word in ("Mine and yours", "it works", "does not hold", "half of it", "mine.md", "mine.rrd", "done in"):
         assert word in result.output
+    (page,) = tmp_path.glob("*/mine.md")
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# Mine and yours\n\nA paper of ours.\n\n`koopmpc reproduce mine`")
+    assert f"Of 2 claims {1 - code} hold, 0 hold in part, {1 + code} do not hold" in text
+    assert (page.parent / "mine" / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits():

@@ -10,7 +10,7 @@ from scipy.special import ellipk
 import koopmpc as km
 from koopmpc.papers.contest import ORACLE, Prediction
 from koopmpc.papers.plants import Pendulum, frequency
-from koopmpc.papers.registry import Verdict
+from koopmpc.papers.registry import Verdict, verdicts
 from koopmpc.papers.snyder import report, theory
 from koopmpc.papers.snyder.claims import of_figures, of_text
 from koopmpc.papers.snyder.paper import held_change, rebuilt
@@ -18,7 +18,7 @@ from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, g
 from koopmpc.recording import page as pages
 from koopmpc.recording.page import Page
 
-PAGE = Path(__file__).parents[2] / "docs" / "snyder.md"
+PAGE = Path(__file__).parents[2] / "docs" / "papers" / "snyder.md"
 # Relative reconstruction errors in %, computed independently: (setting, observables, full rank).
 KNOWN = {
     ("pendulum", "DMD", True): 1.11,
@@ -241,7 +241,7 @@ def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, 
     page = Page(tmp_path, beside="snyder")
     claims = of_figures(fits)
     report.opening(page, claims, 0.01, 10)
-    report.verdicts(page, claims)
+    verdicts(page, claims)
     report.numbers(page, settings, fits, claims)
     report.feedbacks(page)
     theory.frequencies(page, fits)

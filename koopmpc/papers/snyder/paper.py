@@ -1,23 +1,19 @@
 """Snyder & Song, "Koopman operator theory for nonlinear dynamic modeling using dynamic mode decomposition", 2021."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 from koopmpc.papers.reconstruction import Reconstruction, Setting
-from koopmpc.papers.registry import Paper, Reproduction
+from koopmpc.papers.registry import Claim, Paper, Tell, verdicts
 from koopmpc.papers.snyder import control, report, theory
 from koopmpc.papers.snyder.claims import Fits, of_figures, of_text
 from koopmpc.papers.snyder.settings import OBSERVABLES, SHAKINGS, TASKS, all_settings
 from koopmpc.recording.page import Page
-from koopmpc.recording.views.curves import record_curves
 
 RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine
 
 
-def reproduce(folder: Path, quick: bool, progress: Callable[[str], None]) -> Reproduction:
-    """Write the report, the figures and the recording into `folder`; `quick` shortens what takes long."""
-    page = Page(folder, beside="snyder")
+def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
+    """Fill the page and return all claims; `quick` shortens what takes long."""
     progress("trajectories and their reconstructions")
     others = 3 if quick else 10
     settings = all_settings(others)
@@ -37,7 +33,8 @@ def reproduce(folder: Path, quick: bool, progress: Callable[[str], None]) -> Rep
     said = of_text(fits, causes["DMD on x − x_ref"].error, predicted, control.ratios(runs))
     shown = of_figures(fits)
     report.opening(page, [*said, *shown], change, others)
-    report.verdicts(page, said)
+    page.text("## What the paper says in words")
+    verdicts(page, said)
     report.numbers(page, settings, fits, shown)
     report.pictures(page, settings, fits)
     report.appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
@@ -48,10 +45,7 @@ def reproduce(folder: Path, quick: bool, progress: Callable[[str], None]) -> Rep
     theory.failure(page, settings["cart-pole-lqr"], causes)
     control.inputs(page, predicted, exciting)
     control.loops(page, tasks, runs, length["episodes"])
-    progress("report and recording")
-    written, recording = page.write(), folder / "snyder.rrd"
-    record_curves(page.curves, recording, application="koopmpc-reproduce-snyder", page=page.words)
-    return Reproduction((*said, *shown), written, recording)
+    return [*said, *shown]
 
 
 def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
@@ -68,4 +62,4 @@ def held_change(settings: dict[str, Setting], fits: Fits) -> float:
     return max(changes)
 
 
-paper = Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", reproduce)
+paper = Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", work)

@@ -1,6 +1,5 @@
 """The report on Snyder & Song (2021): what the paper left open, its claims, its figures and their numbers."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from koopmpc.figures.comparisons import reconstruction
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.papers.plants import Pendulum, inputs_of, trajectories
 from koopmpc.papers.reconstruction import Reconstruction, Setting, percent, relative, unwarned
-from koopmpc.papers.registry import Claim, Verdict
+from koopmpc.papers.registry import Claim, summary
 from koopmpc.papers.snyder.claims import Fits
 from koopmpc.papers.snyder.settings import FIGURES, VARIANTS, gains
 from koopmpc.plants.integrators import RK4
@@ -78,23 +77,12 @@ def opening(page: Page, claims: Sequence[Claim], change: float, others: int) -> 
     others
         Number of held-out trajectories.
     """
-    count = Counter(claim.verdict for claim in claims)
-    plural = {Verdict.HOLDS: "hold", Verdict.IN_PART: "hold in part", Verdict.FAILS: "do not hold"}
-    summary = ", ".join(f"{count[verdict]} {word}" for verdict, word in plural.items())
     page.text(
         "# Snyder & Song 2021, done again",
-        OPENING.format(total=len(claims), summary=summary),
+        OPENING.format(total=len(claims), summary=summary(claims)),
         SETTINGS,
         FEEDBACK.format(change=percent(change)),
         MEASURES.format(others=others),
-    )
-
-
-def verdicts(page: Page, claims: Sequence[Claim]) -> None:
-    """Add the claims of abstract, results and discussion."""
-    page.text("## What the paper says in words")
-    page.table(
-        ("where", "claim", "verdict", "why"), [(c.where, c.says, f"**{c.verdict.value}**", c.why) for c in claims]
     )
 
 
