@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.table import Table
 
 from koopmpc.bench.table import plain_table
@@ -21,8 +22,9 @@ from koopmpc.figures.plots import Plot, plots
 from koopmpc.recording.page import Page
 from koopmpc.recording.views.curves import record_curves
 
-PAPERS = ("snyder", "brunton")
+PAPERS = ("snyder", "brunton", "proctor", "williams")
 
+_ROUNDING = 1e-10
 Tell = Callable[[str], None]  # is called with what runs now
 
 
@@ -54,10 +56,17 @@ def judged(where: str, says: str, *, holds: bool, why: str, in_part: bool = Fals
     return Claim(where, says, verdict, why, required)
 
 
-def compared(where: str, paper: float, ours: float, spread: float, unit: str = "", digits: int = 6) -> Claim:
-    """Return the required claim that our figure is the paper's: |ours − paper| ≤ spread."""
-    says = f"{paper:.{digits}g} ± {spread:.2g}{unit and ' ' + unit}"
-    return judged(where, says, holds=abs(ours - paper) <= spread, why=f"{ours:.{digits + 1}g}", required=True)
+def compared(where: str, paper: ArrayLike, ours: ArrayLike, spread: float, unit: str = "", digits: int = 6) -> Claim:
+    """Return the required claim that our figure is the paper's: |ours − paper| ≤ spread, entry by entry."""
+    says = f"{written(paper, digits)} ± {spread:.2g}{unit and ' ' + unit}"
+    gap = float(np.abs(np.asarray(ours) - np.asarray(paper)).max())
+    return judged(where, says, holds=gap <= spread, why=f"{written(ours, digits + 1)}, off by {gap:.1g}", required=True)
+
+
+def written(values: ArrayLike, digits: int) -> str:
+    """Return a number, a vector or a matrix as text; what is below 1e-10 is rounding, and is written as 0."""
+    rows = np.atleast_2d(np.where(np.abs(values) < _ROUNDING, 0.0, values))
+    return "; ".join(" ".join(f"{float(value):.{digits}g}" for value in row) for row in rows)
 
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:

@@ -8,7 +8,7 @@ import pytest
 from koopmpc.papers.registry import PAPERS, Verdict, find_paper
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
-QUICK = ("brunton",)
+QUICK = ("brunton", "proctor", "williams")
 
 
 @pytest.mark.parametrize("name", QUICK)
