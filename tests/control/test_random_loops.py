@@ -26,6 +26,17 @@ def test_a_sample_of_random_loops() -> None:
     assert np.quantile(np.concatenate([one.iterations for one in outcomes]), 0.99) <= 200
 
 
+# Limits of no width with rates and blocks; an unstable plant that is lost, 1e3 to 1e6 widths beyond its soft limits;
+# slacks without a quadratic price; hard limits: where interior points end short of a solution.
+HARD = [165, 13, 641, 700]
+
+
+@pytest.mark.parametrize("seeds", [HARD, pytest.param(range(1000), marks=pytest.mark.slow)], ids=["hard", "1000"])
+def test_random_loops_of_bilinear_mpc(seeds, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("koopmpc.plants.compiled.compiler", lambda: None)  # a loop is shorter than its compilation
+    good(outcomes_of(seeds, bilinear=True))
+
+
 @pytest.mark.slow
 def test_ten_thousand_random_loops() -> None:
     outcomes = outcomes_of(range(10_000), 2)

@@ -75,9 +75,12 @@ def test_on_a_linear_plant_all_features_are_koopman_mpc(kind, mix):
         x = model.A @ x + model.B @ u
 
 
-def test_the_program_with_rates_is_that_of_cvxpy():
+@pytest.mark.parametrize("most", [100, 0])
+def test_the_program_with_rates_is_that_of_cvxpy(most, monkeypatch):
+    """By interior points, and by the active-set method that finishes what they do not."""
     import cvxpy as cp
 
+    monkeypatch.setattr("koopmpc.control.nonlinear.iteration.MOST", most)
     cost = km.Cost(Q=[1, 2, 1], R=[0.3, 0.2], R_delta=[0.5, 0.1], Q_N=[4, 3, 2], u_target="zero")
     limits = km.Limits(**BOX, du_max=0.25, du_slack=(0.1, 2.0), x_max=[np.inf, 0.1, np.inf], slack=(5.0, 1.0))
     x0, u0 = np.array([0.5, -0.1, 0.3]), np.array([0.3, -0.2])

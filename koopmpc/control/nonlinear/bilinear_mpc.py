@@ -61,8 +61,8 @@ class BilinearMPC(StagedMPC):
     given equations, the free motion.
 
     A Riccati recursion solves the program; where that plan breaks a limit, an interior-point method does whose steps
-    are Riccati recursions. Where changes of the inputs count, or moves are blocked, the changes are the inputs of the
-    program, and the last input is part of its state.
+    are Riccati recursions, and where that ends early DAQP, on the condensed program. Where changes of the inputs
+    count, or moves are blocked, the changes are the inputs of the program, and the last input is part of its state.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
@@ -167,6 +167,7 @@ class BilinearMPC(StagedMPC):
         deadline: float,
     ) -> StagePlan:
         iteration = self._iteration
+        iteration.multipliers = None
         if self._with_rates:
             iteration.low[0, : self.nu], iteration.high[0, : self.nu] = first
         status, iterations = Status.FAILED, 0

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.limits import Interval
+from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.condensed import Stages, least_deviation
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
@@ -25,7 +26,7 @@ from koopmpc.control.nonlinear.stagewise import (
 )
 from koopmpc.plants.compiled import Routine
 
-MOST = 300  # interior-point steps
+MOST = 100  # interior-point steps, before an active-set method finishes the program
 STALLED, CENTRING = 5, 0.3  # steps without half the μ, then one aims at this share of μ for every pair
 # Of spans for distances, of the curvature along an input's span for μ and what is left of residuals: what is aimed
 # at, and what is good enough where large weights of slacks leave no digits for more.
@@ -64,6 +65,10 @@ class RealTimeIteration:
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides, cost, R = sides(problem), plan_cost(problem), weights(problem)
+        linear, quadratic, allowance = problem.softness
+        none = np.zeros(nu)  # half of the prices, as of the cost
+        prices = [np.full(nu, np.inf), 0.5 * linear], [none, 0.5 * quadratic], [none, allowance]
+        self._softness = Softness(*(np.concatenate(pair) for pair in prices))
         self._sizes, self._input_sizes = problem.sizes, problem.input_sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
         free = unconstrained(sweeps, R)
@@ -80,6 +85,7 @@ class RealTimeIteration:
         self._allowance = problem.softness.allowance[soft - nu]
         self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
+        self.multipliers: Float[np.ndarray, " m"] | None = None  # of a program that the active-set method has finished
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
@@ -92,7 +98,7 @@ class RealTimeIteration:
         self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
         self._next, after = _views([each.shape for each in state])
         plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta]
-        self._A = A
+        self._A, self._stages = A, Stages(A, B, Q, problem.R, self._G, problem.free)
         self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
         self._simulate = Routine(simulate, [*self._ahead, self.theta], [self._trial], compiles=compiles_model)
         self._linearise = Routine(linearise, plan, [A, B, F, Q, q, r, self._g, self._G], compiles=compiles_model)
@@ -104,8 +110,6 @@ class RealTimeIteration:
         self._free = Routine(free, stages, [self._dX, self._dU, curvature])
         self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
         self._centring = zeros(1)
-        held = nu + problem.with_rates * (nu + len(problem.soft_rates))  # limits of inputs and rates, never in conflict
-        self._hard_states = bool((self._sides.row[: ns - nsoft] >= held).any())
         self._interior = interior and Routine(
             interior, [*stages, self._G, self._d, self._centring, *state], [*after, self._measures]
         )
@@ -182,9 +186,16 @@ class RealTimeIteration:
         return float(self._cost(self.X.T, self.U.T, self._R.T, self._U_r.T, *(each.T for each in self._terminal)))
 
     def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> StageStep:
-        """Follow the central path from the unconstrained solution."""
+        """Follow the central path from the unconstrained solution; where it ends early, an active-set method finishes.
+
+        Interior points have nowhere to go between two equal limits; and they end early where a plant is lost, some
+        slacks being 1e6 times as large as others. The next programs of the same step are then finished so at once.
+        """
         s = self._sides
         rows = s.row
+        unlimited = self._dX.copy(), self._dU.copy()
+        if self.multipliers is not None or not self._roomy():
+            return self._finished(free, *unlimited, deadline, 0)
         bound = np.where(s.sign > 0, self.low[:, rows], self.high[:, rows])
         self._d[:] = s.sign * (y[:, rows] - bound) / s.span
         distance = s.sign * (free[:, rows] - bound) / s.span
@@ -200,7 +211,7 @@ class RealTimeIteration:
             self._lam[:, hard:] = self._nu[:] = 0.5 * price
             self._lam[:, :hard] = 0.5 * float(price.mean()) * start / self._t[:, :hard]
         left, initial = 1.0, max(worst, float(self._lam.max()) / unit)
-        iterations, mu, best, since, enough, status = 0, np.inf, np.inf, 0, False, Status.MAX_ITERATIONS
+        iterations, mu, best, since, enough = 0, np.inf, np.inf, 0, False
         assert self._interior is not None, "there are limits"
         while iterations < MOST:
             if perf_counter() > deadline:
@@ -211,8 +222,7 @@ class RealTimeIteration:
             iterations += 1
             length = float(self._measures[1])
             if not (np.isfinite(self._measures).all() and np.isfinite(self._next).all()):
-                status = Status.FAILED
-                break  # with the iterate before
+                break
             self._now[:] = self._next
             left *= 1 - length
             mu = float(np.vdot(self._t, self._lam) + np.vdot(self._eps, self._nu)) / (self._t.size + self._eps.size)
@@ -223,10 +233,34 @@ class RealTimeIteration:
             if precise or length < STUCK or (enough and since):
                 break
         if enough:
-            status = Status.OPTIMAL
-        elif self._hard_states and left * worst > 1e-6:
-            status = Status.INFEASIBLE
-        return StageStep(self._dX, self._dU, self._eps * s.span[hard:], status, iterations)
+            return StageStep(self._dX, self._dU, self._eps * s.span[hard:], Status.OPTIMAL, iterations)
+        return self._finished(free, *unlimited, deadline, iterations)
+
+    def _finished(
+        self,
+        free: Float[np.ndarray, "N nq"],
+        dX: Float[np.ndarray, "N nx"],
+        dU: Float[np.ndarray, "N nu"],
+        deadline: float,
+        iterations: int,
+    ) -> StageStep:
+        """Return the solution by an active-set method; (δX, δU) is the one without limits, `free` its values."""
+        s = self._sides
+        room = Interval(self.low - free, self.high - free)
+        found = least_deviation(self._stages, room, self._softness, self.multipliers, deadline - perf_counter())
+        if found is None:
+            return StageStep(dX, dU, np.zeros_like(self._eps), Status.FAILED, iterations)
+        self.multipliers = found.multipliers if found.status is Status.OPTIMAL else None
+        self._dX[:], self._dU[:] = dX + found.X, dU + found.U
+        moved = np.concatenate([found.U, np.matmul(found.X[:, None, :], self._G)[:, 0]], axis=1)
+        rows, sign = s.row[len(s.row) - s.soft :], s.sign[len(s.row) - s.soft :]
+        past = np.where(sign > 0, room.low[:, rows] - moved[:, rows], moved[:, rows] - room.high[:, rows])
+        return StageStep(self._dX, self._dU, np.maximum(past, 0.0), found.status, iterations + found.iterations)
+
+    def _roomy(self) -> bool:
+        """Return whether there is room between all hard limits, without which there is no interior."""
+        hard = self._sides.row[: len(self._sides.row) - self._sides.soft]
+        return bool((self.low[:, hard] < self.high[:, hard]).all())
 
     def _quantities(self) -> Float[np.ndarray, "N nq"]:
         return np.concatenate([self.U, self._g], axis=1)
