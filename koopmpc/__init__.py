@@ -86,6 +86,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.lifting.state import State as State
     from koopmpc.loop import faults as faults
     from koopmpc.loop.metrics import metrics as metrics
+    from koopmpc.loop.realtime import realtime as realtime
     from koopmpc.loop.run import Run as Run
     from koopmpc.loop.simulate import simulate as simulate
     from koopmpc.plants.black_box import black_box as black_box

@@ -1,4 +1,4 @@
-"""The closed loop: simulate, Run, metrics, faults."""
+"""The closed loop: simulate, realtime, Run, metrics, faults."""
 
 from typing import TYPE_CHECKING
 
@@ -6,6 +6,7 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.loop.metrics import Metrics as Metrics
+    from koopmpc.loop.realtime import Paced as Paced
     from koopmpc.loop.run import Plans as Plans
     from koopmpc.loop.run import Step as Step
 else:

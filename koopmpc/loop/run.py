@@ -34,6 +34,7 @@ class Step:
     reference_next: Float[np.ndarray, " nr"] | None = None
     u_reference: Float[np.ndarray, " nu"] | None = None
     look_ahead: Callable[[], Plan | None] | None = None
+    own: bool = False  # nobody writes into its arrays again, so that an observer may keep them
 
     @property
     def plan(self) -> Plan | None:

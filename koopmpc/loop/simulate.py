@@ -25,7 +25,8 @@ Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
 StepObserver = Callable[[Step], None]
 
 
-_CONTROLLER = (
+CONTROLLER = ("dt", "nu", "horizon", "reset", "__call__")
+HOW = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
     "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller"
 )
@@ -110,7 +111,7 @@ def simulate(
     """
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
-    checks.members(controller, "the controller", ("dt", "nu", "horizon", "reset", "__call__"), _CONTROLLER)
+    checks.members(controller, "the controller", CONTROLLER, HOW)
     if not isinstance(plant, StepMap):
         require_plant(plant)
     if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
@@ -119,7 +120,7 @@ def simulate(
     nx, nu, N = len(states), controller.nu, controller.horizon
     if nu != len(inputs):
         raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(inputs)} ({inputs})")
-    rows = _rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
+    rows = rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
     nr = rows.shape[1] if cost is None else cost.of.bind(states).nz
     if rows.shape[1] != nr:
         raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
@@ -133,7 +134,7 @@ def simulate(
     metadata = {"controller": type(controller).__name__, **(metadata or {})}
     W = None
     if measured is not None:
-        W = _rows_ahead(measured, "measured", "nw", steps, N, "steps")
+        W = rows_ahead(measured, "measured", "nw", steps, N, "steps")
         metadata["measured"] = W[:steps].tolist()
     if isinstance(plant, StepMap):
         if x0 is None:
@@ -141,7 +142,7 @@ def simulate(
         state = checks.array(x0, "x0", (nx,))
         first = plant.measure(state)
     else:
-        first, state = _reading(plant.reset(x0, rng), None, 0), plant.state
+        first, state = reading(plant.reset(x0, rng), None, 0), plant.state
     ny, model = len(first), predictor_of(controller)
     noisy = _noise(noise, steps, ny)
     if state is not None and np.shape(state) != (nx,):
@@ -171,7 +172,7 @@ def simulate(
     found, plan, ended = None, None, ""
     fallible = controller if isinstance(controller, Fallible) else None
     look_ahead: Callable[[], Plan | None] | None = getattr(controller, "plan", None)
-    shape, applied, end = (nu,), None, steps
+    applied, end = None, steps
     if state is not None:
         X[0] = state
     Y[0] = y = sensed(0, first) if spoilt else first
@@ -202,14 +203,7 @@ def simulate(
         finally:
             if failing is not None:
                 failing.solver_fails = False
-        if type(move) is not Move:
-            checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
-        u = np.asarray(move.u, dtype=np.float64)
-        if u.shape != shape:
-            raise ShapeError(f"the controller returned u of shape {u.shape} at step {k}, expected ({nu},)")
-        for value in u.tolist():  # for a few inputs four times as fast as numpy
-            if not isfinite(value):
-                raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
+        u = checked_input(move, nu, k)
         if broken is not None:
             u = np.array(broken.applied(k, u), dtype=np.float64)
         U[k] = u
@@ -226,7 +220,7 @@ def simulate(
             y = x.copy() if seen else plant.measure(x)
         else:
             pushed = () if push is None else (push,)  # of a SimulatedPlant alone
-            y = _reading(plant.step(u.copy(), *pushed), ny, k + 1)
+            y = reading(plant.step(u.copy(), *pushed), ny, k + 1)
             u = U[k].copy()  # the controller may keep the other one
             if (state := plant.state) is not None:
                 X[k + 1] = state
@@ -283,7 +277,7 @@ def simulate(
     )
 
 
-def _reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
+def reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
     """Return what a plant measured at step k as an array of its own."""
     try:
         y = None if value is None else np.array(value, dtype=np.float64)
@@ -297,6 +291,19 @@ def _reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
         expected = "(ny,)" if ny is None else f"({ny},), as at reset"
         raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
     return y
+
+
+def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
+    """Return the input of what a controller returned at step k; raise where that is no Move, or u not finite."""
+    if type(move) is not Move:
+        checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
+    u = np.asarray(move.u, dtype=np.float64)
+    if u.shape != (nu,):
+        raise ShapeError(f"the controller returned u of shape {u.shape} at step {k}, expected ({nu},)")
+    for value in u.tolist():  # for a few inputs four times as fast as numpy
+        if not isfinite(value):
+            raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
+    return u
 
 
 def _same(plan: Plan) -> Plan:
@@ -314,7 +321,7 @@ def predictor_of(controller: object) -> Predictor | None:
     return next((each for each in held if isinstance(each, Predictor)), None)
 
 
-def _rows_ahead(
+def rows_ahead(
     values: ArrayLike, name: str, columns: str, count: int, horizon: int, counted: str
 ) -> Float[np.ndarray, "T n"]:
     """Return `count` rows of a signal that is previewed, and after them `horizon` copies of the last one."""

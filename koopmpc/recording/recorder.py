@@ -202,7 +202,7 @@ class Recorder:
         """Queue a copy of one step for each writer; this returns within microseconds."""
         if not self._open:
             raise DataError("the Recorder is not open; call it inside `with Recorder(...) as recorder:`")
-        own = _copied(step)
+        own = step if step.own else _copied(step)
         for writer in self._writers.values():
             writer.put(own)
 

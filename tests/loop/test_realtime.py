@@ -1,0 +1,273 @@
+"""realtime: a paced loop on a plant in another process, that stalls or dies; late steps, signals, and its log."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from tests.loop.socket_plant import SocketPlant, inputs_in, started
+
+ROOT = Path(__file__).parents[2]
+DT = 0.02
+
+
+class Toward:
+    """u = r + (r − p) − v, which holds p at r; before call n it calls at[n]."""
+
+    nu, horizon = 1, 3
+
+    def __init__(self, dt=DT, at=None):
+        self.dt, self.at, self.calls, self.ahead = dt, at or {}, 0, []
+
+    def reset(self, x0=None, u_prev=None):
+        self.calls = 0
+
+    def __call__(self, y, reference, applied=None, w=None):
+        self.at.get(self.calls, int)()
+        self.ahead.append(reference[:, 0].tolist())
+        self.calls += 1
+        u = np.array([2.0 * reference[0, 0] - y.sum()])
+        return km.Move(u, km.Status.OPTIMAL, km.control.Fallback.NONE, 1e-5, 1)
+
+
+class Here:
+    """A plant of this process that notes what it gets: y counts the inputs."""
+
+    states = outputs = ("n",)
+    inputs = ("u [N]",)
+    state = None
+
+    def __init__(self, dt=DT):
+        self.dt, self.got = dt, []
+
+    def reset(self, x0, rng):
+        return [0.0]
+
+    def step(self, u):
+        self.got.append(float(u[0]))
+        return [float(len(self.got))]
+
+
+class Counting(Toward):
+    """u = 1, 2, 3, …"""
+
+    def __call__(self, y, reference, applied=None, w=None):
+        move = super().__call__(np.zeros(2), reference)
+        move.u[:] = self.calls
+        return move
+
+
+def names(plant):
+    return {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs}
+
+
+def test_a_plant_in_another_process_is_brought_to_its_reference_and_gets_the_safe_input_last(tmp_path):
+    log = tmp_path / "run.rrd"
+    with started(tmp_path) as (_, port, heard), closing(SocketPlant(port, DT)) as plant:
+        with km.Recorder(log, **names(plant)) as recorder:
+            paced = km.realtime(
+                Toward(),
+                plant,
+                dt=DT,
+                x0=[0, 0],
+                reference=[1, 0],
+                steps=120,
+                recorder=recorder,
+                watchdog=20,
+                safe=0.25,
+            )
+        given = inputs_in(heard)
+    run = km.load_run(log)
+    measured = np.isfinite(run.Y[:-1, 0])
+    assert paced.ended == "done"
+    assert paced.steps + paced.skipped == 120
+    assert abs(run.Y[:-1][measured][-1, 0] - 1.0) < 0.2
+    assert given[-1] == ("stop", 0.25)
+    assert [value for _, value in given[: run.steps - paced.skipped]] == run.U[measured, 0].tolist()
+
+
+def test_a_plant_that_stalls_gets_the_safe_input_and_the_loop_ends(tmp_path):
+    with started(tmp_path) as (process, port, heard), closing(SocketPlant(port, DT)) as plant:
+        stall = Toward(at={25: lambda: process.send_signal(signal.SIGSTOP)})
+        paced = km.realtime(stall, plant, dt=DT, x0=[0, 0], reference=[1, 0], watchdog=0.4, safe=-0.5)
+        process.send_signal(signal.SIGCONT)
+        deadline = time.monotonic() + 10
+        while time.monotonic() < deadline and inputs_in(heard)[-1] != ("stop", -0.5):
+            time.sleep(0.05)
+        assert inputs_in(heard)[-1] == ("stop", -0.5)
+    assert paced.ended == "watchdog: the plant did not return within 0.4 s"
+
+
+def test_a_plant_that_dies_ends_the_loop_and_its_log_is_complete(tmp_path):
+    log = tmp_path / "run.rrd"
+    with started(tmp_path) as (process, port, _), closing(SocketPlant(port, DT)) as plant:
+        end = Toward(at={30: process.kill})
+        with km.Recorder(log, **names(plant)) as recorder:
+            paced = km.realtime(end, plant, dt=DT, x0=[0, 0], reference=[1, 0], recorder=recorder, watchdog=20)
+    assert paced.ended.startswith(("plant: ConnectionError", "plant: BrokenPipeError", "plant: ConnectionResetError"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = km.load_run(log)
+    assert abs(run.steps - paced.steps - paced.skipped) <= 1
+
+
+LOOP = """
+import sys
+import koopmpc as km
+from tests.loop.socket_plant import SocketPlant
+from tests.loop.test_realtime import DT, Toward, names
+plant = SocketPlant(int(sys.argv[1]), DT)
+with km.Recorder(sys.argv[2], **names(plant)) as recorder:
+    print("up", flush=True)
+    print(km.realtime(Toward(), plant, dt=DT, x0=[0, 0], reference=[1, 0], recorder=recorder, watchdog=20, safe=0.125))
+"""
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL]
+)
+def test_the_log_is_whole_up_to_its_last_flush_whatever_ends_the_process(tmp_path, number):
+    log = tmp_path / "run.rrd"
+    restored = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    with started(tmp_path) as (_, port, heard):
+        process = subprocess.Popen(
+            [sys.executable, "-c", restored + LOOP, str(port), str(log)],
+            cwd=ROOT,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout.readline() == "up\n"
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and (not heard.exists() or len(inputs_in(heard)) < 60):
+            time.sleep(0.05)
+        process.send_signal(number)
+        said = process.stdout.read()
+        code = process.wait(60)
+        process.stdout.close()
+        given = [value for kind, value in inputs_in(heard) if kind == "u"]
+        stopped = inputs_in(heard)[-1]
+    if number == signal.SIGKILL:
+        assert code == -signal.SIGKILL
+        with pytest.warns(UserWarning, match="ends after step"):
+            run = km.load_run(log)
+        assert run.steps > 20  # the others came after the last flush
+    else:
+        assert code == 0
+        assert f"ended: {number.name}" in said
+        assert stopped == ("stop", 0.125)
+        run = km.load_run(log)
+        assert run.steps >= len(given) - 1
+    logged = run.U[np.isfinite(run.Y[:-1, 0]), 0].tolist()
+    assert logged == given[: len(logged)]
+
+
+@pytest.mark.parametrize("policy", ["skip", "hold"])
+def test_a_late_step_is_counted_and_its_input_is_applied_late_or_not_at_all(tmp_path, policy):
+    dt, plant = 0.2, Here(0.2)
+    with km.Recorder(tmp_path / "run.rrd", **names(plant)) as recorder:
+        paced = km.realtime(
+            Counting(dt, {3: lambda: time.sleep(2.5 * dt)}),
+            plant,
+            dt=dt,
+            reference=[0.0],
+            steps=9,
+            late=policy,
+            recorder=recorder,
+        )
+    run = km.load_run(tmp_path / "run.rrd")
+    late = {"skip": 4.0, "hold": 3.0}[policy]
+    assert plant.got == [1.0, 2.0, 3.0, late, 5.0, 6.0, 7.0, 0.0]
+    assert (paced.steps, paced.late, paced.skipped, paced.held) == (7, 1, 2, int(policy == "hold"))
+    assert run.U[:, 0].tolist() == [1.0, 2.0, 3.0, late, late, late, 5.0, 6.0, 7.0]
+    assert np.flatnonzero(np.isnan(run.Y[:, 0])).tolist() == [4, 5]
+    assert [k for k in range(9) if run.status[k] is km.Status.TIME_LIMIT] == [4, 5]
+    assert {run.fallback[k] for k in (4, 5)} == {km.control.Fallback.HOLD}
+
+
+def test_a_step_reads_when_it_begins_and_sees_the_rows_of_its_time():
+    class Reading(Here):
+        def read(self):
+            return [100.0 + len(self.got)]
+
+        def step(self, u):
+            super().step(u)
+
+    seen, controller = [], Toward()
+    km.realtime(
+        controller, Reading(), dt=DT, reference=[[1.0], [2.0], [3.0]], steps=4, watchdog=20, recorder=seen.append
+    )
+    rows = [1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]
+    assert [step.y[0] for step in seen if np.isfinite(step.y[0])] == [100.0 + i for i in range(controller.calls)]
+    assert controller.ahead == [rows[step.k : step.k + 4] for step in seen if np.isfinite(step.y[0])]
+
+
+def test_a_controller_that_never_returns_is_interrupted_and_the_plant_is_safe():
+    plant = Here()
+    paced = km.realtime(Toward(at={2: lambda: time.sleep(1e6)}), plant, dt=DT, reference=[0.0], watchdog=0.3, safe=9.0)
+    assert paced.ended == "watchdog: the controller did not return within 0.3 s"
+    assert paced.steps == 2
+    assert plant.got[2:] == [9.0]
+
+
+def test_what_a_controller_raises_is_raised_when_the_plant_is_safe():
+    class Broken(Toward):
+        def __call__(self, y, reference, applied=None, w=None):
+            raise ZeroDivisionError
+
+    plant = Here()
+    with pytest.raises(ZeroDivisionError):
+        km.realtime(Broken(), plant, dt=DT, reference=[0.0], safe=9.0)
+    assert plant.got == [9.0]
+
+
+def test_a_plant_that_cannot_be_made_safe_is_named():
+    class Gone(Here):
+        def step(self, u):
+            raise OSError("the cable is out")
+
+    paced = km.realtime(Toward(), Gone(), dt=DT, reference=[0.0])
+    assert paced.ended.startswith("plant: OSError: the cable is out")
+    assert "the safe input did not reach it: OSError: the cable is out" in paced.ended
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"dt": 0.1}, r"the controller has dt = 0\.02 s, the loop 0\.1 s; use one dt for both"),
+        ({"late": "drop"}, r"late is 'drop'; pass \"skip\" or \"hold\""),
+        ({"safe": [0, 0]}, r"safe has shape \(2,\)"),
+        ({"steps": 0}, r"steps is 0"),
+        ({"watchdog": -1.0}, r"watchdog"),
+    ],
+)
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+def test_arguments_that_do_not_fit_say_so_before_the_plant_moves(wrong, message):
+    plant = Here()
+    with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=message):
+        km.realtime(Toward(), plant, **{"dt": DT, "reference": [0.0], **wrong})
+    assert plant.got == []
+
+
+def test_signals_and_switches_are_as_they_were():
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT), sys.getswitchinterval()
+    km.realtime(Toward(), Here(), dt=DT, reference=[0.0], steps=1)
+    assert before == (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT), sys.getswitchinterval())
+
+
+def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys):
+    (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "realtime.md").read_text(), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(source, {})
+    said = capsys.readouterr().out
+    assert said.startswith("stopped by u = [0.]\n300 steps, ") or " skipped" in said
+    assert km.load_run("rig.rrd").steps == 300
