@@ -8,7 +8,7 @@ PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --benchmark-disable
 TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
 
-.PHONY: bench test typed full mutants loops soak speed check format clean embedded
+.PHONY: bench test typed full mutants loops soak speed docs check format clean embedded
 
 bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
@@ -42,6 +42,10 @@ soak: $(VENV)/installed-dev
 embedded: $(VENV)/installed-dev
 	$(PINNED) $(BIN)/python -m tests.embedded.run
 
+# The site, into site/: strict, and without a network once the tools are installed.
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(PINNED) $(BIN)/mkdocs build --strict --quiet
+
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -53,7 +57,7 @@ format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .benchmarks .coverage dist build
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .benchmarks .coverage dist build site
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
@@ -64,4 +68,8 @@ $(VENV)/installed: $(VENV)/bin/python pyproject.toml constraints.txt
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(PIP) -e ".[dev]"
+	touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(PIP) -e ".[docs]"
 	touch $@

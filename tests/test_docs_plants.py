@@ -1,35 +1,27 @@
-"""docs/plants.md runs as it stands, and does what it says."""
-
-import re
-from pathlib import Path
+"""The pages on plants from elsewhere run as they stand, and do what they say."""
 
 import numpy as np
 import pytest
 
 import koopmpc as km
-
-GYM, TANK = re.findall(
-    r"```python\n(.*?)```", (Path(__file__).parents[1] / "docs" / "plants.md").read_text(), re.DOTALL
-)
+from tests.docs.page import alike, blocks, run
 
 
-def test_a_gymnasium_plant_is_swung_up_in_fifteen_lines(tmp_path, monkeypatch):
+def test_a_gymnasium_plant_is_swung_up_in_fifteen_lines(tmp_path):
     pytest.importorskip("gymnasium", reason="the extra gym is not installed")
-    assert len([line for line in GYM.splitlines() if line.strip()]) <= 15
-    monkeypatch.chdir(tmp_path)
-    found: dict = {}
-    exec(GYM, found)
-    run = found["run"]
-    assert np.cos(run.X[-1, 0]) > 0.999
-    assert abs(run.X[-1, 1]) < 0.01
-    assert np.cos(run.X[0, 0]) < -0.999
-    assert np.abs(run.U).max() <= 2
-    assert km.load_run("gym.rrd") == run
+    (block,) = blocks("how/gymnasium.md")
+    assert len([line for line in block.source.splitlines() if line.strip()]) <= 15
+    swing = run("how/gymnasium.md", tmp_path)[0]["run"]
+    assert np.cos(swing.X[-1, 0]) > 0.999
+    assert abs(swing.X[-1, 1]) < 0.01
+    assert np.cos(swing.X[0, 0]) < -0.999
+    assert np.abs(swing.U).max() <= 2
+    assert km.load_run(tmp_path / "gym.rrd") == swing
 
 
-def test_a_tank_that_is_a_function_is_filled():
-    found: dict = {"km": km}
-    exec(TANK, found)
-    level = found["level"]
+def test_a_tank_that_is_a_function_is_filled(tmp_path):
+    names, (said,) = run("how/own_step_function.md", tmp_path)
+    assert alike(*said)
+    level = names["level"]
     assert abs(level.X[-1, 0] - 1.5) < 0.02
     assert 0 <= level.U.min() <= level.U.max() <= 0.1

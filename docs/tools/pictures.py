@@ -1,0 +1,281 @@
+"""The pictures of the site, drawn by the library: `python docs/tools/pictures.py [NAME…]` writes docs/pictures/."""
+
+import re
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import koopmpc as km
+from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, figure, legend, line, styled
+
+DOCS = Path(__file__).parents[1]
+
+
+def pendulum(episodes: int = 120) -> tuple[Any, Any, km.Episodes]:
+    """Return the problem `pendulum`, its plant, and data under a stabilising feedback with noise."""
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, dt=0.05)
+    pd = km.Feedback([[40, 15]], km.Noise(-20, 20), u_min=-25, u_max=25)
+    return problem, plant, km.collect(plant, km.Uniform([-1, -1], [1, 1]), pd, episodes=episodes, steps=60)
+
+
+def start() -> Any:
+    """The run of the start page: the pendulum swings up."""
+    names: dict[str, Any] = {"__name__": "page"}
+    for source in re.findall(r"```python\n(.*?)```", (DOCS / "start.md").read_text(), re.DOTALL):
+        exec(compile(source.partition("km.plot.save")[0], "start.md", "exec"), names)
+        if "run" in names:
+            break
+    return km.plot.run(names["run"], width="two columns")
+
+
+def house() -> Any:
+    """What each station of the house makes of a pendulum: data, a model, a forecast, a closed loop."""
+    _, plant, data = pendulum()
+    train, held_out = data.split(0.8, rng=0)
+    model = km.edmd(train, km.State() + km.Fourier(2, states="theta"))
+    cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    mpc = km.KoopmanMPC(model, cost, limits, horizon=40)
+    run = km.simulate(plant, mpc, x0=[0.8, 0], reference=[0, 0], steps=60, cost=cost, limits=limits)
+    made, axes = figure(1, 4, width="two columns", height=2.0)
+    plane, disk, ahead, loop = axes[0]
+    for episode in train[:40]:
+        plane.plot(*episode.X.T, color="#0072b2", linewidth=0.4, alpha=0.6)
+    plane.set(title="Episodes", xlabel="theta [rad]", ylabel="omega [rad/s]")
+    around = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    disk.plot(around.real, around.imag, **REFERENCE)
+    disk.plot(model.eigenvalues.real, model.eigenvalues.imag, "o", markersize=3, color="#d55e00")
+    disk.set(title="its model", xlabel="Re λ", ylabel="Im λ", aspect="equal", xlim=(0.6, 1.2), ylim=(-0.3, 0.3))
+    episode = held_out[0]
+    foretold = model.rollout(episode.X[0], episode.U[:20])
+    time = 0.05 * np.arange(21)
+    ahead.plot(time, episode.X[:21, 0], **TRUTH)
+    ahead.plot(time, foretold[:, 0], **line(1))
+    ahead.set(title="its forecast", xlabel="time [s]", ylabel="theta [rad]")
+    loop.plot(0.05 * np.arange(len(run.X)), run.X[:, 0], **line(0))
+    loop.axhline(0, **REFERENCE)
+    loop.set(title="Run", xlabel="time [s]", ylabel="theta [rad]")
+    return made
+
+
+def moments() -> Any:
+    """The error of a regression from sums of products and from a triangular factor, over the condition number."""
+    rng = np.random.default_rng(0)
+    conditions = 10.0 ** np.arange(1, 13)
+    errors: dict[str, list[float]] = {"sums of products": [], "triangular factor": []}
+    for condition in conditions:
+        U, V = np.linalg.qr(rng.normal(size=(2000, 8)))[0], np.linalg.qr(rng.normal(size=(8, 8)))[0]
+        Z, A = (U * condition ** -np.linspace(0, 1, 8)) @ V.T, rng.normal(size=(8, 8))
+        Y = Z @ A
+        found = (np.linalg.solve(Z.T @ Z, Z.T @ Y), np.linalg.lstsq(Z, Y, rcond=0)[0])
+        for name, solved in zip(errors, found, strict=True):
+            errors[name].append(float(np.linalg.norm(Z @ solved - Y) / np.linalg.norm(Y)))
+    made, axes = figure(1, 1, width="two columns", height=2.6)
+    (axis,) = axes[0]
+    for i, (name, found) in enumerate(errors.items()):
+        axis.loglog(conditions, found, label=name, **line(i, len(conditions)))
+    axis.axvline(1e6, **LIMIT)
+    axis.text(1.3e6, 1e-9, "the fit changes\nits route here", fontsize=8)
+    axis.set(xlabel="condition number of the scaled observables", ylabel="residual beyond the optimum, relative")
+    legend(made, [axis], 2)
+    return made
+
+
+def riccati_first() -> Any:
+    """Why the QP is not for the inputs: its condition number over the horizon; and how often there is no QP at all."""
+    problem, plant, data = pendulum()
+    local = km.LinearPredictor.local(plant, *problem.equilibrium)
+    A, B = local.A[:2, :2], local.B[:2]
+    gain = km.dlqr(A, B, [10, 1], [0.1])
+    horizons = range(5, 121, 5)
+    plain = []
+    for N in horizons:
+        powers = [np.eye(2)]
+        for _ in range(N):
+            powers.append(A @ powers[-1])
+        G = np.block([[powers[i - j] @ B if j <= i else np.zeros((2, 1)) for j in range(N)] for i in range(N)])
+        weights = np.kron(np.eye(N), np.diag([10.0, 1.0]))
+        weights[-2:, -2:] = gain.P
+        plain.append(np.linalg.cond(G.T @ weights @ G + 0.1 * np.eye(N)))
+    model = km.edmd(data, km.State() + km.Fourier(2, states="theta"))
+    cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    run = km.simulate(
+        plant, km.KoopmanMPC(model, cost, limits, horizon=40), x0=[0.8, 0], reference=[0, 0], steps=60, limits=limits
+    )
+    made, axes = figure(1, 2, width="two columns", height=2.6)
+    left, right = axes[0]
+    left.semilogy(horizons, plain, label="for the inputs", **line(1))
+    left.semilogy(horizons, np.ones(len(plain)), label="for the deviation from the Riccati plan", **line(0))
+    left.set(xlabel="horizon [steps]", ylabel="condition number of the QP")
+    solved = np.array([status is not km.Status.UNCONSTRAINED for status in run.status])
+    steps = np.arange(len(run.U))
+    right.step(steps, run.U[:, 0], where="post", color="#000000", linewidth=0.8)
+    right.plot(steps[solved], run.U[solved, 0], "o", markersize=4, color="#d55e00", label="a QP was solved")
+    right.plot(steps[~solved], run.U[~solved, 0], ".", markersize=3, color="#0072b2", label="one product of matrices")
+    right.axhline(-25, **LIMIT)
+    right.set(xlabel="step", ylabel="torque [N m]")
+    left.legend(fontsize=7)
+    right.legend(fontsize=7)
+    return made
+
+
+def terminal_cost() -> Any:
+    """Closed-loop cost over the horizon, with the default tail behind it and without one."""
+    _, plant, data = pendulum()
+    model = km.edmd(data, km.State() + km.Fourier(2, states="theta"))
+    limits = km.Limits(u_min=-25, u_max=25)
+    judged = km.Cost(Q=[10, 1], R=0.1)
+    horizons = [2, 4, 6, 8, 10, 14, 20, 30, 40]
+    best = None
+    made, axes = figure(1, 1, width="two columns", height=2.6)
+    (axis,) = axes[0]
+    for i, (name, tail) in enumerate({"with its tail, the default": None, "Q_N = Q: no tail": 0}.items()):
+        costs = []
+        for N in horizons:
+            mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1, tail=tail), limits, N)
+            run = km.simulate(plant, mpc, x0=[0.6, 0], reference=[0, 0], steps=150, cost=judged, limits=limits)
+            costs.append(km.metrics(run).cost)
+        best = best or min(costs)
+        axis.semilogy(horizons, np.array(costs) / best, label=name, **line(i, len(horizons)))
+    axis.set(xlabel="horizon [steps]", ylabel="cost in closed loop,\nover the least")
+    legend(made, [axis], 2)
+    return made
+
+
+def one_step_errors() -> Any:
+    """Two models of one pendulum: the better one after a step is useless after ten."""
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, dt=0.05)
+    swings = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=120, steps=40)
+    train, held_out = swings.split(0.5)
+    timid = km.collect(plant, km.Uniform([-0.2, -0.2], [0.2, 0.2]), km.Noise(-1, 1), episodes=60, steps=40)
+    circle = km.Fourier(2, states=["theta"])
+    good = km.edmd(train, km.State() + circle + circle * km.State(["omega"]))
+    bad = km.edmd(timid, km.State() + km.Monomials(5))
+    made, axes = figure(1, 2, width="two columns", height=2.6)
+    bars, curves = axes[0]
+    for i, (name, model) in enumerate({"sines and cosines": good, "monomials up to 5": bad}.items()):
+        bars.bar(i, model.report.residual[1], color=line(i)["color"], width=0.6)
+        score = km.score(model, held_out, horizon=12)
+        curves.semilogy(np.arange(1, 13), score.rmse[:, 1], label=name, **line(i, 12))
+    bars.set(ylabel="error after one step,\nits own data [rad/s]", xticks=[0, 1])
+    bars.set_xticklabels(["sines and\ncosines", "monomials\nup to 5"])
+    curves.set(xticks=range(0, 13, 3), xlabel="steps ahead", ylabel="error, held-out data [rad/s]")
+    legend(made, [curves], 2)
+    return made
+
+
+def choosing_by_closed_loop() -> Any:
+    """What models forecast, and what controllers on them cost: forecasts alone do not choose."""
+    problem = km.load_problem("cart_pole")
+    plant, training = km.discretize(problem.dynamics, problem.dt), problem.training
+    data = km.collect(plant, training.x0, training.excitation, episodes=60, steps=training.steps)
+    train, held_out = data.split(0.7, rng=0)
+    cost, limits = problem.cost, problem.limits
+    starts = [[0.0, 0.0, np.pi - 0.45, 0.0], [0.0, 0.0, np.pi + 0.3, 0.5], [-1.0, 0.0, np.pi, 0.0]]
+    best = sum(
+        _cost(plant, km.NonlinearMPC(plant, cost, limits, 40, solver="fatrop"), x0, cost, limits) for x0 in starts
+    )
+    waves = km.Fourier(1, states="theta")
+    families = {
+        "plain": [km.State(), km.State() + km.Constant()],
+        "monomials": [km.State() + km.Monomials(d) + km.Constant() for d in (2, 3)],
+        "sines": [km.State() + km.Fourier(h, states="theta") + km.Constant() for h in (1, 2, 3)],
+        "sines × states": [km.State() + waves + waves * km.State() + km.Constant()],
+        "radial": [km.State() + km.ThinPlate(_centers(train, c)) + km.Constant() for c in (20, 60)],
+    }
+    made, axes = figure(1, 1, width="two columns", height=3.0)
+    (axis,) = axes[0]
+    for i, (name, liftings) in enumerate(families.items()):
+        points = []
+        for lifting in liftings:
+            for ridge in (0.0, 1e-8, 1e-5, 1e-3):
+                model = km.edmd(train, lifting, ridge=ridge)
+                error = float(km.score(model, held_out, horizon=20).rmse[-1, 2])
+                mpc = km.KoopmanMPC(model, cost, limits, 40)
+                loops = sum(_cost(plant, mpc, x0, cost, limits) for x0 in starts)
+                points.append((error, min(loops / best, 100)))
+        axis.loglog(
+            *np.array(points).T, linestyle="none", marker=line(i, 8)["marker"], color=line(i)["color"], label=name
+        )
+    axis.set(xlabel="error of θ 20 steps ahead, held-out data [rad]", ylabel="cost in closed loop,\nover nonlinear MPC")
+    legend(made, [axis], 5)
+    return made
+
+
+def _cost(plant: Any, mpc: Any, x0: list[float], cost: km.Cost, limits: km.Limits) -> float:
+    """Return the cost of a run of the cart-pole to upright."""
+    mpc.reset()
+    return km.metrics(
+        km.simulate(plant, mpc, x0=x0, reference=[0, 0, np.pi, 0], steps=150, cost=cost, limits=limits)
+    ).cost
+
+
+def _centers(data: km.Episodes, count: int) -> np.ndarray:
+    """Return states of the data, drawn at random."""
+    X = data.snapshots().X
+    return X[np.random.default_rng(0).choice(len(X), count, replace=False)]
+
+
+def what_trust_means() -> Any:
+    """A forecast inside its band; and how many forecasts stay inside, of data like those and in closed loop."""
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, dt=0.05)
+    swings = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=120, steps=40)
+    train, held_out = swings.split(0.5)
+    circle = km.Fourier(2, states=["theta"])
+    model = km.edmd(train, km.State() + circle + circle * km.State(["omega"]))
+    band = km.validate.conformal(model, held_out[:40], horizon=12)
+    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-5, u_max=5), horizon=12)
+    runs = [
+        km.simulate(plant, mpc, x0=x0, reference=[0.5, 0], steps=40)
+        for x0 in np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    ]
+    loop = held_out.with_episodes([km.Episode(X=run.X, U=run.U) for run in runs])
+    time = 0.05 * np.arange(1, 13)
+    made, axes = figure(1, 2, width="two columns", height=2.6, sharey=True)
+    for axis, (title, episodes) in zip(
+        axes[0], {"inputs as in the data": held_out[40:], "in closed loop": loop}.items(), strict=True
+    ):
+        share = []
+        for episode in episodes:
+            for k in range(0, 28, 9):
+                off = episode.X[k + 1 : k + 13] - model.rollout(episode.X[k], episode.U[k : k + 12])[1:]
+                inside = (np.abs(off) <= band.width).all()
+                share.append(inside)
+                axis.plot(
+                    time, off[:, 0], linewidth=0.5, color="#0072b2" if inside else "#d55e00", zorder=2 + (not inside)
+                )
+        axis.fill_between(time, -band.width[:, 0], band.width[:, 0], color="#000000", alpha=0.12)
+        axis.set(title=f"{title}: {np.mean(share):.0%} inside", xlabel="time ahead [s]")
+    axes[0][0].set(ylabel="error of theta [rad]")
+    return made
+
+
+PICTURES: dict[str, Callable[[], Any]] = {
+    made.__name__: styled(made)
+    for made in (
+        start,
+        house,
+        moments,
+        riccati_first,
+        terminal_cost,
+        one_step_errors,
+        choosing_by_closed_loop,
+        what_trust_means,
+    )
+}
+
+
+def write(names: Iterable[str]) -> None:
+    """Write the pictures with these names."""
+    for name in names:
+        made = PICTURES[name]()
+        made.savefig(DOCS / "pictures" / f"{name}.png", dpi=130, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    write(sys.argv[1:] or PICTURES)
