@@ -7,9 +7,10 @@ same function twice.
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -38,9 +39,11 @@ class Lifting(Value, ABC):
     """Observables z = ψ(x), x in R^nx, z in R^nz.
 
     A user's own family is a frozen dataclass with `observables` and `formula`; arrays then go through the
-    traced formula, and so do files.
+    traced formula, and so do files. A family that `km.train` may change names in `tunable` the fields that it tunes, each
+    "real" or, where it must stay above zero, "positive"; `formula` must then also take CasADi symbols in their place.
     """
 
+    tunable: ClassVar[Mapping[str, str]] = {}
     bound: tuple[str, ...] | None = field(default=None, kw_only=True)  # names of the states, once known
 
     @abstractmethod

@@ -1,8 +1,10 @@
 """Sines and cosines: harmonics of angles, and random features of the Gaussian kernel."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
+from zlib import crc32
 
 import casadi as ca
 import numpy as np
@@ -85,6 +87,7 @@ class RandomFourier(Lifting):
     Rahimi & Recht, "Random features for large-scale kernel machines", NIPS 2007.
     """
 
+    tunable: ClassVar[Mapping[str, str]] = {"frequencies": "real", "phases": "real"}
     count: int
     width: float
     rng: int
@@ -125,9 +128,7 @@ class RandomFourier(Lifting):
         """Return the copy with its frequencies and phases: the same seed draws the same ones."""
         frequencies, phases = self.frequencies, self.phases
         if frequencies is None or frequencies.shape[1] != len(states):
-            source = checks.generator(self.rng)
-            phases = source.uniform(0.0, 2 * np.pi, self.count)
-            frequencies = source.standard_normal((self.count, len(states))) / self.width
+            frequencies, phases = self._seeded(len(states))
         bound = RandomFourier(
             self.count, self.width, self.rng, frequencies=frequencies, phases=phases, bound=tuple(states)
         )
@@ -135,13 +136,19 @@ class RandomFourier(Lifting):
         return bound
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``."""
-        return tuple(f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng})" for j in range(self.count))
+        """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``; other numbers add their checksum."""
+        tag = ""
+        if self.frequencies is not None and self.phases is not None:
+            drawn, turned = self._seeded(self.frequencies.shape[1])
+            if not (np.array_equal(drawn, self.frequencies) and np.array_equal(turned, self.phases)):
+                tag = f"; {crc32(self.frequencies.tobytes() + self.phases.tobytes()):08x}"
+        every = range(self.count)
+        return tuple(f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng}{tag})" for j in every)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return √(2/count) cos(ωⱼ·x + bⱼ) for each j."""
         frequencies, phases = self._drawn
-        return self._amplitude * ca.cos(ca.DM(frequencies) @ x + ca.DM(phases))
+        return self._amplitude * ca.cos(ca.SX(frequencies) @ x + ca.SX(phases))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         frequencies, phases = self._drawn
@@ -150,6 +157,12 @@ class RandomFourier(Lifting):
             Z += values[:, None] * coordinates
         np.cos(Z, out=Z)
         Z *= self._amplitude
+
+    def _seeded(self, nx: int) -> tuple[Float[np.ndarray, "count nx"], Float[np.ndarray, " count"]]:
+        """Return the frequencies and phases that the seed draws on `nx` states."""
+        source = checks.generator(self.rng)
+        phases = source.uniform(0.0, 2 * np.pi, self.count)
+        return source.standard_normal((self.count, nx)) / self.width, phases
 
     @property
     def _amplitude(self) -> float:

@@ -1,6 +1,8 @@
 """Gaussian, ThinPlate and PolynomialKernel: functions of the state and given centres."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -53,13 +55,13 @@ def squared_distances(
     out[rows, which] = np.einsum("ij,ij->j", difference, difference)
 
 
-def symbolic_squared_distances(x: ca.SX, centers: Float[np.ndarray, "nc nx"]) -> list[ca.SX]:
-    """Return ‖x − c‖² for each centre, summed in the same order."""
-    totals: list[ca.SX] = []
-    for center in centers.tolist():
+def symbolic_squared_distances(x: ca.SX, centers: "Float[np.ndarray, 'nc nx'] | ca.SX") -> list[ca.SX]:
+    """Return ‖x − c‖² for each centre, given or a symbol itself, summed in the same order."""
+    rows, totals = ca.SX(centers), list[ca.SX]()
+    for j in range(rows.shape[0]):
         total = ca.SX(0)
-        for i, coordinate in enumerate(center):
-            total += (x[i] - coordinate) ** 2
+        for i in range(rows.shape[1]):
+            total += (x[i] - rows[j, i]) ** 2
         totals.append(total)
     return totals
 
@@ -77,22 +79,35 @@ class Gaussian(Lifting):
     centers
         (nc, nx), one centre a row.
     width
-        Standard deviation of the bell, in the unit of the states; scale states that differ much.
+        Standard deviation of the bell, in the unit of the states; one for all centres, or (nc,), one for each. Scale
+        states that differ much.
     """
 
+    tunable: ClassVar[Mapping[str, str]] = {"centers": "real", "width": "positive"}
     centers: Float[np.ndarray, "nc nx"]
-    width: float
+    width: float | Float[np.ndarray, " nc"]
 
-    def __init__(self, centers: ArrayLike, width: float, *, bound: tuple[str, ...] | None = None) -> None:
-        freeze(self, centers=checked_centers(centers), width=checks.positive(width, "width"), bound=bound)
+    def __init__(self, centers: ArrayLike, width: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
+        rows = checked_centers(centers)
+        if np.ndim(width) == 0:
+            freeze(self, centers=rows, width=checks.positive(cast("float", width), "width"), bound=bound)
+            return
+        each = checks.array(width, "width", (len(rows),))
+        if not (each > 0).all():
+            raise DataError(f"width holds {each.min():g}; every width must be above zero")
+        freeze(self, centers=rows, width=each, bound=bound)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"gaussian(0.5, -1; 0.3)"``, which hold the centre and the width."""
-        return center_names("gaussian", self.centers, states, f"; {self.width!r}")
+        if isinstance(self.width, float):
+            return center_names("gaussian", self.centers, states, f"; {self.width!r}")
+        each = zip(self.centers, self.width.tolist(), strict=True)
+        return tuple(center_names("gaussian", row[None], states, f"; {width!r}")[0] for row, width in each)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return exp(−‖x − c‖² / (2 width²)) for each centre."""
-        return ca.vertcat(*(ca.exp(self._rate * r2) for r2 in symbolic_squared_distances(x, self.centers)))
+        distances = ca.vertcat(*symbolic_squared_distances(x, self.centers))
+        return ca.exp(ca.SX(self._rate) * distances)
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         squared_distances(x, self.centers, Z)
@@ -100,7 +115,7 @@ class Gaussian(Lifting):
         np.exp(Z, out=Z)
 
     @property
-    def _rate(self) -> float:
+    def _rate(self) -> float | Float[np.ndarray, " nc"]:
         return -0.5 / self.width**2
 
 
@@ -117,6 +132,7 @@ class ThinPlate(Lifting):
         (nc, nx), one centre a row.
     """
 
+    tunable: ClassVar[Mapping[str, str]] = {"centers": "real"}
     centers: Float[np.ndarray, "nc nx"]
 
     def __init__(self, centers: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
@@ -149,6 +165,7 @@ class PolynomialKernel(Lifting):
         At least 1.
     """
 
+    tunable: ClassVar[Mapping[str, str]] = {"centers": "real"}
     centers: Float[np.ndarray, "nc nx"]
     degree: int
 
@@ -162,8 +179,7 @@ class PolynomialKernel(Lifting):
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return (1 + xᵀc)^degree for each centre."""
-        products = [sum((x[i] * c for i, c in enumerate(center)), ca.SX(1)) for center in self.centers.tolist()]
-        return ca.vertcat(*(product**self.degree for product in products))
+        return (1 + ca.SX(self.centers) @ x) ** self.degree
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         np.matmul(x.T, self.centers.T, out=Z)
