@@ -113,6 +113,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.synthesis.designed import load_controller as load_controller
     from koopmpc.synthesis.select import select as select
     from koopmpc.synthesis.stabilise import stabilise as stabilise
+    from koopmpc.synthesis.train import train as train
     from koopmpc.validate.report import trust as trust
     from koopmpc.validate.scoring import score as score
 

@@ -39,8 +39,8 @@ class Lifting(Value, ABC):
     """Observables z = ψ(x), x in R^nx, z in R^nz.
 
     A user's own family is a frozen dataclass with `observables` and `formula`; arrays then go through the
-    traced formula, and so do files. A family that `km.train` may change names in `tunable` the fields that it tunes, each
-    "real" or, where it must stay above zero, "positive"; `formula` must then also take CasADi symbols in their place.
+    traced formula, and so do files. A family that `km.train` may change names in `tunable` the fields that are tuned,
+    each "real" or, where it must stay above zero, "positive"; `formula` then takes CasADi symbols in their place, too.
     """
 
     tunable: ClassVar[Mapping[str, str]] = {}

@@ -64,6 +64,7 @@ class Fourier(Lifting):
 
 
 _SEEDS = 2**32
+_UNDRAWN = "RandomFourier has drawn nothing yet; call .bind(states) or pass it to edmd"
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -147,8 +148,9 @@ class RandomFourier(Lifting):
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return √(2/count) cos(ωⱼ·x + bⱼ) for each j."""
-        frequencies, phases = self._drawn
-        return self._amplitude * ca.cos(ca.SX(frequencies) @ x + ca.SX(phases))
+        if self.frequencies is None or self.phases is None:
+            raise DataError(_UNDRAWN)
+        return self._amplitude * ca.cos(ca.SX(self.frequencies) @ x + ca.SX(self.phases))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         frequencies, phases = self._drawn
@@ -171,5 +173,5 @@ class RandomFourier(Lifting):
     @property
     def _drawn(self) -> tuple[Float[np.ndarray, "count nx"], Float[np.ndarray, " count"]]:
         if self.frequencies is None or self.phases is None:
-            raise DataError("RandomFourier has drawn nothing yet; call .bind(states) or pass it to edmd")
+            raise DataError(_UNDRAWN)
         return self.frequencies, self.phases

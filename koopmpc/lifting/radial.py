@@ -99,24 +99,21 @@ class Gaussian(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"gaussian(0.5, -1; 0.3)"``, which hold the centre and the width."""
-        if isinstance(self.width, float):
+        if not isinstance(self.width, np.ndarray):
             return center_names("gaussian", self.centers, states, f"; {self.width!r}")
-        each = zip(self.centers, self.width.tolist(), strict=True)
-        return tuple(center_names("gaussian", row[None], states, f"; {width!r}")[0] for row, width in each)
+        pairs = zip(self.centers, self.width, strict=True)
+        every = [center_names("gaussian", row[None], states, f"; {float(width)!r}") for row, width in pairs]
+        return tuple(name for names in every for name in names)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return exp(−‖x − c‖² / (2 width²)) for each centre."""
         distances = ca.vertcat(*symbolic_squared_distances(x, self.centers))
-        return ca.exp(ca.SX(self._rate) * distances)
+        return ca.exp(ca.SX(-0.5 / self.width**2) * distances)
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         squared_distances(x, self.centers, Z)
-        np.multiply(Z, self._rate, out=Z)
+        np.multiply(Z, -0.5 / self.width**2, out=Z)
         np.exp(Z, out=Z)
-
-    @property
-    def _rate(self) -> float | Float[np.ndarray, " nc"]:
-        return -0.5 / self.width**2
 
 
 _TINY = 1e-100  # keeps ln and its first two derivatives finite at the centre, and is below rounding elsewhere

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -28,8 +28,8 @@ class _Field(NamedTuple):
 class Tuning:
     """ψ(x; p): a bound lifting as a function of its tunable numbers p; p = 0 is the lifting as it is.
 
-    A field that stays above zero is its value times exp(p). Any other is its value plus p times a unit: the width of the
-    family where it has one, else the spread of the field's rows. So p has no unit, whatever the states are measured in.
+    A field that stays above zero is its value times exp(p). Any other is its value plus p times a unit: the width of
+    the family where it has one, else the spread of the field's rows. So p does not depend on the units of the states.
 
     Parameters
     ----------
@@ -106,24 +106,27 @@ def _inputs(*arguments: np.ndarray) -> Any:
     return [row if argument.ndim == 2 else float(row) for argument in arguments for row in argument]
 
 
-def _inside(lifting: Lifting) -> Iterator[tuple[str, Any]]:
+def _inside(lifting: Lifting) -> Iterator[tuple[str, Lifting | tuple[Lifting, ...]]]:
     """Yield the fields that hold liftings: one, or a tuple of them."""
     for field in fields(lifting):
-        value = getattr(lifting, field.name)
-        if isinstance(value, Lifting) or (isinstance(value, tuple) and value and isinstance(value[0], Lifting)):
+        value: Any = getattr(lifting, field.name)
+        if isinstance(value, Lifting):
             yield field.name, value
+        elif isinstance(value, tuple) and all(isinstance(part, Lifting) for part in cast("tuple[Any, ...]", value)):
+            yield field.name, cast("tuple[Lifting, ...]", value)
 
 
 def _tunable(lifting: Lifting) -> Iterator[_Field]:
     """Yield the tunable fields of the lifting, then those of the liftings in it."""
     values = {name: np.asarray(getattr(lifting, name), dtype=float) for name in lifting.tunable}
-    widths = [float(np.exp(np.log(values[name]).mean())) for name, kind in lifting.tunable.items() if kind == "positive"]
+    positive: list[Any] = [values[name] for name, kind in lifting.tunable.items() if kind == "positive"]
+    widths = [float(np.exp(np.mean(np.log(np.asarray(value, dtype=float))))) for value in positive]
     for name, kind in lifting.tunable.items():
-        value = values[name]
-        spread = float(np.sqrt(np.mean((value - value.mean(axis=0)) ** 2))) if value.ndim else 0.0
+        value: Any = values[name]
+        spread = float(np.std(value - np.mean(value, axis=0))) if np.ndim(value) else 0.0
         yield _Field(value, widths[0] if widths else spread or 1.0, kind == "positive")
-    for _, value in _inside(lifting):
-        for part in value if isinstance(value, tuple) else (value,):
+    for _, inner in _inside(lifting):
+        for part in inner if isinstance(inner, tuple) else (inner,):
             yield from _tunable(part)
 
 
@@ -136,7 +139,7 @@ def _copied(lifting: Lifting, values: Iterator[Any], *, symbols: bool) -> Liftin
         else:
             changes[name] = _copied(value, values, symbols=symbols)
     if not symbols:
-        changes = {name: float(v) if isinstance(v, np.ndarray) and v.ndim == 0 else v for name, v in changes.items()}
+        changes = {name: float(v) if np.ndim(v) == 0 and name in lifting.tunable else v for name, v in changes.items()}
         return replace(lifting, **changes)
     _ = lifting.names  # a copy keeps the names of the original, which symbols have none of
     twin = copy(lifting)

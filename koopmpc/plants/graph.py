@@ -1,7 +1,7 @@
 """A traced CasADi expression as a list of whitelisted operations: over numpy columns, as symbols, as data."""
 
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, cast
@@ -213,8 +213,8 @@ class Graph(Value):
         """Return the registers that `run` needs for `rows` columns."""
         return list(np.empty((int(self.places[:, 0].max(initial=0)) + 1, rows)))
 
-    def run(self, inputs: np.ndarray, results: np.ndarray, scratch: list[np.ndarray]) -> None:
-        """Write y = g(v) into `results` (m, M) from `inputs` (n, M): the inner loop of a batch."""
+    def run(self, inputs: np.ndarray | Sequence[Columns], results: np.ndarray, scratch: list[np.ndarray]) -> None:
+        """Write y = g(v) into `results` (m, M) from `inputs`, (n, M) or n rows and numbers: the loop of a batch."""
         with np.errstate(all="ignore"):
             for target, value in self._walk(inputs, scratch):
                 results[target] = value

@@ -1,0 +1,163 @@
+"""Variable projection: the error over a horizon of the best linear model on ψ(x; p), and its gradient by p."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.lifting.tuning import Tuning
+
+_DECODED = 1e-12  # ridge of C, where the lifting does not hold all states
+_LOST = 1e3  # the objective, a logarithm, where a prediction leaves the finite numbers
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Pieces of N steps as arrays: what ψ acts on, with the states first; all inputs; 1 / (N nx Σ x²) of each state."""
+
+    X: Float[np.ndarray, "M N1 np"]
+    V: Float[np.ndarray, "M N nv"]
+    weight: Float[np.ndarray, "N nx"]
+
+    @classmethod
+    def of(cls, points: Episodes, N: int, nx: int) -> "Windows":
+        """Return the arrays of episodes of N steps each."""
+        X = np.stack([e.X for e in points])
+        size = np.sum(X[:, 1:, :nx] ** 2, axis=0)
+        weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0) / (N * nx)
+        return cls(X, np.stack([np.hstack([e.U, e.W]) for e in points]), weight)
+
+
+class _LeastSquares:
+    """K = argmin ‖T − P K‖² + ridge ‖D K‖², D the norms of P's columns, and the way back through it."""
+
+    def __init__(self, P: Float[np.ndarray, "m n"], T: Float[np.ndarray, "m k"], ridge: float) -> None:
+        self.P, self.T, self.ridge = P, T, ridge
+        G = P.T @ P
+        self.norms = np.sqrt(np.where(G.diagonal() > 0, G.diagonal(), 1.0))
+        self.factor = cho_factor(G / np.outer(self.norms, self.norms) + ridge * np.eye(len(G)))
+        self.K = self._solve(P.T @ T)
+
+    def _solve(self, right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        return cast("Any", cho_solve(self.factor, right / self.norms[:, None])) / self.norms[:, None]
+
+    def pullback(self, dK: Float[np.ndarray, "n k"]) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m k"]]:
+        """Return the derivatives by P and T of what has the derivative dK by K."""
+        right = self._solve(dK)
+        dG = -right @ self.K.T
+        by_norms = 2 * self.ridge * dG.diagonal()
+        return self.T @ right.T + self.P @ (dG + dG.T) + self.P * by_norms, self.P @ right
+
+
+class VariableProjection:
+    """J(p) = log of the relative error over the horizon, with the A, B and C that p's least squares give.
+
+    Parameters
+    ----------
+    tuning
+        ψ(x; p).
+    windows
+        The data.
+    ridge
+        Of the least squares, on columns of unit norm.
+    """
+
+    def __init__(self, tuning: Tuning, windows: Windows, ridge: float) -> None:
+        self.tuning, self.windows, self.ridge = tuning, windows, ridge
+        names, states = tuning.lifting.names, tuning.lifting.bound_states[: windows.weight.shape[1]]
+        self.held = [(i, names.index(state)) for i, state in enumerate(states) if state in names]
+        self.missing = [i for i, state in enumerate(states) if state not in names]
+
+    def __call__(self, p: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+        """Return J and its gradient."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                return self._both(p)
+            except (LinAlgError, ValueError):  # the observables, or the forecasts, left the finite numbers
+                return _LOST, np.zeros(len(p))
+
+    def elsewhere(self, p: Float[np.ndarray, " n"], other: Windows) -> float:
+        """Return J on other windows, with the matrices that these give."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                Z = self._lifted(p, self.windows)
+                fit, decode = self._fitted(Z)
+                error = _forecast(self._lifted(p, other), fit.K, self._decoder(decode), other)[0]
+            except (LinAlgError, ValueError):
+                return _LOST
+        return 0.5 * float(np.log(max(error, 1e-300))) if np.isfinite(error) else _LOST
+
+    def _both(self, p: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+        data, nz = self.windows, self.tuning.lifting.nz
+        Z = self._lifted(p, data)
+        fit, decode = self._fitted(Z)
+        error, back = _forecast(Z, fit.K, self._decoder(decode), data)
+        if not np.isfinite(error) or error == 0:
+            return (_LOST if error else -_LOST), np.zeros(len(p))
+        dZ0, dK, dC = back()
+        dP, dT = fit.pullback(dK)
+        dZ = np.zeros_like(Z)
+        dZ[:, 0] += dZ0
+        dZ[:, :-1] += dP[:, :nz].reshape(dZ[:, :-1].shape)
+        dZ[:, 1:] += dT.reshape(dZ[:, 1:].shape)
+        if decode is not None:
+            dZ[:, :-1] += decode.pullback(dC[:, self.missing])[0].reshape(dZ[:, :-1].shape)
+        flat = data.X.reshape(-1, data.X.shape[2])
+        gradient = self.tuning.pullback(flat, p, dZ.reshape(len(flat), nz))
+        return 0.5 * float(np.log(error)), gradient / (2 * error)
+
+    def _lifted(self, p: Float[np.ndarray, " n"], data: Windows) -> Float[np.ndarray, "M N1 nz"]:
+        M, N1, n = data.X.shape
+        return self.tuning(data.X.reshape(-1, n), p).reshape(M, N1, -1)
+
+    def _fitted(self, Z: Float[np.ndarray, "M N1 nz"]) -> "tuple[_LeastSquares, _LeastSquares | None]":
+        """Return the fit of [A B]ᵀ, and that of C where the lifting does not hold all states."""
+        nz, X = Z.shape[2], self.windows.X
+        now, ahead = Z[:, :-1].reshape(-1, nz), Z[:, 1:].reshape(-1, nz)
+        V = self.windows.V.reshape(len(now), -1)
+        fit = _LeastSquares(np.hstack([now, V]), ahead, self.ridge)
+        if not self.missing:
+            return fit, None
+        return fit, _LeastSquares(now, X[:, :-1, self.missing].reshape(len(now), -1), _DECODED)
+
+    def _decoder(self, decode: "_LeastSquares | None") -> Float[np.ndarray, "nz nx"]:
+        """Return Cᵀ: rows of the identity for the states that the lifting holds, least squares for the others."""
+        C = np.zeros((self.tuning.lifting.nz, len(self.held) + len(self.missing)))
+        for state, place in self.held:
+            C[place, state] = 1.0
+        if decode is not None:
+            C[:, self.missing] = decode.K
+        return C
+
+
+_Back = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def _forecast(
+    Z: Float[np.ndarray, "M N1 nz"], K: Float[np.ndarray, "n nz"], C: Float[np.ndarray, "nz nx"], data: Windows
+) -> tuple[float, _Back]:
+    """Return the mean relative squared error over the horizon, and what gives its derivatives by z_0, K and C."""
+    nz, N, nx = Z.shape[2], data.V.shape[1], C.shape[1]
+    A, B = K[:nz], K[nz:]
+    path = [Z[:, 0]]
+    for h in range(N):
+        path.append(path[-1] @ A + data.V[:, h] @ B)
+    gaps = [path[h + 1] @ C - data.X[:, h + 1, :nx] for h in range(N)]
+    error = float(sum(np.sum(gap**2, axis=0) @ weight for gap, weight in zip(gaps, data.weight, strict=True)))
+
+    def back() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        dz, dK, dC = np.zeros_like(path[0]), np.zeros_like(K), np.zeros_like(C)
+        for h in reversed(range(N)):
+            slope = 2 * gaps[h] * data.weight[h]
+            dC += path[h + 1].T @ slope
+            dz += slope @ C.T
+            dK[:nz] += path[h].T @ dz
+            dK[nz:] += data.V[:, h].T @ dz
+            dz = dz @ A.T
+        return dz, dK, dC
+
+    return error, back
