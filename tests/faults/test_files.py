@@ -139,6 +139,14 @@ def test_every_page_of_a_parquet_file_has_a_checksum(tmp_path: Path) -> None:
         km.load_episodes(tmp_path / "data.parquet")
 
 
+def test_a_column_whose_name_is_no_text_any_more_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "data.parquet"
+    episodes().save(path)
+    path.write_bytes(path.read_bytes().replace(b"x [m]", b"\xed [m]"))
+    with pytest.raises(km.errors.LogError, match=r"data\.parquet holds no episodes that can be read"):
+        km.load_episodes(path)
+
+
 def rezipped(path: Path, **members: bytes) -> None:
     """Write the members into the .npz file, instead of its own or beside them."""
     with zipfile.ZipFile(path) as held:

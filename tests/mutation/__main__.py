@@ -9,6 +9,7 @@ reason, in tests/mutation/equivalent.txt.
 
 import argparse
 import compileall
+import hashlib
 import json
 import os
 import random
@@ -147,14 +148,21 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--least", type=float, default=0.92, help="score below which it fails")
     parser.add_argument("--only", default="", help="draw from files whose name holds this")
-    parser.add_argument("--kept", type=Path, help="folder for the measured map, used again where it is there")
+    parser.add_argument("--part", default="1/1", help="2/3 runs the second third of the changes that are drawn")
+    parser.add_argument(
+        "--kept", type=Path, help="folder that keeps the map and what was killed: a run goes on from it"
+    )
     asked = parser.parse_args()
     files = sorted(path for room in ROOMS for path in (HOME / "koopmpc" / room).rglob("*.py"))
     names = [str(path.relative_to(HOME)) for path in files]
     sources = {name: (HOME / name).read_bytes() for name in names if asked.only in name}
     everything = [mutant for name, source in sources.items() for mutant in mutants(name, source)]
     drawn = random.Random(asked.seed).sample(everything, min(asked.count, len(everything)))
+    part, parts = (int(number) for number in asked.part.split("/"))
+    drawn = drawn[part - 1 :: parts]
     known, say = equivalents(), sys.stdout.write
+    log = asked.kept and asked.kept / f"killed.{part}"  # one line for each change: a test that kills it stays
+    killed = {line for file in asked.kept.glob("killed.*") for line in file.read_text().splitlines()} if log else set()
     with tempfile.TemporaryDirectory() as temporary:
         made = [Copy(Path(temporary) / str(i)) for i in range(asked.workers)]
         copies: SimpleQueue[Copy] = SimpleQueue()
@@ -181,6 +189,9 @@ def main() -> int:
             told = f"{mutant.file}:{mutant.first}\n- {before}\n+ {after}\n"
             if why is not None:
                 return mutant, "equivalent", f"{told}  {why}\n"
+            key = f"{mutant.start} {hashlib.sha256(mutant.of(sources[mutant.file])).hexdigest()}"
+            if key in killed:
+                return mutant, "killed", told
             if not tests:
                 return mutant, "survived", f"{told}  no test runs this line\n"
             copy = copies.get()
@@ -188,6 +199,9 @@ def main() -> int:
                 found = copy.outcome(mutant, tests, sum(seconds.get(test, 0.0) for test in tests))
             finally:
                 copies.put(copy)
+            if log and found != "survived":
+                with log.open("a") as file:
+                    file.write(key + "\n")
             return mutant, found, f"{told}  {found}; {len(tests)} tests\n"
 
         counts = dict.fromkeys(("killed", "timed out", "equivalent", "survived"), 0)

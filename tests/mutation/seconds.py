@@ -20,10 +20,10 @@ def pytest_runtest_protocol(item):
 
 def pytest_sessionfinish(session):
     if hasattr(session.config, "workeroutput"):  # of pytest-xdist: this is one of its processes
-        session.config.workeroutput["seconds"] = _seconds
+        session.config.workeroutput["seconds"] = dict(_seconds)  # which execnet can send
     else:
         Path("seconds.json").write_text(json.dumps(_seconds))
 
 
 def pytest_testnodedown(node):
-    _seconds.update(node.workeroutput.get("seconds", {}))
+    _seconds.update(getattr(node, "workeroutput", {}).get("seconds", {}))

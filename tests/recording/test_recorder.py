@@ -204,3 +204,26 @@ def test_a_killed_writer_keeps_what_was_flushed(tmp_path: Path) -> None:
     assert np.array_equal(read.X, run.X[: read.steps + 1])
     assert np.array_equal(read.plans.X, run.plans.X[: read.steps])
     assert read.status == run.status[: read.steps]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads as Linux lists them")
+def test_logs_that_are_written_give_their_threads_back(tmp_path: Path) -> None:
+    threads = []
+    for _ in range(4):
+        km.record(make_run(), tmp_path / "run.rrd")
+        threads.append(len(list(Path("/proc/self/task").iterdir())))
+    assert threads[1] == threads[3]  # of the last log they may be there until the next
+
+
+def test_a_recording_that_the_user_made_global_stays_so(tmp_path: Path) -> None:
+    import rerun as rr
+
+    before, own = rr.get_global_data_recording(), rr.RecordingStream("own")
+    rr.set_global_data_recording(own)
+    try:
+        km.record(make_run(), tmp_path / "run.rrd")
+        kept = rr.get_global_data_recording()
+        assert kept is not None
+        assert kept.get_recording_id() == own.get_recording_id()
+    finally:
+        rr.set_global_data_recording(before)

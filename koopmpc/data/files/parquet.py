@@ -254,7 +254,7 @@ def _schema(path: Path) -> Any:
 
     try:
         return pq.read_schema(path)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise LogError(
             f"{path} holds no episodes that can be read: it is no .parquet file, or was cut; {ADVICE}"
         ) from error
@@ -269,5 +269,5 @@ def _table(path: Path, wanted: list[str] | None = None) -> Any:
             size = held.metadata.num_rows * (held.metadata.num_columns if wanted is None else len(wanted))
             affordable(8 * size, f"{path}: {size} cells")
             return held.read(columns=wanted)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise LogError(f"{path} holds no episodes that can be read: its columns are damaged; {ADVICE}") from error

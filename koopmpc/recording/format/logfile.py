@@ -62,19 +62,19 @@ class LogFile:
         self._tail = b""
         self._thread: Thread | None = None
 
-    def attach(self, rec: Any, *more: Any, **blueprint: Any) -> None:
+    def attach(self, rec: Any, *more: Any) -> None:
         """Make this file the sink of a recording, beside other sinks."""
         import rerun as rr
 
         if not _PIPES.is_dir():
-            rec.set_sinks(rr.FileSink(self.part), *more, **blueprint)
+            rec.set_sinks(rr.FileSink(self.part), *more)
             return
         end, begin = os.pipe()
         try:
             thread = Thread(target=self._pump, args=(end,), name="koopmpc-log", daemon=True)
             thread.start()
             self._thread = thread  # which is waited for only where it runs: an interrupt may come while it starts
-            rec.set_sinks(rr.FileSink(f"{_PIPES}/{begin}"), *more, **blueprint)
+            rec.set_sinks(rr.FileSink(f"{_PIPES}/{begin}"), *more)
         finally:
             os.close(begin)  # Rerun holds one of its own
 

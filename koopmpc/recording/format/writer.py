@@ -47,6 +47,37 @@ _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
 PATIENCE = 10.0  # longest wait for a file that is written at once [s]
 
 
+def _new_recording(application: str) -> Any:
+    """Return a recording of its own; those that have ended give their memory and threads back.
+
+    Rerun keeps what has ended until it is asked. It would also let go of a recording that the user made global by
+    ``rr.init``: where there is one, nothing is asked, and Rerun itself tidies up at the next ``rr.init``.
+    """
+    import rerun as rr
+    import rerun_bindings
+
+    if rr.get_global_data_recording() is None:
+        rerun_bindings.flush_and_cleanup_orphaned_recordings()
+    return rr.RecordingStream(application, recording_id=uuid.uuid4())
+
+
+def _send_blueprint(rec: Any, application: str, layout: Any) -> None:
+    """Send a blueprint, as ``rec.send_blueprint`` does, which keeps its memory and two threads for ever."""
+    import rerun as rr
+    import rerun_bindings
+
+    own = rerun_bindings.new_blueprint(
+        application_id=application, make_default=False, make_thread_default=False, default_enabled=True
+    )
+    stream = rr.RecordingStream._from_native(own)
+    try:
+        stream.set_time("blueprint", sequence=0)
+        layout.to_blueprint()._log_to_stream(stream)
+        rerun_bindings.send_blueprint(stream.memory_recording().storage, False, True, recording=rec.to_native())
+    finally:
+        stream.disconnect()  # else what it holds and the stream hold each other
+
+
 @contextmanager
 def file_recording(path: str | Path, application: str, layout: Any) -> Generator[Any]:
     """Yield a recording that is written beside `path`, and takes its place at the end of the block.
@@ -56,12 +87,11 @@ def file_recording(path: str | Path, application: str, layout: Any) -> Generator
     LogError
         The path cannot be written.
     """
-    import rerun as rr
-
     file = LogFile(path)
-    rec = rr.RecordingStream(application, recording_id=uuid.uuid4())
+    rec = _new_recording(application)
     try:
-        file.attach(rec, default_blueprint=layout)
+        file.attach(rec)
+        _send_blueprint(rec, application, layout)
         yield rec
         rec.flush(timeout_sec=PATIENCE)
         rec.disconnect()
@@ -102,12 +132,10 @@ class Writer:
 
         A `growing` log is there while it is written, any other takes its place at the end.
         """
-        import rerun as rr
-
         self._about, self._scene, self._model = about, scene, model
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._viewer, self._steps = viewer, steps
-        self._rec: Any = rr.RecordingStream(application_of(about), recording_id=uuid.uuid4())
+        self._rec: Any = _new_recording(application_of(about))
         self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
@@ -206,7 +234,7 @@ class Writer:
         numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
         self._rec.log(Entity.METRICS, document, rr.AnyValues(**numbers), static=True)
         if self._extent.ranges() != self._shown:
-            self._rec.send_blueprint(self._blueprint(), make_active=False)
+            _send_blueprint(self._rec, application_of(self._about), self._blueprint())
         self.flush()
         self._release()
         if self._file is not None:
@@ -242,7 +270,7 @@ class Writer:
         heading = rr.TextDocument(drawable(f"**{title_of(self._about)}**"), media_type=rr.MediaType.MARKDOWN)
         self._rec.log("title", heading, static=True)
         self.flush()  # a log that is cut says what it was
-        self._rec.send_blueprint(self._blueprint(), make_active=False)
+        _send_blueprint(self._rec, application_of(self._about), self._blueprint())
         if self._model is not None:
             for entity, drawing in draw_eigenvalues(self._model).items():
                 self._style(entity, drawing)
