@@ -28,6 +28,7 @@ from koopmpc.loop.faults import (
     SolverFailure,
 )
 from koopmpc.loop.metrics import metrics
+from koopmpc.loop.realtime import in_real_time
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
 from koopmpc.recording.format.reader import load_run
@@ -44,19 +45,17 @@ FAULTS: dict[str, Fault] = {
 _COLD_STEPS, _SLEEP = 25, 0.004  # steps that are timed with cold caches, and the sleep before each [s]
 
 
-def row_of_run(
-    parts: Prepared, row: RunRow, folder: Path, *, logged: bool, live: bool = False, compiled: bool = False
-) -> RunRow:
+def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **how: bool) -> RunRow:
     """Run what `row` names, and return it with its figures; an exception becomes the row's failure.
 
     A run that is `logged`, or that failed, is written to a log, which is read back; one that is logged is also timed
-    with cold caches.
+    with cold caches. The rest is passed to `closed_loop`.
     """
     begin = time.perf_counter()
     log = folder / f"{row.name}.rrd"
     row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
     try:
-        run = closed_loop(parts, row, plans=logged, live=live, compiled=compiled)
+        run = closed_loop(parts, row, plans=logged, **how)
         judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[row.case].steps)
     except FullDiskError:
         raise
@@ -108,8 +107,10 @@ def _recorded(run: Run, log: Path) -> list[str]:
     return []
 
 
-def closed_loop(parts: Prepared, row: RunRow, *, plans: bool, live: bool = False, compiled: bool = False) -> Run:
-    """Return the run that `row` names, from its x0."""
+def closed_loop(
+    parts: Prepared, row: RunRow, *, plans: bool, live: bool = False, paced: bool = False, compiled: bool = False
+) -> Run:
+    """Return the run that `row` names, from its x0; `live` in a viewer, `paced` as fast as its plant would be."""
     problem, case = parts.problem, parts.problem.cases[row.case]
     plant = parts.off(row.case, row.wrong, row.start) if row.wrong else parts.truth_of(row.case)
     held = parts.inputs_that_hold(row.case, plant) if row.wrong else parts.u_reference(row.case)
@@ -142,7 +143,7 @@ def closed_loop(parts: Prepared, row: RunRow, *, plans: bool, live: bool = False
             noise=noise,
             faults=(*case.faults, *injected),
             rng=row.start,
-            observers=observers,
+            observers=observers if not paced else (*observers, in_real_time(plant.dt)),
             plans=plans,
             **about,
         )

@@ -42,6 +42,7 @@ class _Grid(NamedTuple):
     folder: Path
     log_starts: int
     live: bool
+    paced: bool
     monitor: bool
     compiled: bool
 
@@ -79,6 +80,7 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     live: bool = False,
+    paced: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[RunRow]:
     """Run each controller on each case of each problem, and judge all by the same cost and limits.
@@ -119,6 +121,8 @@ def sweep(
     live
         Whether to stream each run to a Rerun viewer; one is opened where none is up. Without a viewer there is one
         UserWarning, and the runs are recorded all the same. Runs of this process only.
+    paced
+        Whether each run takes as long as its plant would, to be watched.
     progress
         Called with (name of the run, runs done, runs in all).
 
@@ -157,7 +161,7 @@ def sweep(
     with opened(folder, asked):
         done = {row.key: row for row in load_rows(folder)}
         left = [row for row in rows if row.key not in done]
-        grid = _Grid(uuid4().hex, dict(sent), folder.resolve(), log_starts, live, monitor, compiled)
+        grid = _Grid(uuid4().hex, dict(sent), folder.resolve(), log_starts, live, paced, monitor, compiled)
         where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
         told = _Told(progress, len(done), len(rows))
         told.say(left[0].name if left else "done", 0)
@@ -304,7 +308,8 @@ def _do(batch: _Batch) -> list[RunRow]:
                 sent = grid.problems[f"{row.problem}:{row.case}"]
                 parts = _prepared(grid.name, sent, row.seed, grid.folder, grid.monitor)
                 logged = row.start < grid.log_starts
-                done = row_of_run(parts, row, grid.folder, logged=logged, live=grid.live, compiled=grid.compiled)
+                how = {"live": grid.live, "paced": grid.paced, "compiled": grid.compiled}
+                done = row_of_run(parts, row, grid.folder, logged=logged, **how)
             journal.end(done)
             finished.append(done)
     return finished

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.text import Text
 
 from koopmpc.cli import sweeps
-from koopmpc.cli.console import bar, console, folder_of, friendly, new_file, new_folder, program, split
+from koopmpc.cli.console import bar, console, folder_of, friendly, new_file, new_folder, program, say_page, split
 from koopmpc.cli.sweeps import Logs
 from koopmpc.errors import KoopmpcError
 
@@ -224,9 +224,7 @@ def view(
             record_comparison(logs, shown[0])
         if web:
             with served(shown, port) as (address, data):
-                out.print(Text(f"open {address}", style="bold"), soft_wrap=True)
-                tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data}:127.0.0.1:{data} HOST"
-                out.print(Text(f"from another machine first: {tunnel}\nCtrl-C ends it"), soft_wrap=True)
+                say_page(address, port, data)
                 with suppress(KeyboardInterrupt):
                     Event().wait()
             return

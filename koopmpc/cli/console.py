@@ -136,6 +136,14 @@ def as_options(message: str) -> str:
     return _SUBJECT.sub(r"\1--\2", told)
 
 
+def say_page(address: str, port: int, data: int) -> None:
+    """Print where a browser finds the viewer that is served here, and how to reach it from another machine."""
+    out = console()
+    out.print(Text(f"open {address}", style="bold"), soft_wrap=True)
+    tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data}:127.0.0.1:{data} HOST"
+    out.print(Text(f"from another machine first: {tunnel}\nCtrl-C ends it"), soft_wrap=True)
+
+
 @contextmanager
 def friendly() -> Generator[None]:
     """Show each warning and error of koopmpc as one message on stderr; an error exits with 2, a full disk with 1."""

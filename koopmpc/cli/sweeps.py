@@ -1,14 +1,17 @@
 """Commands that run, compare and look back: run, bench, report, compare, inspect, replay."""
 
 import shlex
-from collections.abc import Sequence
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
 
-from koopmpc.cli.console import bar, console, friendly, new_folder, program
+from koopmpc.cli.console import bar, console, friendly, new_folder, program, say_page
 from koopmpc.cli.ending import ENDING
 from koopmpc.errors import DataError, LogError
 
@@ -16,7 +19,12 @@ if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
 
 _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
-Live = Annotated[bool, typer.Option("--live", help="Stream each run to a Rerun viewer while it runs.")]
+Live = Annotated[
+    bool, typer.Option("--live", help="Stream each run to the viewer that is up, to one that is opened, or to a page.")
+]
+InRealTime = Annotated[
+    bool, typer.Option("--paced", help="Let each run take as long as its plant would, to be watched.")
+]
 Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
 Watched = Annotated[
     bool, typer.Option("--monitor", help="Count the steps at which a learned model is beyond its data.")
@@ -34,14 +42,15 @@ def run(
     faults: Faults = False,
     monitor: Watched = False,
     live: Live = False,
+    paced: InRealTime = False,
     logs: Logs = Path("logs"),
 ) -> None:
     """Run controllers in closed loop on one problem; one log a run, and a table."""
     from koopmpc.bench.library import load_problem
 
-    with friendly():
+    with friendly(), _page(live):
         loaded = load_problem(problem)
-        _sweep([loaded], controller, None, logs, loaded.name, faults=faults, monitor=monitor, live=live)
+        _sweep([loaded], controller, None, logs, loaded.name, faults=faults, monitor=monitor, live=live, paced=paced)
 
 
 def bench(
@@ -60,6 +69,7 @@ def bench(
     workers: Annotated[int | None, typer.Option("--workers", help="Local processes.")] = None,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="tcp://host:port of a Dask cluster.")] = None,
     live: Live = False,
+    paced: InRealTime = False,
     logs: Logs = Path("logs"),
     resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the sweep in this folder.")] = None,
 ) -> None:
@@ -67,8 +77,8 @@ def bench(
     from koopmpc.bench.library import DEFAULT, load_problem, shipped
     from koopmpc.bench.store import manifest_of
 
-    with friendly():
-        where = {"workers": workers, "scheduler": scheduler, "live": live}
+    with friendly(), _page(live):
+        where = {"workers": workers, "scheduler": scheduler, "live": live, "paced": paced}
         if resume is not None:
             asked: dict[str, Any] = manifest_of(resume)["asked"]
             loaded = [
@@ -150,6 +160,26 @@ def replay(log: Annotated[Path, typer.Argument(help="A log of `koopmpc run` or `
     console().print(Text(str(found)), soft_wrap=True)
     if found.differences:
         raise typer.Exit(1)
+
+
+@contextmanager
+def _page(live: bool) -> Generator[None]:
+    """Serve a page in this block, in a terminal until Ctrl-C, where no viewer is up and none can be opened."""
+    from koopmpc.recording.viewer import PORT, WEB_PORT, has_display, is_up, served
+
+    with ExitStack() as page:
+        shown = None
+        if live and not is_up(PORT) and not has_display():
+            try:
+                shown = page.enter_context(served((), live=True))
+            except LogError as error:
+                warnings.warn(f"--live has no page to show the runs on: {error}", UserWarning, stacklevel=2)
+        if shown is not None:
+            say_page(shown[0], WEB_PORT, shown[1])
+        yield
+        if shown is not None and console().is_terminal:
+            with suppress(KeyboardInterrupt):
+                Event().wait()
 
 
 def _sweep(

@@ -7,6 +7,7 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.loop.metrics import Metrics as Metrics
     from koopmpc.loop.realtime import Paced as Paced
+    from koopmpc.loop.realtime import in_real_time as in_real_time
     from koopmpc.loop.run import Plans as Plans
     from koopmpc.loop.run import Step as Step
 else:

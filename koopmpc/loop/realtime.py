@@ -1,4 +1,7 @@
-"""realtime: one controller on hardware, paced by a monotonic clock; late steps, a watchdog, SIGTERM."""
+"""realtime: one controller on hardware, paced by a monotonic clock; late steps, a watchdog, SIGTERM.
+
+`in_real_time` paces a simulated loop, to be watched.
+"""
 
 import math
 import signal
@@ -300,6 +303,19 @@ class _Loop:
             self.recorder(
                 Step(k, np.full(len(self.y), np.nan), self.kept, self.rows[min(k, self.last)], move, own=True)
             )
+
+
+def in_real_time(dt: float) -> Callable[[Step], None]:
+    """Return an observer that lets `simulate` take as long as its plant would: step k ends k dt after step 0."""
+    dt, begin = checks.positive(dt, "dt", "s"), math.nan
+
+    def wait(step: Step) -> None:
+        nonlocal begin
+        if step.k == 0:
+            begin = time.monotonic()
+        time.sleep(max(0.0, begin + step.k * dt - time.monotonic()))
+
+    return wait
 
 
 @contextmanager

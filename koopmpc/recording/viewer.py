@@ -128,8 +128,12 @@ def need_display(logs: Sequence[str | Path], *, options: str = "") -> None:
 
 
 @contextmanager
-def served(logs: str | Path | Sequence[str | Path], port: int = WEB_PORT) -> Generator[tuple[str, int]]:
+def served(
+    logs: str | Path | Sequence[str | Path], port: int = WEB_PORT, *, live: bool = False
+) -> Generator[tuple[str, int]]:
     """Serve logs to a browser on this machine; yield the address, and the port of the data beside that of the page.
+
+    With `live` it serves what is streamed to this machine's port 9876, where a `Recorder` looks for a viewer.
 
     Both listen at 127.0.0.1 alone: from another machine they are reached through ssh.
 
@@ -138,13 +142,14 @@ def served(logs: str | Path | Sequence[str | Path], port: int = WEB_PORT) -> Gen
     LogError
         A log does not exist or is no .rrd file; the port is taken, or the server does not start.
     """
-    paths = _existing(logs)
+    paths = [] if live else _existing(logs)
     if is_up(port):
         raise LogError(f"a program listens at 127.0.0.1:{port} already; end it, or choose another with --port")
-    data = free_port()
+    data = PORT if live else free_port()
     server = start_viewer("--serve-web", "--web-viewer-port", str(port), *paths, port=data)
     if server is None:
-        raise LogError(f"the server did not start; run `{program()} --serve-web {paths[0]}` to see what it says")
+        command = shlex.join([str(program()), "--serve-web", *paths])
+        raise LogError(f"the server did not start; run `{command}` to see what it says")
     deadline = time.monotonic() + _START
     while not is_up(port) and server.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)  # the page comes up after the data

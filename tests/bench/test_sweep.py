@@ -1,13 +1,17 @@
 """sweep: a row, a log and a verdict for every run; what one run raises stays with that run."""
 
+import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
 import koopmpc as km
+from koopmpc.cli.app import app
 from tests.bench.test_table import printed
 from tests.bench.tiny import write
 from tests.control.kkt import CheckedOSQP
@@ -253,6 +257,39 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
     assert np.array_equal(live.U, kept.U)
     assert live.plans == kept.plans
     assert live.metadata == kept.metadata
+
+
+def test_a_paced_run_takes_as_long_as_its_plant_and_is_the_same(swept, tmp_path):
+    problem, rows, _, _ = swept
+    begin = time.monotonic()
+    (row,) = km.sweep([problem.select("far")], ["lqr"], folder=tmp_path, paced=True)
+    assert time.monotonic() - begin > 5 * problem.dt
+    assert row.metrics.cost == next(r.metrics.cost for r in rows if (r.case, r.controller) == ("far", "lqr"))
+
+
+@pytest.mark.filterwarnings("default:--live")
+@pytest.mark.parametrize("fails", [False, True])
+def test_live_without_a_viewer_or_a_display_serves_a_page_while_runs_go_on(tmp_path, monkeypatch, fails):
+    pages = []
+
+    @contextmanager
+    def served(logs, *, live):
+        if fails:
+            raise km.errors.LogError("the port is taken")
+        pages.append(live)
+        yield "http://here", 1
+        pages.append("closed")
+
+    monkeypatch.setattr("koopmpc.recording.viewer.is_up", lambda port: False)
+    monkeypatch.setattr("koopmpc.recording.viewer.has_display", lambda: False)
+    monkeypatch.setattr("koopmpc.recording.viewer.served", served)
+    monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
+    monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
+    tiny = str(write(tmp_path))
+    shown = CliRunner().invoke(app, ["run", f"{tiny}:far", "-c", "lqr", "--live", "--logs", str(tmp_path / "logs")])
+    assert shown.exit_code == 0
+    assert pages == ([] if fails else [True, "closed"])
+    assert ("no page to show the runs on: the port is taken" if fails else "open http://here") in shown.output
 
 
 def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):

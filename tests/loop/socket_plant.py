@@ -19,7 +19,7 @@ class SocketPlant:
     def __init__(self, port, dt):
         self.dt = dt
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=30)
-        self._file = self._socket.makefile("rw")
+        self._file = self._socket.makefile("r")
 
     def close(self):
         self._file.close()
@@ -74,7 +74,7 @@ def serve(path):
     connection, _ = listening.accept()
     p = v = u = 0.0
     seen = time.monotonic()
-    with connection.makefile("rw") as stream, open(path, "a") as notes:  # noqa: PTH123
+    with connection.makefile("r") as stream, open(path, "a") as notes:  # noqa: PTH123
         for line in stream:
             now = time.monotonic()
             while seen < now:
@@ -85,8 +85,7 @@ def serve(path):
             notes.write(line)
             notes.flush()
             if "stop" not in message:
-                stream.write(json.dumps([p, v]) + "\n")
-                stream.flush()
+                connection.sendall((json.dumps([p, v]) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -110,12 +110,14 @@ def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
     assert km.load_run(tmp_path / "seen.rrd") == run
 
 
-_DYING = """
-import sys, time, warnings
+_FAILING = """
+import signal, sys, time, warnings
 sys.path.insert(0, {root!r})
 from tests.recording.runs import about, make_run, steps_of
 from koopmpc.recording.viewer import start_viewer
+from koopmpc.recording import recorder as room
 import koopmpc as km
+room._PATIENCE_VIEWER = 1.0
 run = make_run(T=40)
 viewer = start_viewer("--serve-grpc", port={port})
 with warnings.catch_warnings(record=True) as caught:
@@ -125,20 +127,29 @@ with warnings.catch_warnings(record=True) as caught:
             recorder(step)
             time.sleep(0.02)
             if step.k == 15:
-                viewer.kill()
-                viewer.wait()
+                {end}
+viewer.kill()
+viewer.wait()
 for warning in caught:
     print(warning.category.__name__, warning.message)
 """
 
 
-def test_a_viewer_that_dies_costs_one_warning_and_no_step(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [
+        ("viewer.kill(); viewer.wait()", "was closed"),
+        ("viewer.send_signal(signal.SIGSTOP)", "takes in nothing more (it took in no more for 1 s)"),
+    ],
+    ids=["killed", "slow"],
+)
+def test_a_viewer_that_fails_costs_one_warning_and_no_step(tmp_path: Path, end: str, told: str) -> None:
     """In a process of its own: Rerun prints what it thinks of it when the process ends."""
     path, root, port = tmp_path / "run.rrd", str(Path(__file__).parents[2]), free_port()
-    code = _DYING.format(root=root, path=str(path), port=port)
+    code = _FAILING.format(root=root, path=str(path), port=port, end=end)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     (said,) = done.stdout.splitlines()
-    assert said == f"UserWarning the viewer was closed before the end; the log {path} is complete"
+    assert said == f"UserWarning the viewer {told} before the end; the log {path} is complete"
     assert done.stderr == ""  # no line of Rerun's own
     assert km.load_run(path) == make_run(T=40)
 

@@ -3,6 +3,7 @@
 import sys
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.recording import viewer
 from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer
-from tests.recording.runs import make_run
+from tests.recording.runs import about, make_run, steps_of
 from tests.recording.viewing import drawn
 
 
@@ -94,6 +95,19 @@ def test_a_viewer_is_found_once_it_is_up(monkeypatch: pytest.MonkeyPatch) -> Non
         process.wait()
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     assert find_viewer(port) is None
+
+
+def test_what_a_loop_streams_is_served_to_a_browser_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, web, run = free_port(), free_port(), make_run(T=40)
+    monkeypatch.setattr(viewer, "PORT", data)
+    with viewer.served((), web, live=True) as (address, port), urlopen(f"http://127.0.0.1:{web}") as page:
+        assert port == data
+        assert address == f"http://127.0.0.1:{web}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy"
+        assert b"<html" in page.read()
+        with km.Recorder(live=True, port=data, **about(run)) as recorder:
+            for step in steps_of(run):
+                recorder(step)
+    assert not is_up(data)
 
 
 def test_a_viewer_is_opened_where_there_is_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
