@@ -7,15 +7,17 @@ docstrings and from `koopmpc COMMAND --help`.
 import inspect
 from collections.abc import Iterator
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
 
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.lazy import _imported
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
 
 ROOMS = {  # where a name is defined → title and first sentence of its page, in the order of the data
     "plants": ("Plants", "Equations, step functions and Gymnasium environments become x⁺ = F(x, u)."),
@@ -145,8 +147,10 @@ def _spelled(parameter: Any) -> str:
     return ", ".join(f"`{word}`" for word in words)
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
+def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
     """Add the pages to the site (a hook of MkDocs)."""
+    from mkdocs.structure.files import File
+
     named = entries()
     pages = {room: page(room, [e for e in named if e.room == room]) for room in ROOMS}
     for name, text in {"index": index(named), "commands": commands(), **pages}.items():

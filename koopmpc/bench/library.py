@@ -54,6 +54,13 @@ def load_problem(problem: str | Path) -> Problem:
     ------
     ProblemError
         There is no such problem or case, the file raises, or it defines no `problem`.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> problem = km.load_problem("pendulum")  # or the path of your own file
+    >>> problem.dt, list(problem.cases)
+    (0.05, ['upright', 'hang', 'hold'])
     """
     text = str(problem)
     path, case = _find(text), ""

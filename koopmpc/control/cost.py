@@ -62,6 +62,12 @@ class Cost(Value):
         A weight is indefinite or not symmetric.
     DataError
         Both Q_N and tail are given; tail is no whole number or negative; u_target is none of the above.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plain = km.Cost(Q=[10, 1], R=0.1)  # errors of the states, and the input beside the one that holds the reference
+    >>> upright = km.Cost(Q=[10, 10, 1], R=0.1, of=km.Fourier(1, states="theta") + km.State("omega"))  # sin θ, cos θ, ω
     """
 
     Q: ArrayLike

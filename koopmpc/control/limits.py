@@ -95,6 +95,12 @@ class Limits(Value):
     DataError
         Crossed limits; rate limits without zero between them; y limits without `of`; a negative slack weight; a
         negative margin, or one that makes limits cross.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> limits = km.Limits(u_min=-25, u_max=25, x_min=[-1.2, -4], x_max=[1.2, 4])  # inputs hard, states soft
+    >>> hard = km.Limits(u_min=-25, u_max=25, du_max=8, x_max=[1.2, 4], slack=None)
     """
 
     u_min: ArrayLike | None = None

@@ -49,6 +49,15 @@ class LQR:
         The cost is on an observable that the lifting lacks.
     DefinitenessError
         R + BᵀPB is not positive definite.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> model = km.LinearPredictor.local(plant, [0, 0], [0])
+    >>> km.LQR(model, cost, limits)([0.1, 0.0], [0.0, 0.0]).status.name
+    'UNCONSTRAINED'
     """
 
     def __init__(self, predictor: LinearPredictor, cost: Cost, limits: Limits | None = None) -> None:
@@ -201,6 +210,13 @@ def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
     """Minimise Σ xᵀQx + uᵀRu for x⁺ = A x + B u: K = (R + BᵀPB)⁻¹BᵀPA, P = Q + AᵀP(A − BK).
 
     Parameters and errors as in `lqr`. With a Constant observable there is no such solution; `LQR` iterates instead.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> gain = km.dlqr([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], Q=[1, 0.1], R=0.01)
+    >>> gain.K.round(2)  # u = −K x
+    array([[7.6 , 4.98]])
     """
     A, B, Q, R = _pair(A, B, Q, R, definite=True)
     try:

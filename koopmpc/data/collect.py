@@ -67,6 +67,14 @@ def collect(
         x0 or the excitation does not fit the plant.
     DataError
         A state became NaN or infinite, or the plant lacks a method.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> len(data), data[0].X.shape, data[0].U.shape
+    (60, (31, 2), (30, 1))
     """
     if not isinstance(plant, StepMap):
         require_plant(plant)

@@ -39,6 +39,15 @@ class Delay(Value):
     ----------
     Takens, "Detecting strange attractors in turbulence", 1981; with inputs, as here: Korda & Mezić, Automatica 93,
     2018.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> model = km.edmd(data, km.State(), embedding=km.Delay(1))  # acts on [x_k, u_{k−1}, x_{k−1}]
+    >>> model.nz
+    5
     """
 
     steps: int

@@ -35,6 +35,14 @@ class Episode(Value):
         X has not one row more than U and W.
     DataError
         There is NaN or inf.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import numpy as np
+    >>> episode = km.Episode(X=np.zeros((101, 2)), U=np.ones((100, 1)))  # x_0 … x_100, u_0 … u_99
+    >>> episode.X.shape
+    (101, 2)
     """
 
     U: Float[np.ndarray, "T nu"]
@@ -95,6 +103,16 @@ class Episodes(Named, Value):
         The episodes, or the names, differ in nx, nu or nw.
     DataError
         There is no episode, one is too short, dt is not above zero, or a name is used twice.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import numpy as np
+    >>> X, U = np.zeros((101, 2)), np.ones((100, 1))
+    >>> data = km.Episodes([km.Episode(X=X, U=U)] * 10, dt=0.01, states=["x [m]", "v [m/s]"], inputs=["force [N]"])
+    >>> train, held_out = data.split(0.8, rng=0)  # by episode, never inside one
+    >>> len(train), data.snapshots().X.shape
+    (8, (1000, 2))
     """
 
     episodes: tuple[Episode, ...]

@@ -65,7 +65,16 @@ class Levels(OpenLoop):
 
 
 class Noise(Levels):
-    """u uniform between `low` and `high`, drawn anew every `hold` steps."""
+    """u uniform between `low` and `high`, drawn anew every `hold` steps.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> push = km.Noise(-5, 5, hold=3)  # a new value every third step
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> km.collect(plant, [[0.0, 0.0]], push, episodes=1, steps=6)[0].U.ravel().round(1)
+    array([ 4.4,  4.4,  4.4, -1.8, -1.8, -1.8])
+    """
 
     def sequence(self, steps: int, dt: float, rng: np.random.Generator) -> Float[np.ndarray, "steps nu"]:
         """Return the draws, each held."""
@@ -239,6 +248,15 @@ class Feedback(Excitation):
         The point to hold the plant at, scalars or (ny,) and (nu,); zero by default.
     u_min, u_max
         Limits on u, scalars or (nu,).
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> pd = km.Feedback([[40, 15]], km.Noise(-5, 5), u_min=-25, u_max=25)  # it would fall over
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), pd, episodes=5, steps=60)
+    >>> bool(max(abs(episode.X[-1, 0]) for episode in data) < 1)
+    True
     """
 
     K: Float[np.ndarray, "nu ny"]

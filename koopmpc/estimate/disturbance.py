@@ -51,6 +51,20 @@ class LiftedDisturbance(Value):
     ----------
     von Neumann, "Distribution of the ratio of the mean square successive difference to the variance", Ann. Math.
     Stat. 12, 1941.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> pd = km.Feedback([[40, 15]], km.Noise(-20, 20), u_min=-25, u_max=25)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), pd, episodes=60, steps=60)
+    >>> model = km.edmd(data, km.State() + km.Fourier(1, states="theta"))
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.KoopmanMPC(model, cost, limits, horizon=40, estimator=km.LiftedDisturbance())
+    >>> heavy = km.discretize(type(km.load_problem("pendulum").dynamics)(m=1.2), dt=0.05)
+    >>> run = km.simulate(heavy, mpc, x0=[0, 0], reference=[0.5, 0], steps=300)
+    >>> bool(abs(run.X[-1, 0] - 0.5) < 1e-6)  # though the bob is a fifth heavier
+    True
     """
 
     gain: float | None = None

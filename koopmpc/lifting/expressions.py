@@ -42,6 +42,14 @@ class Expressions(Lifting):
         Takes the column x and returns a list of expressions: ``lambda x: [x[1] * ca.sin(x[0])]``.
     names
         The name of each expression, by which limits and costs find it.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import casadi as ca
+    >>> drag = km.Expressions(lambda x: [x[1] * ca.fabs(x[1])], ["v|v|"])
+    >>> (km.State() + drag).bind(("x", "v"))([1.0, -2.0])
+    array([ 1., -2., -4.])
     """
 
     fn: Callable[[ca.SX], Sequence[ca.SX]]

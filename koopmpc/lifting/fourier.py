@@ -27,6 +27,13 @@ class Fourier(Lifting):
         Highest multiple k.
     states
         The chosen states, by index or by name, with or without the unit; all of them by default.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> circle = km.Fourier(1, states="theta")
+    >>> (circle + circle * km.State("omega")).bind(("theta", "omega")).names
+    ('sin(theta)', 'cos(theta)', 'omega*sin(theta)', 'omega*cos(theta)')
     """
 
     harmonics: int

@@ -22,6 +22,13 @@ class State(Lifting):
     ----------
     states
         The chosen states, by index or by name, with or without the unit; all of them by default.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> lifting = km.State() + km.Fourier(1, states="theta") + km.Constant()
+    >>> lifting.bind(("theta [rad]", "omega [rad/s]")).names
+    ('theta [rad]', 'omega [rad/s]', 'sin(theta)', 'cos(theta)', '1')
     """
 
     states: Chosen | None = None
@@ -76,6 +83,13 @@ class Monomials(Lifting):
     """ψ(x) = all x₁^a₁ … xₙ^aₙ of total degree a₁ + … + aₙ from 2 to `degree`, in graded order.
 
     Degree 1 is `State`, degree 0 is `Constant`; add them where they are wanted.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> lifting = km.State() + km.Monomials(2)
+    >>> lifting.bind(("x", "v")).names
+    ('x', 'v', 'x^2', 'x*v', 'v^2')
     """
 
     degree: int

@@ -139,6 +139,16 @@ def metrics(run: Run) -> Metrics:
     ShapeError
         The reference has another number of columns than the outputs that the cost tracks, or than the states where
         there is no cost; a weight or a limit has another size than what it is for.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.LinearMPC(plant, [0, 0], [0], cost, limits, horizon=40)
+    >>> run = km.simulate(plant, mpc, x0=[0.5, 0], reference=[0, 0], steps=100, cost=cost, limits=limits)
+    >>> km.metrics(run).violation, km.metrics(run).settling_time < 5
+    (0.0, True)
     """
     checks.kind(run, "run", Run, "simulate returns one")
     error = tracking_error(run)

@@ -108,6 +108,16 @@ def simulate(
     ------
     ShapeError, DataError
         Sizes do not fit; plant or controller lack a member; a controller returned a u that is not finite.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.LinearMPC(plant, [0, 0], [0], cost, limits, horizon=40)
+    >>> run = km.simulate(plant, mpc, x0=[0.5, 0], reference=[0, 0], steps=100, cost=cost, limits=limits)
+    >>> run.X.shape, run.U.shape, bool(abs(run.X[-1, 0]) < 0.01)
+    ((101, 2), (100, 1), True)
     """
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))

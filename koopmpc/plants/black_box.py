@@ -54,6 +54,16 @@ def black_box(
         `step` or `measure` cannot be called, dt is not above zero, or there is no state.
     ShapeError
         Later, where a function returns another number of values than there are names.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> def tank(x, u):
+    ...     return [x[0] + 0.5 * u[0] - 0.02 * max(x[0], 0.0) ** 0.5]
+    ...
+    >>> plant = km.black_box(tank, dt=1.0, states=["level [m]"], inputs=["inflow [m³/s]"])
+    >>> km.collect(plant, km.Uniform(0.2, 2.0), km.Noise(0.0, 0.1), episodes=3, steps=10)[0].X.shape
+    (11, 1)
     """
     for function, name in ((step, "step"), (measure, "measure")):
         if function is not None and not callable(function):

@@ -18,6 +18,18 @@ class Dynamics(Named, ABC):
     """A plant ẋ = f(x, u), y = h(x): a frozen dataclass whose fields are the parameters, with units.
 
     `states` and `inputs` name the rows of x and u, unit included: ``("theta [rad]", "omega [rad/s]")``.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import casadi as ca
+    >>> class Spring(km.Dynamics):
+    ...     states, inputs = ("position [m]", "velocity [m/s]"), ("force [N]",)
+    ...     def rhs(self, x, u):
+    ...         return ca.vertcat(x[1], u[0] - x[0] - 2 * x[0] ** 3)
+    ...
+    >>> km.discretize(Spring(), dt=0.05)([0.5, 0.0], [1.0]).round(4)
+    array([0.5003, 0.0125])
     """
 
     states: ClassVar[tuple[str, ...]]

@@ -269,6 +269,16 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
         dt is not above zero.
     ShapeError
         `dynamics.rhs` returns another number of rows than there are states.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> plant([0.1, 0.0], [0.0]).round(4)  # one step; plant.rollout(x0, U) takes many
+    array([0.1006, 0.0245])
+    >>> plant.linearize([0.0, 0.0], [0.0]).B.round(4)
+    array([[0.0003],
+           [0.0125]])
     """
     checks.positive(dt, "dt", "s")
     F = integrator.step(right_side(dynamics), dt)

@@ -104,6 +104,17 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
         The metadata hold something other than numbers, names, lists and arrays; the scene's shapes come and go.
     LogError
         The path cannot be written.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> gain = km.LQR(km.LinearPredictor.local(plant, [0, 0], [0]), cost, limits)
+    >>> run = km.simulate(plant, gain, x0=[0.5, 0], reference=[0, 0], steps=100, cost=cost, limits=limits)
+    >>> km.record(run, "pendulum.rrd")  # then: koopmpc view pendulum.rrd
+    >>> km.load_run("pendulum.rrd") == run
+    True
     """
     checks.kind(run, "run", Run, "pass what simulate returned; a model is written by km.recording.record_model")
     scene, model = scene or run.scene, run.model if model is None else model

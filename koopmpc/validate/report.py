@@ -101,6 +101,17 @@ def trust(
         Episodes and predictor differ in states or inputs.
     DataError
         They differ in dt, an episode is shorter than the horizon, or there is one alone.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> train, held_out = data.split(0.6, rng=0)
+    >>> model = km.edmd(train, km.State() + km.Fourier(1, states="theta"))
+    >>> report = km.trust(model, held_out, horizon=5, train=train)
+    >>> report.trusted
+    True
     """
     horizon, source = checks.count(horizon, "horizon"), checks.generator(rng)
     errors = score(predictor, episodes_of(held_out), horizon)

@@ -87,6 +87,16 @@ def score(predictor: AnyPredictor, episodes: Episodes, horizon: int, *, stride: 
         An episode is shorter than the horizon, or has another dt.
     ShapeError
         The episodes have other states or inputs.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> train, held_out = data.split(0.8, rng=0)
+    >>> found = km.score(km.edmd(train, km.State() + km.Fourier(1, states="theta")), held_out, horizon=10)
+    >>> found.rmse.shape  # a row a step ahead, a column a state, in its unit
+    (10, 2)
     """
     horizon, stride = checks.count(horizon, "horizon"), checks.count(stride, "stride")
     points = comparable(predictor, episodes, horizon)

@@ -81,6 +81,19 @@ class KoopmanMPC(MPCBase):
     ----------
     Korda & Mezić, "Linear predictors for nonlinear dynamical systems: Koopman operator meets model predictive
     control", Automatica 93, 2018.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> pd = km.Feedback([[40, 15]], km.Noise(-20, 20), u_min=-25, u_max=25)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), pd, episodes=60, steps=60)
+    >>> model = km.edmd(data, km.State() + km.Fourier(1, states="theta"))
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.KoopmanMPC(model, cost, limits, horizon=40)
+    >>> move = mpc([0.8, 0.0], [0.0, 0.0])
+    >>> move.u.round(3), move.status.name
+    (array([-25.]), 'OPTIMAL')
     """
 
     _wanted: ClassVar[Coordinates | None] = None  # QP coordinates, set by a subclass in tests; None: the solver's

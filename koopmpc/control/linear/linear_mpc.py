@@ -46,6 +46,15 @@ class LinearMPC(KoopmanMPC):
     References
     ----------
     Rawlings, Mayne & Diehl, "Model Predictive Control: Theory, Computation, and Design", 2nd ed., 2017, chapter 1.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.LinearMPC(plant, [0, 0], [0], cost, limits, horizon=40)
+    >>> mpc([0.1, 0.0], [0.0, 0.0]).status.name
+    'UNCONSTRAINED'
     """
 
     def __init__(

@@ -97,6 +97,18 @@ class BilinearMPC(StagedMPC):
     ----------
     Diehl, Bock & Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control",
     SIAM J. Control Optim. 43, 2005.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> model = km.bilinear_edmd(data, km.State() + km.Fourier(2, states="theta"), difference=True)
+    >>> upright = km.Fourier(1, states="theta") + km.State("omega")
+    >>> cost, limits = km.Cost(Q=[10, 10, 1], R=0.1, of=upright), km.Limits(u_min=-10, u_max=10)
+    >>> mpc = km.BilinearMPC(model, cost, limits, horizon=40)
+    >>> mpc([0.5, 0.0], [0, 1, 0]).status.name
+    'OPTIMAL'
     """
 
     _compiles_model = True  # a subclass that is used briefly leaves it to the interpreter

@@ -71,6 +71,15 @@ class NonlinearMPC(StagedMPC):
     ----------
     Wächter & Biegler, "On the implementation of an interior-point filter line-search algorithm for large-scale
     nonlinear programming", Math. Prog. 106, 2006.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.NonlinearMPC(plant, cost, limits, horizon=20, solver="fatrop")
+    >>> mpc([0.5, 0.0], [0.0, 0.0]).status.name
+    'OPTIMAL'
     """
 
     @heard  # CasADi swallows a Ctrl-C while it builds expressions

@@ -76,6 +76,16 @@ def bilinear_edmd(
     ----------
     Bruder, Fu & Vasudevan, "Advantages of bilinear Koopman realizations for the modeling and control of systems
     with unknown dynamics", IEEE Robot. Autom. Lett. 6, 2021.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> model = km.bilinear_edmd(data, km.State() + km.Fourier(1, states="theta"), difference=True)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> km.BilinearMPC(model, cost, limits, horizon=20)([0.5, 0.0], [0.0, 0.0]).status.name
+    'UNCONSTRAINED'
     """
     source = source_of(episodes)
     if source.nu == 0:

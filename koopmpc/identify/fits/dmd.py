@@ -58,6 +58,16 @@ def dmd(
     Tu et al., "On dynamic mode decomposition: theory and applications", J. Comput. Dyn. 1, 2014; noise: Dawson,
     Hemati, Williams & Rowley, "Characterizing and correcting for the effect of sensor noise in the dynamic mode
     decomposition", Exp. Fluids 57, 2016.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import numpy as np
+    >>> t = np.arange(0, 10, 0.1)
+    >>> X = np.column_stack([np.cos(2 * t), np.sin(2 * t)])
+    >>> model = km.dmd(km.Episodes([km.Episode(X=X, U=np.zeros((99, 0)))], dt=0.1))
+    >>> abs(np.log(model.eigenvalues).imag / 0.1).round(6)  # rad/s
+    array([2., 2.])
     """
     regression = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", options=options)
     return linear_predictor(regression, fit(regression, rank=rank, method=method))

@@ -292,6 +292,17 @@ def edmd(
     ----------
     Williams, Kevrekidis & Rowley, "A data-driven approximation of the Koopman operator", J. Nonlinear Sci.
     25, 2015; with inputs: Korda & Mezić, Automatica 93, 2018; noise: Dawson et al., Exp. Fluids 57, 2016.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> model = km.edmd(data, km.State() + km.Fourier(1, states="theta"))
+    >>> model.A.shape, model.B.shape
+    ((4, 4), (4, 1))
+    >>> model.rollout([0.5, 0.0], [[0.0], [1.0]]).shape  # x_0 … x_2
+    (3, 2)
     """
     regression = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **options)
     return linear_predictor(regression, fit(regression, ridge=ridge, rank=rank, method=method))

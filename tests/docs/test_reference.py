@@ -1,0 +1,75 @@
+"""The reference of the site: every public name has an entry, every entry a page, and the examples of docstrings run."""
+
+import doctest
+import importlib
+import inspect
+import os
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+
+import koopmpc as km
+from tests.docs.page import DOCS
+
+sys.path.insert(0, str(DOCS / "tools"))
+import reference
+
+ENTRIES = reference.entries()
+WITH_EXAMPLE = [entry for entry in ENTRIES if callable(entry.found) and ">>>" in (inspect.getdoc(entry.found) or "")]
+
+
+def test_every_public_name_has_an_entry_that_leads_to_where_it_is_defined():
+    found = {id(entry.found) for entry in ENTRIES}
+    for name in dir(km):
+        value = getattr(km, name)
+        public = getattr(value, "__all__", []) if isinstance(value, ModuleType) else [name]
+        room = value if isinstance(value, ModuleType) else km
+        for each in public:
+            assert id(getattr(room, each)) in found, f"{name}.{each}"
+    for entry in ENTRIES:
+        home, _, attribute = entry.path.rpartition(".")
+        assert getattr(importlib.import_module(home), attribute) is entry.found
+    for name in ("NaNSensor", "Fault"):
+        assert f"km.faults.{name}" in {entry.name for entry in ENTRIES}
+    assert {"km.scene.Box", "km.errors.LogError", "km.plot.spectrum"} <= {entry.name for entry in ENTRIES}
+
+
+def test_every_room_has_a_page_in_the_menu_and_every_function_and_class_a_first_line():
+    menu = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    for entry in ENTRIES:
+        assert f"reference/{entry.room}.md" in menu, entry.name
+        assert entry.first_line or not callable(entry.found), entry.name
+    assert set(reference.ROOMS) == {entry.room for entry in ENTRIES}
+
+
+def test_every_command_is_on_its_page_with_what_it_says_of_itself():
+    page = reference.commands()
+    for command in ("fit", "bench", "export", "inspect"):
+        assert f"## koopmpc {command}\n" in page
+    assert "`--seeds`" in page
+
+
+def test_thirty_names_have_an_example():
+    assert len(WITH_EXAMPLE) >= 30
+    assert {"km.edmd", "km.KoopmanMPC", "km.simulate", "km.Cost"} <= {entry.name for entry in WITH_EXAMPLE}
+
+
+@pytest.mark.parametrize("entry", WITH_EXAMPLE, ids=lambda entry: entry.name)
+def test_the_examples_of_a_docstring_run_and_show_what_they_say(entry, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    example = doctest.DocTestParser().get_doctest(inspect.getdoc(entry.found), {}, entry.name, None, None)
+    said = []
+    doctest.DocTestRunner(verbose=False).run(example, out=said.append)
+    assert not said, "".join(said)
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_holds_every_entry(tmp_path):
+    pytest.importorskip("material", reason="the extra docs is not installed")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    subprocess.run(command, cwd=DOCS.parent, check=True, env=environment)
+    for entry in ENTRIES:
+        assert f'id="{entry.path}"' in (tmp_path / "reference" / f"{entry.room}.html").read_text(encoding="utf-8")
