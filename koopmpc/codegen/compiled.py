@@ -3,6 +3,7 @@
 import ctypes
 import subprocess
 import warnings
+from threading import Lock
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -22,16 +23,19 @@ from koopmpc.codegen.machine import (
     plant_text,
     whole_call,
 )
-from koopmpc.codegen.tables import tables_of
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.codegen.staged import target_rows
+from koopmpc.codegen.tables import Exportable, refusal
+from koopmpc.control.linear.plan import planned_states
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, WholeRun, alone, busy
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.compiled import compiler, library, private_cache
 from koopmpc.plants.step_map import StepMap
 
 _STATUS, _FALLBACK = list(Status), list(Fallback)
 _PLANTS = 8  # plants whose machine code a controller keeps
+_ROWS = 100_000  # reference rows whose targets a controller keeps
 
 
 class NoCompilerWarning(UserWarning):
@@ -48,7 +52,7 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
     Parameters
     ----------
     controller
-        An LQR, a KoopmanMPC or a LinearMPC.
+        An LQR, a KoopmanMPC, a LinearMPC or a BilinearMPC.
     precision
         "double", or "float": the numbers of a microcontroller, to look at what they cost.
 
@@ -61,10 +65,10 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     if isinstance(controller, Compiled):
         return controller
-    if not isinstance(controller, LQR | KoopmanMPC):
-        tables_of(controller, single=False)  # says why not
-    if getattr(controller, "watch", None) is not None:
-        warnings.warn("the monitor is not in the C: no Move says whether it is known", UserWarning, stacklevel=2)
+    error = refusal(controller)
+    if error is not None:
+        raise error
+    assert isinstance(controller, Exportable), "all others are refused"
     command = compiler()
     if command is None:
         warnings.warn(
@@ -72,7 +76,7 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
         )
         return controller
     try:
-        return Compiled(controller, precision, command)  # pyright: ignore[reportArgumentType]  # see above
+        return Compiled(controller, precision, command)
     except (OSError, subprocess.SubprocessError) as error:
         warnings.warn(
             f"the C compiler failed, the controller stays in Python: {first_error(error)}", NoCompilerWarning, 2
@@ -90,18 +94,43 @@ class ManyRuns(NamedTuple):
     slack: Float[np.ndarray, "E T"]
 
 
+class _Targets:
+    """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
+
+    def __init__(self, controller: BilinearMPC) -> None:
+        self._controller, self._lock = controller, Lock()
+        self._known: set[bytes] = set()
+        self._table = np.zeros((0, 1))
+
+    def of(self, reference: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "rows size"]:
+        """Return the table with the rows of this reference in it."""
+        with self._lock:
+            rows = np.atleast_2d(reference)
+            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
+            if len(self._known) + len(rows) > _ROWS:
+                self._known, self._table = set(), np.zeros((0, 1))
+            new = [row for row in rows if row.tobytes() not in self._known]
+            if new:
+                found = target_rows(self._controller, np.array(new))
+                self._table = np.vstack([self._table, found]) if len(self._table) else found
+                self._known |= {row.tobytes() for row in new}
+            return self._table
+
+
 class Compiled:
     """A controller in machine code; see `compiled`.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
     """
 
-    def __init__(self, controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> None:
+    def __init__(self, controller: Exportable, precision: Precision, command: list[str]) -> None:
         self.original, self.precision = controller, precision
         self._built = built = built_of(controller, precision, command)
         sizes = built.sizes
         self.dt, self.nu, self.horizon = controller.dt, sizes["NU"], sizes["HORIZON"]
-        self.cost, self.limits, self.predictor = controller.cost, controller.limits, controller.predictor
+        self.cost, self.limits = controller.cost, controller.limits
+        self._targets = _Targets(controller) if isinstance(controller, BilinearMPC) else None
+        self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # of a linear plan, from its inputs and its start
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
         self._memory = np.zeros(-(-built.state_size // 8))
         self._plants: dict[int, tuple[StepMap, ctypes.CDLL]] = {}
@@ -126,6 +155,9 @@ class Compiled:
         self._call = self._built.code.koopmpc_call
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._count, self._told, self._is_double = 1, False, not single
+        self._solver = "" if self._targets is not None else "daqp"
+        if self._targets is not None:
+            self._aim(np.zeros((0, self._nr)))
 
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
@@ -133,7 +165,7 @@ class Compiled:
         kind = self._y.dtype
         given = (
             None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
-            for value, name, size in ((x0, "x0", self.predictor.nx), (u_prev, "u_prev", self.nu))
+            for value, name, size in ((x0, "x0", self._built.sizes["NX"]), (u_prev, "u_prev", self.nu))
         )
         start, last = given
         self._built.code.koopmpc_init(
@@ -141,6 +173,16 @@ class Compiled:
             None if start is None else ctypes.c_void_p(start.ctypes.data),
             None if last is None else ctypes.c_void_p(last.ctypes.data),
         )
+        self._aim(np.zeros((0, self._nr)))
+
+    def _aim(self, rows: Float[np.ndarray, "rows nr"]) -> None:
+        """Have the C know the targets of these rows; only a BilinearMPC needs that."""
+        if self._targets is not None:
+            self._aimed = rows.tobytes()
+            self._table = self._targets.of(rows).astype(self._y.dtype)
+            self._built.code.koopmpc_use_targets(
+                ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_void_p(self._table.ctypes.data), len(self._table)
+            )
 
     def __call__(
         self,
@@ -169,6 +211,8 @@ class Compiled:
                 count = self._rows(target, self._reference, self._nr, "reference")
             if count != self._count:  # a field that is written takes as long as the C step
                 frame.reference.count = self._count = count
+            if self._targets is not None and target.tobytes() != self._aimed:
+                self._aim(target)
             if applied is not None or w is not None or self._told:
                 self._tell(applied, w)
             self._call(self._pointer)
@@ -182,7 +226,7 @@ class Compiled:
                 perf_counter() - start,
                 frame.iterations,
                 frame.slack,
-                "daqp" if frame.iterations else "",
+                self._solver if frame.iterations else "",
             )
         finally:
             self._token.append(held)
@@ -218,24 +262,23 @@ class Compiled:
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
-        if isinstance(self.original, LQR):
+        original, sizes, memory = self.original, self._built.sizes, ctypes.c_void_p(self._memory.ctypes.data)
+        if isinstance(original, LQR):
             return None
-        model, sizes = self.predictor, self._built.sizes
         U = np.zeros((sizes["N"], self.nu), self._y.dtype)
-        if not self._built.code.koopmpc_plan(ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_void_p(U.ctypes.data)):
+        if not self._built.code.koopmpc_plan(memory, ctypes.c_void_p(U.ctypes.data)):
             return None
-        U = U.astype(np.float64)
-        known = self._memory.view(self._y.dtype)[: sizes["KNOWN"]].astype(np.float64)
-        first = model.nz + self.nu * sizes["WITH_RATES"]
-        end = first + sizes["N"] * model.nw
-        push = known[first:end].reshape(sizes["N"], model.nw) @ model.E.T
-        if sizes["ESTIMATOR"]:
-            push = push + known[end:]
-        Z = np.empty((sizes["N"] + 1, model.nz))
-        Z[0] = known[: model.nz]
-        for k in range(sizes["N"]):
-            Z[k + 1] = model.A @ Z[k] + model.B @ U[k] + push[k]
-        return Plan(Z @ model.C.T, U)
+        if isinstance(original, BilinearMPC):
+            X = np.zeros((sizes["N"] + 1, sizes["NX"]), self._y.dtype)
+            self._built.code.koopmpc_plan_states(memory, ctypes.c_void_p(X.ctypes.data))
+            return Plan(X.astype(np.float64), U.astype(np.float64))
+        if self._states is None:
+            rates, disturbed = bool(sizes["WITH_RATES"]), bool(sizes["ESTIMATOR"])
+            steps = np.arange(sizes["N"])
+            self._states = planned_states(original.predictor, steps, with_rates=rates, disturbed=disturbed)
+        known = self._memory.view(self._y.dtype)[: sizes["KNOWN"]]
+        X = self._states @ np.concatenate([U.ravel(), known, [1.0]], dtype=np.float64)
+        return Plan(X.reshape(sizes["N"] + 1, -1), U.astype(np.float64))
 
     @alone
     def whole_run(
@@ -257,6 +300,7 @@ class Compiled:
         code = None if misfit or self.precision == "float" else self._machine_of(plant)
         if code is None:
             return None
+        self._aim(rows)
         rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
         slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
@@ -298,6 +342,7 @@ class Compiled:
         if code is None:
             raise DataError("the plant, or a controller of floats, cannot run in C as a whole; use km.simulate")
         rows = np.ascontiguousarray(given[np.minimum(np.arange(T + self.horizon + 1), len(given) - 1)])
+        self._aim(given)
         E = len(starts)
         X, U = np.empty((E, T + 1, starts.shape[1])), np.empty((E, T, self.nu))
         X[:, 0] = starts
@@ -339,9 +384,10 @@ class Compiled:
         return _rebuilt, (self.original, self.precision, self._memory)
 
 
-def _rebuilt(controller: LQR | KoopmanMPC, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:
+def _rebuilt(controller: Exportable, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:
     """Return the controller of a pickle, built here; it goes on where the pickled one was."""
     result = compiled(controller, precision=precision)
     if isinstance(result, Compiled) and result._memory.shape == memory.shape:
         result._memory[:] = memory
+        result._aim(np.zeros((0, result._nr)))  # the table is where it is now
     return result

@@ -12,16 +12,20 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.codegen.machine import Precision
-from koopmpc.codegen.sources import constants, flops, iteration_flops, shipped, sources_of
-from koopmpc.codegen.tables import Tables, tables_of
+from koopmpc.codegen.sources import constants, flops, iteration_flops, shipped, sources_of, tables_of
+from koopmpc.codegen.tables import Exportable, Tables, refusal
 from koopmpc.codegen.text import Language, function, traced
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.control.nonlinear.iteration import MOST
+from koopmpc.disk import writing
 from koopmpc.errors import DataError
 from koopmpc.estimate.filtered import Kalman
 from koopmpc.plants.compiled import compiler
 from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _BUILT = (".o", ".a", ".su")  # what a build leaves in the folder
 _PROGRAMS = ("example", "sanitized")
@@ -51,7 +55,7 @@ def export(
     Parameters
     ----------
     controller
-        An LQR, a KoopmanMPC or a LinearMPC, without a time_limit.
+        An LQR, a KoopmanMPC, a LinearMPC or a BilinearMPC, without a time_limit.
     folder
         Is made; one that holds other files than those of an export is refused.
     precision
@@ -76,7 +80,12 @@ def export(
     if precision not in ("double", "float"):
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     single = precision == "float"
-    tables = tables_of(controller, single=single)
+    error = refusal(controller)
+    if error is not None:
+        raise error
+    assert isinstance(controller, Exportable), "all others are refused"
+    rows = _reference_of(controller, reference)
+    tables = tables_of(controller, rows, single=single)
     coarse = float(np.finfo(np.float32).eps) * tables.conditioning
     if single and coarse > _DIGITS:
         warnings.warn(
@@ -85,19 +94,32 @@ def export(
             PrecisionWarning,
             stacklevel=2,
         )
-    if not isinstance(controller, LQR | KoopmanMPC):
-        raise AssertionError("tables_of refuses all others")
     texts = sources_of(tables, single=single)
     texts |= {name: shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
-    texts |= _plant(controller, tables, plant, x0, reference, checks.count(steps, "steps"), Language(single))
+    texts |= _plant(controller, tables, plant, x0, rows, checks.count(steps, "steps"), Language(single))
     root = Path(folder)
     _refuse_others(root, {*texts, "README.md"})
-    for name, text in texts.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    (root / "README.md").write_text(_readme(controller, tables, root, precision), encoding="utf-8")
+    for path, text in texts.items():
+        _write(root / path, text)
+    _write(root / "README.md", _readme(controller, tables, root, precision))
     return root
+
+
+def _write(path: Path, text: str) -> None:
+    with writing(path) as file:
+        file.write(text.encode())
+
+
+def _reference_of(controller: Exportable, reference: ArrayLike | None) -> Float[np.ndarray, "rows nr"]:
+    """Return the rows of a reference, by default one of zeros."""
+    if isinstance(controller, LQR):
+        nr = controller._nr
+    else:
+        nr = len(controller._outputs.Q) if isinstance(controller, BilinearMPC) else len(controller._map.track.Q)
+    if reference is None:
+        return np.zeros((1, nr))
+    rows = np.atleast_2d(checks.array(reference, "reference"))
+    return checks.array(rows, "reference", (None, nr))
 
 
 def _refuse_others(root: Path, known: set[str]) -> None:
@@ -112,19 +134,19 @@ def _refuse_others(root: Path, known: set[str]) -> None:
 
 
 def _plant(
-    controller: LQR | KoopmanMPC,
+    controller: Exportable,
     tables: Tables,
     plant: StepMap | None,
     x0: ArrayLike | None,
-    reference: ArrayLike | None,
+    held: Float[np.ndarray, "rows nr"],
     steps: int,
     language: Language,
 ) -> dict[str, str]:
     """Return plant.c and plant.h: what the example controls."""
-    predictor, sizes = tables.predictor, tables.sizes
+    model, sizes = tables.model, tables.sizes
     if plant is not None:
         checks.kind(plant, "plant", StepMap, "discretize the dynamics")
-    step_map = predictor.step_map() if plant is None else plant
+    step_map = plant or (model if isinstance(model, StepMap) else model.step_map())
     nx, nu = step_map.F.size1_in(0), step_map.F.size1_in(1)
     if nu != sizes["NU"]:
         raise DataError(f"the plant has {nu} inputs, the controller {sizes['NU']}; pass the plant that it controls")
@@ -132,8 +154,7 @@ def _plant(
     measured = _measured(controller, step_map, x, sizes["NY"])
     step = traced(step_map.F, "the plant")
     look = traced(ca.Function("measure", [x], [measured]), "what the plant measures")
-    start = _start(predictor.scale, predictor.C, nx) if x0 is None else checks.array(x0, "x0", (nx,))
-    held = np.zeros(sizes["NR"]) if reference is None else checks.array(reference, "reference", (sizes["NR"],))
+    start = _start(model, nx) if x0 is None else checks.array(x0, "x0", (nx,))
     rest = np.clip(np.zeros(nu), tables.limits["input_low"], tables.limits["input_high"])
     arrays = "".join(
         language.array(name, values).replace("static const", "const") + "\n"
@@ -148,8 +169,8 @@ def _plant(
     header = (
         "/** @file plant.h @brief What the example controls. */\n#ifndef PLANT_H\n#define PLANT_H\n\n"
         '#include "koopmpc.h"\n\n'
-        f"#define PLANT_NX {nx}\n#define PLANT_STEPS {steps}\n\n"
-        f"extern const koopmpc_real plant_x0[{nx}], plant_u0[{nu}], plant_reference[{len(held)}];\n\n"
+        f"#define PLANT_NX {nx}\n#define PLANT_STEPS {steps}\n#define PLANT_ROWS {len(held)}\n\n"
+        f"extern const koopmpc_real plant_x0[{nx}], plant_u0[{nu}], plant_reference[{held.size}];\n\n"
         "/** next = F(x, u), one sample later. */\n"
         "void plant_step(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *next);\n\n"
         "/** y, what the controller measures. */\nvoid plant_measure(const koopmpc_real *x, koopmpc_real *y);\n\n"
@@ -158,11 +179,11 @@ def _plant(
     return {"plant.c": code, "plant.h": header}
 
 
-def _measured(controller: LQR | KoopmanMPC, plant: StepMap, x: ca.SX, ny: int) -> ca.SX:
+def _measured(controller: Exportable, plant: StepMap, x: ca.SX, ny: int) -> ca.SX:
     """Return what the controller takes as y, of the plant's state x."""
-    observer = controller._observer if isinstance(controller, LQR) else controller._initial.observer
-    predictor = controller.predictor
-    if isinstance(observer, Kalman) and len(predictor.lifting.bound_states) == x.numel():
+    observer = controller._initial.observer if isinstance(controller, KoopmanMPC) else None
+    predictor = None if isinstance(controller, BilinearMPC) else controller.predictor
+    if isinstance(observer, Kalman) and predictor is not None and len(predictor.lifting.bound_states) == x.numel():
         system = observer._system
         H = np.zeros((ny, predictor.nz))
         H[:, system.kept] = system.M[:, : len(system.kept)]
@@ -177,9 +198,11 @@ def _measured(controller: LQR | KoopmanMPC, plant: StepMap, x: ca.SX, ny: int) -
     return y
 
 
-def _start(scale: Float[np.ndarray, "nz nz"] | None, C: Float[np.ndarray, "nx nz"], nx: int) -> Float[np.ndarray, " n"]:
-    sizes = np.ones(len(C)) if scale is None else np.linalg.norm(scale @ C.T, axis=0)
-    return np.resize(sizes, nx)
+def _start(model: LinearPredictor | BilinearPredictor | StepMap, nx: int) -> Float[np.ndarray, " n"]:
+    """Return the root mean squares of the states over the data, ones where they are not known."""
+    if isinstance(model, StepMap) or model.scale is None:
+        return np.resize(np.ones(len(model.states)), nx)
+    return np.resize(np.linalg.norm(model.scale @ model.C.T, axis=0), nx)
 
 
 def _measure_objects(root: Path) -> tuple[int, int, int] | None:
@@ -214,9 +237,9 @@ def _measure_objects(root: Path) -> tuple[int, int, int] | None:
     return flash, state, stack
 
 
-def _readme(controller: LQR | KoopmanMPC, tables: Tables, root: Path, precision: Precision) -> str:
+def _readme(controller: Exportable, tables: Tables, root: Path, precision: Precision) -> str:
     """Return what there is to know of the folder."""
-    sizes, predictor, single = tables.sizes, tables.predictor, precision == "float"
+    sizes, model, single = tables.sizes, tables.model, precision == "float"
     numbers_held = constants(tables) * (4 if single else 8)
     measured = _measure_objects(root)
     rows = [("constants", f"{numbers_held} bytes")]
@@ -229,7 +252,7 @@ def _readme(controller: LQR | KoopmanMPC, tables: Tables, root: Path, precision:
         ]
     rows.append(("floating-point operations of a step without active limits, at most", str(flops(tables))))
     if not tables.is_lqr:
-        limit = int(tables.settings["iter_limit"])
+        limit = MOST if tables.is_staged else int(tables.settings["iter_limit"])
         rows += [
             ("iterations of the QP solver in one solve, at most", str(limit)),
             ("floating-point operations of one iteration, at most", str(iteration_flops(tables))),
@@ -237,13 +260,17 @@ def _readme(controller: LQR | KoopmanMPC, tables: Tables, root: Path, precision:
     rows.append(("rounding of the lifted state, amplified to a share of an input's span", f"{tables.conditioning:.2g}"))
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)
     notes = "".join(f"- {note}\n" for note in tables.notes)
+    solver = (
+        "`daqp/` holds sources of DAQP 0.11.0 by Daniel Arnström, unchanged, under the MIT licence in `daqp/LICENSE`.\n"
+    )
+    solver = "" if tables.is_staged else "\n" + solver
     bound = (
         ""
-        if tables.is_lqr
+        if tables.is_lqr or tables.is_staged
         else 'A bound on the worst step comes from the iterations: export a controller with `solver="daqp", '
         'settings={"iter_limit": 100}`.\n'
     )
-    dt, state_names, input_names = predictor.dt, ", ".join(predictor.states), ", ".join(predictor.inputs)
+    dt, state_names, input_names = model.dt, ", ".join(model.states), ", ".join(model.inputs)
     return f"""# {type(controller).__name__} in C99
 
 Sampling time {dt} s; states {state_names}; inputs {input_names}. Precision: {precision}.
@@ -272,6 +299,4 @@ y has {sizes["NY"]} values, u {sizes["NU"]}, a reference row {sizes["NR"]}, a ro
 {sizes["HORIZON"] + 1} rows of a preview are read. NaN in y is a missed measurement. `koopmpc.h` says what every
 argument and every status means.
 
-{notes}
-`daqp/` holds sources of DAQP 0.11.0 by Daniel Arnström, unchanged, under the MIT licence in `daqp/LICENSE`.
-"""
+{notes}{solver}"""

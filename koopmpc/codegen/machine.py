@@ -10,11 +10,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.codegen.sources import sources_of
-from koopmpc.codegen.tables import tables_of
+from koopmpc.codegen.sources import sources_of, tables_of
+from koopmpc.codegen.tables import Exportable
 from koopmpc.codegen.text import Language, function, traced
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.control.lqr import LQR
 from koopmpc.plants.compiled import library, private_cache
 from koopmpc.plants.step_map import StepMap
 
@@ -78,8 +76,15 @@ DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
 }
 /* ManyRuns from many states, one after the other, each from the beginning; Y holds one run. */
 DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
+#if KOOPMPC_IS_STAGED
+  const koopmpc_real *targets = f->state->targets;
+  const int count = f->state->target_count;
+#endif
   for (long e = 0; e < runs; e++) {
     koopmpc_init(f->state, KOOPMPC_NX == run->nx ? run->X : 0, 0);
+#if KOOPMPC_IS_STAGED
+    koopmpc_use_targets(f->state, targets, count);
+#endif
     run->measure(run->X, run->Y);
     koopmpc_run(f, run);
     run->X += (run->steps + 1) * run->nx;
@@ -99,38 +104,29 @@ class CRows(ctypes.Structure):
     _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
 
 
+_FRAME = (
+    ("state", ctypes.c_void_p),
+    ("y", ctypes.c_void_p),
+    ("reference", CRows),
+    ("applied", ctypes.c_void_p),
+    ("w", CRows),
+    ("u", ctypes.c_void_p),
+    ("status", ctypes.c_int),
+    ("fallback", ctypes.c_int),
+    ("iterations", ctypes.c_int),
+)
+
+
 class Frame(ctypes.Structure):
     """What a call passes; the same fields as in C."""
 
-    _fields_ = (
-        ("state", ctypes.c_void_p),
-        ("y", ctypes.c_void_p),
-        ("reference", CRows),
-        ("applied", ctypes.c_void_p),
-        ("w", CRows),
-        ("u", ctypes.c_void_p),
-        ("status", ctypes.c_int),
-        ("fallback", ctypes.c_int),
-        ("iterations", ctypes.c_int),
-        ("slack", ctypes.c_double),
-    )
+    _fields_ = (*_FRAME, ("slack", ctypes.c_double))
 
 
 class SingleFrame(ctypes.Structure):
     """A `Frame` in single precision."""
 
-    _fields_ = (
-        ("state", ctypes.c_void_p),
-        ("y", ctypes.c_void_p),
-        ("reference", CRows),
-        ("applied", ctypes.c_void_p),
-        ("w", CRows),
-        ("u", ctypes.c_void_p),
-        ("status", ctypes.c_int),
-        ("fallback", ctypes.c_int),
-        ("iterations", ctypes.c_int),
-        ("slack", ctypes.c_float),
-    )
+    _fields_ = (*_FRAME, ("slack", ctypes.c_float))
 
 
 class WholeCall(ctypes.Structure):
@@ -195,7 +191,7 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith("flags")), platform.processor())
 
 
-def built_of(controller: LQR | KoopmanMPC, precision: Precision, command: list[str]) -> Built:
+def built_of(controller: Exportable, precision: Precision, command: list[str]) -> Built:
     """Return the machine code of a controller.
 
     Raises

@@ -1,34 +1,73 @@
 """All the C of a controller: files that are the same for every one, and those with its own numbers."""
 
-from collections.abc import Mapping
 from importlib.resources import files
 
 import numpy as np
+from jaxtyping import Float
 
-from koopmpc.codegen.tables import CArrays, Tables
+from koopmpc.codegen.linear import koopman_tables, lqr_tables
+from koopmpc.codegen.staged import bilinear_tables
+from koopmpc.codegen.tables import Exportable, Tables, refusal
 from koopmpc.codegen.text import Language, function
+from koopmpc.control.lqr import LQR
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 
-OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c", "koopmpc_qp.h", "koopmpc_qp.c")
+OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
+_RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c")
+_QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_target.c", "koopmpc_daqp.c")
+_STAGED = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c", "koopmpc_rest.c")
 SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
 SOLVER_FILES = (*SOLVER, "factorization.h", "LICENSE")
 
 
+def tables_of(
+    controller: Exportable, references: Float[np.ndarray, "rows nr"] | None = None, *, single: bool
+) -> Tables:
+    """Return the tables of a controller; a BilinearMPC's hold the targets of these reference rows.
+
+    Raises
+    ------
+    DataError
+        It cannot be written in C; the message says which part of it, and what would do.
+    """
+    error = refusal(controller)
+    if error is not None:
+        raise error
+    if isinstance(controller, BilinearMPC):
+        return bilinear_tables(controller, references, single=single)
+    return (
+        lqr_tables(controller, single=single)
+        if isinstance(controller, LQR)
+        else koopman_tables(controller, single=single)
+    )
+
+
 def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
-    """Return the text of every file by its name: header, controller, lifting, numbers, solver."""
+    """Return the text of every file by its name: header, controller, model, numbers, solver."""
     language = Language(single)
-    controller = "koopmpc_lqr.c" if tables.is_lqr else "koopmpc_mpc.c"
-    result = {name: shipped("c", name) for name in (*OWN, controller, "koopmpc_daqp.c")}
-    result |= {f"daqp/{name}": shipped("daqp", name) for name in SOLVER_FILES}
+    if tables.is_staged:
+        own = (*OWN, *_RECEDING, *_STAGED)
+    else:
+        own = (*OWN, *_QP, *(("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")))
+    result = {name: shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _sizes(tables, single=single)
     result["koopmpc_solver.h"] = _solver(tables, language)
     result["koopmpc_limits.h"] = _header("limits", "Limits of the inputs.", language.arrays(tables.limits))
+    result["koopmpc_observer.h"] = _header("observer", "The observer's model.", language.arrays(tables.observer))
     result["koopmpc_plan.h"] = _header("plan", "The plan and its limits.", language.arrays(tables.plan))
-    result["koopmpc_targets.h"] = _header("targets", "Targets and their limits.", _targets(tables, language))
-    assert tables.lifting is not None
-    lift = function(tables.lifting, "koopmpc_lift", {"zeta": tables.sizes["NZETA"]}, "z", language)
-    result["koopmpc_lift.c"] = (
-        "/** @file koopmpc_lift.c @brief z = psi(zeta), the observables. */\n#include <math.h>\n\n"
-        '#include "koopmpc.h"\n\n' + lift.text
+    if tables.is_staged:
+        result["koopmpc_table.h"] = _header("table", "Targets of reference rows.", language.arrays(tables.targets))
+    else:
+        result |= {f"daqp/{name}": shipped("daqp", name) for name in SOLVER_FILES}
+        result["koopmpc_targets.h"] = _header("targets", "Targets and their limits.", _targets(tables, language))
+    header = "koopmpc_stages.h" if tables.is_staged else "koopmpc.h"
+    result["koopmpc_model.c"] = (
+        "/** @file koopmpc_model.c @brief The model, written from CasADi's graph. */\n#include <math.h>\n\n"
+        f'#include "{header}"\n\n'
+        + "\n".join(
+            function(each.graph, name, each.arguments, each.result, language).text
+            for name, each in tables.functions.items()
+        )
     )
     return result
 
@@ -41,28 +80,53 @@ def shipped(folder: str, name: str) -> str:
 def flops(tables: Tables) -> int:
     """Return a bound of the floating-point operations of a step in which no limit is active and the reference rests."""
     sizes = tables.sizes
-    assert tables.lifting is not None
-    lift = function(tables.lifting, "f", {"zeta": sizes["NZETA"]}, "z", Language()).flops
+    cost = {
+        name: function(each.graph, name, each.arguments, each.result, Language()).flops
+        for name, each in tables.functions.items()
+    }
+    nz = sizes["NZ"]
     if tables.is_lqr:
-        return lift + 2 * sizes["NU"] * (sizes["NZ"] + sizes["NW"] + sizes["NR"] + 2 * sizes["NU"])
-    nz, known = sizes["NZ"], sizes["KNOWN"]
+        return cost["koopmpc_lift"] + 2 * sizes["NU"] * (nz + sizes["NW"] + sizes["NR"] + 2 * sizes["NU"])
+    if tables.is_staged:
+        N, ns, nr = sizes["N"], sizes["POINT"], sizes["TRACKED"]
+        stage = cost["koopmpc_slopes"] + cost["koopmpc_tracked"] + cost["koopmpc_limited"] + 2 * ns * nr * (nr + ns)
+        end = 2 * sizes["END"] * (nr * ns + ns * ns)
+        halvings = 10  # of a step, at most
+        one = N * (stage + halvings * cost["koopmpc_stage_map"]) + end + _sweeps(tables, 1)
+        return sizes["ITERATIONS"] * one + (sizes["LATENCY"] + sizes["ESTIMATOR"] + 1) * cost["koopmpc_map"]
     model = 2 * nz * (nz + sizes["NU"] + sizes["NW"])
     filtered = {0: 0, 1: model + 8 * nz * sizes["NX"], 2: 4 * sizes["NS"] ** 2 * (1 + sizes.get("DELAY_Y", 0))}
-    return lift + 2 * sizes["NT"] * (known + 1) + sizes["LATENCY"] * model + filtered[sizes["ESTIMATOR"]]
+    return (
+        cost["koopmpc_lift"]
+        + 2 * sizes["NT"] * (sizes["KNOWN"] + 1)
+        + sizes["LATENCY"] * model
+        + filtered[sizes["ESTIMATOR"]]
+    )
 
 
 def iteration_flops(tables: Tables) -> int:
     """Return a bound of the floating-point operations of one iteration of the QP solver."""
+    if tables.is_staged:
+        return _sweeps(tables, 2) + 100 * tables.sizes["N"] * (tables.sizes["SIDES"] + 1)
     n, m = tables.sizes["MOVES"], tables.sizes["QP_M"]
     rank = n + tables.sizes["QP_SOFT"] + 1
     return 2 * n * m + 4 * n * rank + 4 * rank * rank
 
 
+def _sweeps(tables: Tables, gradients: int) -> int:
+    """Return the operations of a Riccati factorisation of all stages, and of the sweeps for so many gradients."""
+    sizes = tables.sizes
+    n, m, g = sizes["POINT"], sizes["NU"], sizes["LIMITED"]
+    factor = 4 * n**3 + 8 * n * n * m + 6 * n * m * m + m**3 + 3 * n * n * (g + 1) + 22 * m
+    return sizes["N"] * (factor + gradients * (8 * n * n + 16 * n * m + 4 * m * m + 4 * n * g))
+
+
 def _header(name: str, what: str, body: str) -> str:
     guard = f"KOOPMPC_{name.upper()}_H"
+    includes = '#include "koopmpc.h"\n\n' if name != "sizes" else ""
     return (
         f"/** @file koopmpc_{name}.h @brief {what} Matrices stand column after column. */\n#ifndef {guard}\n"
-        f"#define {guard}\n\n{body}\n#endif\n"
+        f"#define {guard}\n\n{includes}{body}\n#endif\n"
     )
 
 
@@ -70,7 +134,7 @@ def _sizes(tables: Tables, *, single: bool) -> str:
     lines = [f"#define KOOPMPC_{name} {value}" for name, value in sorted(tables.sizes.items())]
     precision = "#define KOOPMPC_FLOAT\n#define DAQP_SINGLE_PRECISION\n" if single else ""
     functions = "#define KOOPMPC_FN(name) name##f\n" if single else "#define KOOPMPC_FN(name) name\n"
-    dt = f"#define KOOPMPC_DT {tables.predictor.dt!r}\n"
+    dt = f"#define KOOPMPC_DT {tables.model.dt!r}\n"
     body = precision + functions + "#define KOOPMPC_SQRT KOOPMPC_FN(sqrt)\n" + dt + "\n".join(lines) + "\n"
     return _header("sizes", "Sizes of this controller.", body).replace(" Matrices stand column after column.", "")
 
@@ -82,7 +146,8 @@ def _solver(tables: Tables, language: Language) -> str:
         f".{name} = {int(value) if name in whole else language.number(value)}"
         for name, value in tables.settings.items()
     )
-    lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
+    if settings:
+        lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
     return _header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n").replace(
         " Matrices stand column after column.", ""
     )
@@ -105,5 +170,5 @@ def _targets(tables: Tables, language: Language) -> str:
 
 def constants(tables: Tables) -> int:
     """Return how many numbers the controller's tables hold."""
-    groups: tuple[Mapping[str, np.ndarray] | CArrays, ...] = (tables.limits, tables.plan, tables.targets)
+    groups = (tables.limits, tables.observer, tables.plan, tables.targets)
     return sum(max(1, np.size(values)) for group in groups for values in group.values())

@@ -120,5 +120,5 @@ def test_what_cannot_be_written_in_c_says_which_part_and_what_would_do(pendulum)
 
 def test_an_estimator_of_ones_own_is_refused_by_name(pendulum):
     mine = km.KoopmanMPC(pendulum[1], COST, LIMITS, 5, estimator=Told([0.0] * pendulum[1].nz))
-    with pytest.raises(km.errors.DataError, match="a Told is no estimator"):
+    with pytest.raises(km.errors.DataError, match="the estimator Told cannot be written in C; use"):
         km.compiled(mine)

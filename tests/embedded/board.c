@@ -41,11 +41,12 @@ static koopmpc_state controller;
 
 static void loop(void) {
   koopmpc_real x[PLANT_NX], next[PLANT_NX], y[KOOPMPC_NY], u[KOOPMPC_NU];
-  const koopmpc_rows reference = {plant_reference, 1};
   koopmpc_report report;
   for (int i = 0; i < PLANT_NX; i++) x[i] = plant_x0[i];
   koopmpc_init(&controller, KOOPMPC_NX == PLANT_NX ? plant_x0 : 0, 0);
   for (int k = 0; k < PLANT_STEPS; k++) {
+    const int ahead = k < PLANT_ROWS ? k : PLANT_ROWS - 1;
+    const koopmpc_rows reference = {plant_reference + ahead * KOOPMPC_NR, PLANT_ROWS - ahead};
     uint32_t start;
     plant_measure(x, y);
     SYSTICK[2] = 0;

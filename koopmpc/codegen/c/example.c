@@ -10,7 +10,6 @@ int main(void) {
   koopmpc_real x[PLANT_NX], next[PLANT_NX], y[KOOPMPC_NY];
   koopmpc_real acts[(KOOPMPC_LATENCY + 1) * KOOPMPC_NU]; /* an input acts KOOPMPC_LATENCY steps after its step */
   koopmpc_real *u = acts + KOOPMPC_LATENCY * KOOPMPC_NU;
-  const koopmpc_rows reference = {plant_reference, 1};
   koopmpc_report report;
   int counts[9] = {0}, most = 0;
   for (int i = 0; i < PLANT_NX; i++) x[i] = plant_x0[i];
@@ -21,6 +20,8 @@ int main(void) {
   for (int i = 0; i < KOOPMPC_NU; i++) printf(",u%d", i);
   printf(",status,fallback,iterations\n");
   for (int k = 0; k < PLANT_STEPS; k++) {
+    const int ahead = k < PLANT_ROWS ? k : PLANT_ROWS - 1; /* the reference from this step on, its last row held */
+    const koopmpc_rows reference = {plant_reference + ahead * KOOPMPC_NR, PLANT_ROWS - ahead};
     plant_measure(x, y);
     koopmpc_step(&controller, y, &reference, 0, 0, u, &report);
     printf("%d", k);

@@ -73,15 +73,12 @@ typedef struct {
 /** All that moves from step to step. */
 typedef struct {
   koopmpc_real known[KOOPMPC_KNOWN + 1];   /**< [z; u_{-1}; w_0 ...; d], where the plan starts */
-  koopmpc_real t[KOOPMPC_NT];              /**< the plan of this step and what its targets come to */
-  koopmpc_real column[KOOPMPC_NT];         /**< the reference's part of the plan */
-  koopmpc_real reference[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows that `column` belongs to */
+  koopmpc_real reference[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows of the last step */
   koopmpc_real kept[KOOPMPC_MOVES];        /**< inputs of the last good plan */
   koopmpc_real given[KOOPMPC_NU];          /**< the last input returned */
   koopmpc_real sent[(KOOPMPC_LATENCY + 1) * KOOPMPC_NU]; /**< inputs computed and not yet acted */
   koopmpc_real ahead[(KOOPMPC_LATENCY + 1) * KOOPMPC_NW1];
   koopmpc_real w[KOOPMPC_NW1];
-  koopmpc_real dual[KOOPMPC_QP_M1];        /**< multipliers of the last solve, from which the next one starts */
   koopmpc_real zeta[KOOPMPC_NZETA];
   koopmpc_real z[KOOPMPC_NZ], d[KOOPMPC_NZ];
   koopmpc_real scratch[2 * KOOPMPC_NS + 2];
@@ -96,6 +93,45 @@ typedef struct {
   koopmpc_real innovation[KOOPMPC_NY], factor[KOOPMPC_NY * KOOPMPC_NY];
   int queued, started, missed;
 #endif
+#if KOOPMPC_IS_STAGED
+  koopmpc_real S[(KOOPMPC_N + 1) * KOOPMPC_POINT], V[KOOPMPC_MOVES];         /**< the plan: states, inputs of stages */
+  koopmpc_real bestS[(KOOPMPC_N + 1) * KOOPMPC_POINT], bestV[KOOPMPC_MOVES]; /**< the best plan of several starts */
+  koopmpc_real draftX[(KOOPMPC_N + 1) * KOOPMPC_NZ], draftU[KOOPMPC_MOVES];
+  koopmpc_real R[KOOPMPC_N * KOOPMPC_TRACKED], U_r[KOOPMPC_MOVES], u_r[KOOPMPC_MOVES]; /**< targets of the stages */
+  koopmpc_real end_M[KOOPMPC_END * KOOPMPC_TRACKED], end_L[KOOPMPC_END * KOOPMPC_POINT], end_m[KOOPMPC_END];
+  koopmpc_real rest[KOOPMPC_NZ]; /**< the equilibrium that the plan leads to */
+  koopmpc_real A[KOOPMPC_N * KOOPMPC_POINT * KOOPMPC_POINT], B[KOOPMPC_MOVES * KOOPMPC_POINT]; /**< the program */
+  koopmpc_real Q[KOOPMPC_N * KOOPMPC_POINT * KOOPMPC_POINT], G[KOOPMPC_N * KOOPMPC_LIMITED1 * KOOPMPC_POINT];
+  koopmpc_real c[KOOPMPC_N * KOOPMPC_POINT], q[KOOPMPC_N * KOOPMPC_POINT], r[KOOPMPC_MOVES];
+  koopmpc_real g[KOOPMPC_N * KOOPMPC_LIMITED1], start[KOOPMPC_POINT];
+  koopmpc_real K[KOOPMPC_MOVES * KOOPMPC_POINT], half[KOOPMPC_MOVES * KOOPMPC_NU]; /**< its Riccati recursion */
+  koopmpc_real Pc[KOOPMPC_N * KOOPMPC_POINT], feed[KOOPMPC_MOVES], curvature[KOOPMPC_MOVES];
+  koopmpc_real dX[KOOPMPC_N * KOOPMPC_POINT], dU[KOOPMPC_MOVES], newX[KOOPMPC_N * KOOPMPC_POINT], newU[KOOPMPC_MOVES];
+  koopmpc_real t[KOOPMPC_PAIRS], lam[KOOPMPC_PAIRS], d_side[KOOPMPC_PAIRS], moved[KOOPMPC_PAIRS]; /**< its limits */
+  koopmpc_real gap[KOOPMPC_PAIRS], eased[KOOPMPC_PAIRS], base[KOOPMPC_PAIRS], second[KOOPMPC_PAIRS];
+  koopmpc_real step_t[KOOPMPC_PAIRS], step_lam[KOOPMPC_PAIRS];
+  koopmpc_real eps[KOOPMPC_EASED], nu[KOOPMPC_EASED], kappa[KOOPMPC_EASED], second_eps[KOOPMPC_EASED];
+  koopmpc_real step_eps[KOOPMPC_EASED], step_nu[KOOPMPC_EASED];
+  koopmpc_real barrier[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)], push[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)];
+  koopmpc_real reach[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)];
+  koopmpc_real first_low[KOOPMPC_NU], first_high[KOOPMPC_NU]; /**< limits of the first change of the inputs */
+  koopmpc_real without_limits[KOOPMPC_NU], defects[KOOPMPC_POINT], length, slack, best_slack;
+  koopmpc_real e[KOOPMPC_PUSHES]; /**< E w + d of the stages */
+#if KOOPMPC_DISTURBED
+  koopmpc_real rest_u[KOOPMPC_NU], rest_active[KOOPMPC_NU + KOOPMPC_BOX];
+  koopmpc_real rest_goal[KOOPMPC_GOAL], rest_input[KOOPMPC_NU];
+  koopmpc_real chord_s[KOOPMPC_NZ + KOOPMPC_NU], chord_H[(KOOPMPC_NZ + KOOPMPC_NU) * KOOPMPC_NZ];
+  koopmpc_real chord_T[(KOOPMPC_NZ + KOOPMPC_NU) * (KOOPMPC_NR + KOOPMPC_NZ + KOOPMPC_NU)];
+  koopmpc_real chord_G[(KOOPMPC_BOX + 1) * KOOPMPC_NZ];
+  int has_rest, has_chord;
+#endif
+  const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
+  int target_count, found;     /**< its rows, and the one that was found last */
+  int moved_on;                /**< whether the disturbance or the row of given input targets has moved */
+#else
+  koopmpc_real t[KOOPMPC_NT];              /**< the plan of this step and what its targets come to */
+  koopmpc_real column[KOOPMPC_NT];         /**< the reference's part of the plan */
+  koopmpc_real dual[KOOPMPC_QP_M1];        /**< multipliers of the last solve, from which the next one starts */
   koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
   int target_ints[KOOPMPC_TARGET_INTS];
   koopmpc_real qp_reals[KOOPMPC_QP_REALS]; /**< memory of the QP solver, and the rows that it ended with */
@@ -104,11 +140,12 @@ typedef struct {
   koopmpc_real eased[KOOPMPC_QP_M * KOOPMPC_MOVES + 4 * KOOPMPC_QP_M]; /**< rows of a problem that a weight eases */
 #endif
   int far;        /**< whether the last solution had to be approached */
-  int aimed;      /**< whether `column` is that of `reference` */
-  int row;        /**< row of given input targets */
-  int warm;       /**< whether `dual` is of the last step */
   int resumes;    /**< whether the solver may go on from the few rows that it holds */
   int unmet;      /**< whether the hard limits of the last solve contradicted each other */
+#endif
+  int aimed;      /**< whether the targets are those of `reference` */
+  int row;        /**< row of given input targets */
+  int warm;       /**< whether the next step starts from the last one */
   int has_kept, age, planned;
   int seen;       /**< whether a past is known, where the model needs one */
 } koopmpc_state;
@@ -146,6 +183,28 @@ int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U);
 
 /** z = psi(x), the lifting; zeta is the state, or the state and its past. */
 void koopmpc_lift(const koopmpc_real *zeta, koopmpc_real *z);
+
+#if KOOPMPC_IS_STAGED
+/**
+ * Write the states of the last plan.
+ * @param s the state
+ * @param X KOOPMPC_N + 1 rows of KOOPMPC_NX states
+ * @return as koopmpc_plan
+ */
+int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X);
+
+/**
+ * Take the targets of reference rows from another table than that of koopmpc_table.h. A step whose reference holds a
+ * row that the table lacks is KOOPMPC_BAD_MEASUREMENT.
+ * @param s       the state
+ * @param targets `count` rows of KOOPMPC_TARGET numbers, which stay where they are
+ * @param count   how many
+ */
+void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count);
+
+/** next = F(x, u), the model; x is the state, or the state and its past. */
+void koopmpc_map(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *next);
+#endif
 
 #ifdef __cplusplus
 }

@@ -1,10 +1,8 @@
-/** @file koopmpc_common.c @brief Vectors, the history of delays, and targets: what all controllers share. */
+/** @file koopmpc_common.c @brief Vectors, limits of inputs, and the history of delays: what all controllers share. */
 #include <math.h>
 
 #include "koopmpc_common.h"
 #include "koopmpc_limits.h"
-#include "koopmpc_solver.h"
-#include "koopmpc_targets.h"
 
 void koopmpc_add(koopmpc_real *restrict to, const koopmpc_real *restrict map, int rows, const koopmpc_real *restrict x,
                  int columns) {
@@ -54,46 +52,6 @@ void koopmpc_observe(koopmpc_real *zeta, int *seen, koopmpc_real *z, const koopm
     koopmpc_lift(zeta, z);
   else
     koopmpc_fill(z, (koopmpc_real)NAN, KOOPMPC_NZ);
-}
-
-void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha) {
-  koopmpc_copy(alpha, koopmpc_target_offset, KOOPMPC_NA);
-  koopmpc_add(alpha, koopmpc_target_reference, KOOPMPC_NA, r, KOOPMPC_NR);
-  if (e) koopmpc_add(alpha, koopmpc_target_disturbance, KOOPMPC_NA, e, KOOPMPC_NZ);
-}
-
-int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha) {
-  koopmpc_real low[KOOPMPC_NL], high[KOOPMPC_NL], value[KOOPMPC_NL];
-  int outside = 0;
-  koopmpc_nearest(r, e, alpha);
-  koopmpc_fill(value, 0, KOOPMPC_NL);
-  koopmpc_add(value, koopmpc_target_rows, KOOPMPC_NL, alpha, KOOPMPC_NA);
-  koopmpc_fill(low, 0, KOOPMPC_NL);
-  if (e) koopmpc_add(low, koopmpc_target_rows_disturbance, KOOPMPC_NL, e, KOOPMPC_NZ);
-  for (int i = 0; i < KOOPMPC_NL; i++) {
-    const koopmpc_real pushed = low[i];
-    const koopmpc_real reach = KOOPMPC_ROUNDING * (koopmpc_abs(value[i]) + koopmpc_target_size[i]);
-    low[i] = koopmpc_target_low[i] - pushed;
-    high[i] = koopmpc_target_high[i] - pushed;
-    outside |= value[i] < low[i] - reach || value[i] > high[i] + reach;
-  }
-  if (!outside) return 0;
-  for (int which = 0; which < 2; which++) { /* inside all limits, or inside those of the inputs alone */
-    const koopmpc_qp *qp = &koopmpc_target_qps[which];
-    koopmpc_qp_memory mem = koopmpc_qp_on(qp, s->target_reals, s->target_ints);
-    for (int wider = 0; wider < 2; wider++) { /* believed to have no solution only with limits a tolerance wider */
-      for (int i = 0; i < qp->m; i++) {
-        mem.low[i] = koopmpc_clip(low[i] - value[i], -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_target_unit[which][i];
-        mem.high[i] = koopmpc_clip(high[i] - value[i], -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_target_unit[which][i];
-      }
-      if (koopmpc_qp_solve(qp, &mem, 0, wider ? KOOPMPC_WIDER : 0, 0).flag > 0) {
-        for (int i = 0; i < KOOPMPC_NA; i++) alpha[i] += mem.primal[i];
-        return 1;
-      }
-    }
-  }
-  koopmpc_fill(alpha, 0, KOOPMPC_NA);
-  return 1;
 }
 
 void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last) {

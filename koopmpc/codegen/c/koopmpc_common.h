@@ -1,8 +1,8 @@
-/** @file koopmpc_common.h @brief Vectors, the history of delays, and targets: what all controllers share. */
+/** @file koopmpc_common.h @brief Vectors, limits of inputs, and the history of delays: what all controllers share. */
 #ifndef KOOPMPC_COMMON_H
 #define KOOPMPC_COMMON_H
 
-#include "koopmpc_qp.h"
+#include "koopmpc.h"
 
 #define KOOPMPC_HUGE ((koopmpc_real)1e30)
 

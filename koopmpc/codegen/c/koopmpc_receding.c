@@ -1,0 +1,242 @@
+/** @file koopmpc_receding.c @brief Where a plan starts, and what a failed step does. */
+#include <math.h>
+
+#include "koopmpc_limits.h"
+#include "koopmpc_observer.h"
+#include "koopmpc_receding.h"
+#include "koopmpc_solver.h"
+
+#if KOOPMPC_ESTIMATOR == 1 || KOOPMPC_LATENCY > 0
+/** z <- F(z, u) + E w + d; d may be NULL. */
+static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_real *u, const koopmpc_real *w,
+                    const koopmpc_real *d) {
+#if KOOPMPC_IS_STAGED
+  koopmpc_map(z, u, next);
+#else
+  koopmpc_fill(next, 0, KOOPMPC_NZ);
+  koopmpc_add(next, koopmpc_A, KOOPMPC_NZ, z, KOOPMPC_NZ);
+  koopmpc_add(next, koopmpc_B, KOOPMPC_NZ, u, KOOPMPC_NU);
+#endif
+  if (KOOPMPC_NW) koopmpc_add(next, koopmpc_E, KOOPMPC_NZ, w, KOOPMPC_NW);
+  if (d)
+    for (int i = 0; i < KOOPMPC_NZ; i++) next[i] += d[i];
+}
+#endif
+
+#if KOOPMPC_ESTIMATOR == 1
+
+/** Move d towards the mean of the misfits, by the share of them that was constant. */
+static void learn(koopmpc_state *s, koopmpc_real *misfit) {
+  enum { NZ = KOOPMPC_NZ, NX = KOOPMPC_NX };
+  koopmpc_real states[KOOPMPC_NX], step[KOOPMPC_NX], believed[KOOPMPC_NX], varied = 0, most = 0;
+  for (int i = 0; i < NZ; i++)
+    if (i == KOOPMPC_CONSTANT || i >= KOOPMPC_LEARNED) misfit[i] = 0;
+  if (!koopmpc_usable(misfit, NZ)) return;
+  for (int i = 0; i < NX; i++) states[i] = step[i] = believed[i] = 0;
+  koopmpc_add(states, koopmpc_C, NX, misfit, NZ);
+  for (int i = 0; i < NZ; i++) s->scratch[i] = s->z[i] - s->last_z[i];
+  koopmpc_add(step, koopmpc_C, NX, s->scratch, NZ);
+  koopmpc_add(believed, koopmpc_C, NX, s->d, NZ);
+  for (int i = 0; i < NX; i++) {
+    const koopmpc_real square = states[i] * states[i], moved = step[i] * step[i];
+    const koopmpc_real change = states[i] - s->newest[NZ + i];
+    const koopmpc_real size = square > moved ? square : moved;
+    if (size > s->sizes[i]) {
+      s->sizes[i] = size;
+      s->weights[i] = 1 / size;
+    }
+    s->newest[NZ + NX + i] = s->learned ? square - (koopmpc_real)0.5 * change * change : square;
+    s->newest[NZ + i] = states[i];
+  }
+  s->learned = 1;
+  koopmpc_copy(s->newest, misfit, NZ);
+  for (int i = 0; i < NZ + 2 * NX; i++) s->means[i] += KOOPMPC_GAIN * (s->newest[i] - s->means[i]);
+  for (int i = 0; i < NX; i++) {
+    const koopmpc_real mean = s->means[NZ + i] * s->means[NZ + i], square = believed[i] * believed[i];
+    const koopmpc_real spread = s->means[NZ + NX + i] - mean;
+    varied += (spread > 0 ? spread : 0) * s->weights[i];
+    most += (mean > square ? mean : square) * s->weights[i];
+  }
+  if (varied < most)
+    for (int i = 0; i < NZ; i++) s->d[i] += (1 - varied / most) * (s->means[i] - s->d[i]);
+}
+
+static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
+  koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
+  if (!koopmpc_usable(s->z, KOOPMPC_NZ)) {
+    s->has_last = 0;
+    return 0;
+  }
+  if (s->has_last) {
+    koopmpc_real misfit[KOOPMPC_NZ];
+    advance(misfit, s->last_z, u, s->w, 0);
+    for (int i = 0; i < KOOPMPC_NZ; i++) misfit[i] = s->z[i] - misfit[i];
+    learn(s, misfit);
+  }
+  koopmpc_copy(s->last_z, s->z, KOOPMPC_NZ);
+  s->has_last = 1;
+  return 1;
+}
+
+#elif KOOPMPC_ESTIMATOR == 2
+
+enum { DRIVE = KOOPMPC_NU + KOOPMPC_NW };
+
+/** s <- F s + G [u; w] + f. */
+static void predict(koopmpc_state *s, koopmpc_real *state, const koopmpc_real *drive) {
+  koopmpc_copy(s->scratch, koopmpc_filter_f, KOOPMPC_NS);
+  koopmpc_add(s->scratch, koopmpc_filter_F, KOOPMPC_NS, state, KOOPMPC_NS);
+  koopmpc_add(s->scratch, koopmpc_filter_G, KOOPMPC_NS, drive, DRIVE);
+  koopmpc_copy(state, s->scratch, KOOPMPC_NS);
+}
+
+/** s <- s + P M' S^-1 (y - M s - h) with the outputs that came; S = M P M' + R in units of its diagonal. */
+static void correct(koopmpc_state *s, const koopmpc_real *y) {
+  int came[KOOPMPC_NY], n = 0;
+  koopmpc_real *L = s->factor, *x = s->innovation;
+  for (int i = 0; i < KOOPMPC_NY; i++)
+    if (koopmpc_abs(y[i]) < KOOPMPC_HUGE) came[n++] = i;
+  for (int i = 0; i < n; i++) {
+    const int a = came[i];
+    x[i] = y[a] - koopmpc_filter_h[a];
+    for (int j = 0; j < KOOPMPC_NS; j++) x[i] -= koopmpc_filter_M[a * KOOPMPC_NS + j] * s->s[j];
+    x[i] /= koopmpc_filter_unit[a];
+    for (int j = 0; j <= i; j++) { /* Cholesky's factor, row by row, and forward substitution with it */
+      koopmpc_real sum = koopmpc_filter_S[a * KOOPMPC_NY + came[j]];
+      for (int k = 0; k < j; k++) sum -= L[i * KOOPMPC_NY + k] * L[j * KOOPMPC_NY + k];
+      L[i * KOOPMPC_NY + j] = i == j ? KOOPMPC_SQRT(sum) : sum / L[j * KOOPMPC_NY + j];
+    }
+    for (int k = 0; k < i; k++) x[i] -= L[i * KOOPMPC_NY + k] * x[k];
+    x[i] /= L[i * KOOPMPC_NY + i];
+  }
+  for (int i = n - 1; i >= 0; i--) {
+    for (int k = i + 1; k < n; k++) x[i] -= L[k * KOOPMPC_NY + i] * x[k];
+    x[i] /= L[i * KOOPMPC_NY + i];
+  }
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < KOOPMPC_NS; j++) s->s[j] += koopmpc_filter_PM[came[i] * KOOPMPC_NS + j] * x[i];
+}
+
+static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
+  koopmpc_real *now = s->scratch + KOOPMPC_NS, largest = 0;
+  int any = 0;
+  if (s->started) {
+    koopmpc_real *last = s->queue + s->queued * DRIVE;
+    koopmpc_copy(last, u, KOOPMPC_NU);
+    koopmpc_copy(last + KOOPMPC_NU, s->w, KOOPMPC_NW);
+    s->queued++;
+  }
+  if (s->queued > KOOPMPC_DELAY_Y) {
+    predict(s, s->s, s->queue);
+    s->queued--;
+    for (int i = 0; i < s->queued * DRIVE; i++) s->queue[i] = s->queue[i + DRIVE];
+  }
+  for (int i = 0; i < KOOPMPC_NY; i++) any |= koopmpc_abs(y[i]) < KOOPMPC_HUGE;
+  if (s->queued >= KOOPMPC_DELAY_Y && any) correct(s, y); /* else y is older than the start */
+  s->missed = any ? 0 : s->missed + 1;
+  s->started = 1;
+  koopmpc_copy(now, s->s, KOOPMPC_NS);
+  for (int k = 0; k < s->queued; k++) predict(s, now, s->queue + k * DRIVE);
+  koopmpc_copy(s->z, koopmpc_filter_one, KOOPMPC_NZ);
+  koopmpc_add(s->z, koopmpc_filter_z, KOOPMPC_NZ, now, KOOPMPC_NS);
+  koopmpc_fill(s->d, 0, KOOPMPC_NZ);
+  koopmpc_add(s->d, koopmpc_filter_d, KOOPMPC_NZ, now, KOOPMPC_NS);
+  for (int i = 0; i < KOOPMPC_NS; i++) {
+    const koopmpc_real size = koopmpc_abs(now[i]);
+    largest = size <= largest ? largest : size; /* NaN stays */
+  }
+  return s->missed <= KOOPMPC_PATIENCE && largest < KOOPMPC_HUGE;
+}
+
+#else
+
+static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
+  koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
+  return 1;
+}
+
+#endif
+
+/** Write down the preview of the measured disturbances. */
+static void preview(koopmpc_state *s, const koopmpc_rows *w) {
+  for (int k = 0; k < KOOPMPC_N + KOOPMPC_LATENCY; k++) {
+    const koopmpc_real *row = w ? koopmpc_row(w, k, KOOPMPC_NW) : 0;
+    for (int i = 0; i < KOOPMPC_NW; i++) {
+      const koopmpc_real value = row ? row[i] : 0;
+      if (k <= KOOPMPC_LATENCY) s->ahead[k * KOOPMPC_NW + i] = value;
+      if (k >= KOOPMPC_LATENCY) s->known[KOOPMPC_PREVIEW + (k - KOOPMPC_LATENCY) * KOOPMPC_NW + i] = value;
+    }
+  }
+}
+
+void koopmpc_take(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *applied, const koopmpc_rows *w) {
+  const koopmpc_real *acted = s->sent;
+  int good;
+  if (KOOPMPC_WITH_RATES)
+    koopmpc_copy(s->known + KOOPMPC_U_PREV, applied && !KOOPMPC_LATENCY ? applied : s->given, KOOPMPC_NU);
+  if (KOOPMPC_NW) preview(s, w);
+  for (int i = 0; i < KOOPMPC_LATENCY * KOOPMPC_NU; i++) s->sent[i] = s->sent[i + KOOPMPC_NU];
+  koopmpc_copy(s->sent + KOOPMPC_LATENCY * KOOPMPC_NU, s->given, KOOPMPC_NU);
+  if (applied && koopmpc_usable(applied, KOOPMPC_NU)) acted = applied;
+  good = observe(s, y, acted);
+  for (int i = 0; i < KOOPMPC_NW; i++) /* an unknown one stays as it was */
+    if (koopmpc_abs(s->ahead[i]) < KOOPMPC_HUGE) s->w[i] = s->ahead[i];
+  if (good)
+    koopmpc_copy(s->known, s->z, KOOPMPC_NZ);
+  else
+    koopmpc_fill(s->known, (koopmpc_real)NAN, KOOPMPC_NZ);
+#if KOOPMPC_LATENCY > 0
+  for (int i = 0; i < KOOPMPC_LATENCY; i++) {
+    koopmpc_real next[KOOPMPC_NZ];
+    advance(next, s->known, s->sent + (i + 1) * KOOPMPC_NU, s->ahead + i * KOOPMPC_NW,
+            KOOPMPC_ESTIMATOR ? s->d : 0);
+    koopmpc_copy(s->known, next, KOOPMPC_NZ);
+  }
+#endif
+  if (KOOPMPC_ESTIMATOR) koopmpc_copy(s->known + KOOPMPC_DRIFT, s->d, KOOPMPC_NZ);
+}
+
+void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmpc_real *applied, koopmpc_real *u,
+                  koopmpc_report *report, koopmpc_status status) {
+  koopmpc_real before[KOOPMPC_NU];
+  const koopmpc_real *chosen = before;
+  s->planned = 0;
+  s->warm = 0;
+  koopmpc_copy(before, applied && koopmpc_usable(applied, KOOPMPC_NU) ? applied : s->given, KOOPMPC_NU);
+  report->status = status;
+  if (s->has_kept && s->age + 1 < KOOPMPC_N) {
+    s->age++;
+    chosen = s->kept + KOOPMPC_NU * koopmpc_move_of[s->age];
+    report->fallback = KOOPMPC_SHIFTED_PLAN;
+  } else {
+    s->has_kept = 0;
+    report->fallback = free_input ? KOOPMPC_CLIPPED_LQR : KOOPMPC_HOLD;
+    if (free_input) chosen = free_input;
+  }
+  koopmpc_copy(u, chosen, KOOPMPC_NU);
+  koopmpc_admit(u, KOOPMPC_RATED ? koopmpc_rate_low : 0, koopmpc_rate_high, before);
+  koopmpc_copy(s->given, u, KOOPMPC_NU);
+}
+
+void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev) {
+  const koopmpc_state empty = {0};
+  *s = empty;
+  for (int i = 0; i < KOOPMPC_NU; i++)
+    s->given[i] = u_prev ? u_prev[i] : koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
+  for (int k = 0; k <= KOOPMPC_LATENCY; k++) koopmpc_copy(s->sent + k * KOOPMPC_NU, s->given, KOOPMPC_NU);
+#if KOOPMPC_ESTIMATOR == 2
+  {
+    const koopmpc_real zero[KOOPMPC_NX] = {0}, *start = x0 ? x0 : zero;
+    for (int i = 0; i < KOOPMPC_NX; i++) s->zeta[i] = start[i];
+    for (int i = KOOPMPC_NX; i < KOOPMPC_NZETA; i++) {
+      enum { PAST = KOOPMPC_NX + KOOPMPC_NU * KOOPMPC_DELAYED_INPUTS };
+      const int place = (i - KOOPMPC_NX) % PAST - KOOPMPC_NU * KOOPMPC_DELAYED_INPUTS;
+      s->zeta[i] = place < 0 ? 0 : start[place];
+    }
+    koopmpc_lift(s->zeta, s->z);
+    for (int i = 0; i < KOOPMPC_KEPT; i++) s->s[i] = s->z[koopmpc_kept[i]];
+  }
+#else
+  (void)x0;
+#endif
+}

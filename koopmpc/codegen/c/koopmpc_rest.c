@@ -1,0 +1,312 @@
+/**
+ * @file koopmpc_rest.c
+ * @brief The equilibrium x = F(x, u) + e that holds a reference or comes nearest to it, by Gauss-Newton steps.
+ *
+ * The equilibria of the undisturbed rows stand in the table. A disturbance moves one: by a step with the factors of an
+ * earlier one (a chord), or by steps that hold the active limits. Where these lead to none, that of the table stays.
+ */
+#include <math.h>
+
+#include "koopmpc_limits.h"
+#include "koopmpc_plan.h"
+#include "koopmpc_solver.h"
+#include "koopmpc_stages.h"
+
+#if KOOPMPC_DISTURBED
+
+enum {
+  BOX = KOOPMPC_BOX,
+  ROWS_R = KOOPMPC_NR,
+  SIZE = NX + NV,
+  LEFT = ROWS_R + SIZE,
+  LIMITS = NV + BOX,
+  MOST_ROWS = LEFT > NX + LIMITS ? LEFT : NX + LIMITS,
+  NEWTON = 20
+};
+#define RANK ((koopmpc_real)KOOPMPC_RANK)
+#define CLOSE ((koopmpc_real)1e-2)
+
+/** Parts of what the model says at (x, u): F, its derivatives A and B, of and J, the limited g and G. */
+enum { AT_A = NX, AT_B = AT_A + NX * NX, AT_OF = AT_B + NX * NV, AT_J = AT_OF + ROWS_R, AT_G = AT_J + ROWS_R * NX };
+enum { AT_DG = AT_G + BOX, AT = AT_DG + BOX * NX };
+
+static koopmpc_real largest_of(const koopmpc_real *a, int n) {
+  koopmpc_real most = 0;
+  for (int i = 0; i < n; i++)
+    if (!(koopmpc_abs(a[i]) <= most)) most = koopmpc_abs(a[i]);
+  return most;
+}
+
+/**
+ * The pseudo-inverse (n, m) of E (m, n), and a basis of its null space in the columns of `null` (n, n), by one-sided
+ * Jacobi rotations of E's columns: E V = B has orthogonal columns. E is overwritten; returns the null space's size.
+ */
+static int inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null) {
+  koopmpc_real V[SIZE * SIZE], size[SIZE], largest = 0;
+  int count = 0;
+  for (int i = 0; i < n * n; i++) V[i] = i % (n + 1) == 0 ? 1 : 0;
+  for (int sweep = 0, turned = 1; sweep < 40 && turned; sweep++) {
+    turned = 0;
+    for (int p = 0; p < n; p++)
+      for (int q = p + 1; q < n; q++) {
+        koopmpc_real a = 0, b = 0, c = 0, zeta, t, cosine, sine;
+        for (int i = 0; i < m; i++) {
+          a += E[i * n + p] * E[i * n + p];
+          b += E[i * n + q] * E[i * n + q];
+          c += E[i * n + p] * E[i * n + q];
+        }
+        if (!(koopmpc_abs(c) > KOOPMPC_TURN * KOOPMPC_SQRT(a * b)) || !(koopmpc_abs(c) > 0)) continue;
+        turned = 1;
+        zeta = (b - a) / (2 * c);
+        t = (zeta < 0 ? -1 : 1) / (koopmpc_abs(zeta) + KOOPMPC_SQRT(1 + zeta * zeta));
+        cosine = 1 / KOOPMPC_SQRT(1 + t * t);
+        sine = cosine * t;
+        for (int i = 0; i < m; i++) {
+          const koopmpc_real left = E[i * n + p], right = E[i * n + q];
+          E[i * n + p] = cosine * left - sine * right;
+          E[i * n + q] = sine * left + cosine * right;
+        }
+        for (int i = 0; i < n; i++) {
+          const koopmpc_real left = V[i * n + p], right = V[i * n + q];
+          V[i * n + p] = cosine * left - sine * right;
+          V[i * n + q] = sine * left + cosine * right;
+        }
+      }
+  }
+  for (int j = 0; j < n; j++) {
+    size[j] = 0;
+    for (int i = 0; i < m; i++) size[j] += E[i * n + j] * E[i * n + j];
+    if (size[j] > largest) largest = size[j];
+  }
+  koopmpc_fill(result, 0, n * m);
+  for (int j = 0; j < n; j++) {
+    if (size[j] > rank * rank * largest && size[j] > 0) {
+      for (int i = 0; i < n; i++)
+        for (int k = 0; k < m; k++) result[i * m + k] += V[i * n + j] * E[k * n + j] / size[j];
+    } else {
+      for (int i = 0; i < n && null; i++) null[i * n + count] = V[i * n + j];
+      count++;
+    }
+  }
+  return count;
+}
+
+/** Rows of the residuals on (x, u) by sizes: of(x) first, then (x, u) at next to no weight. */
+static void residuals(const koopmpc_real *at, koopmpc_real *W) {
+  koopmpc_fill(W, 0, LEFT * SIZE);
+  for (int i = 0; i < ROWS_R; i++)
+    for (int m = 0; m < ROWS_R; m++)
+      for (int j = 0; j < NX; j++)
+        W[i * SIZE + j] += koopmpc_rest_weight[i * ROWS_R + m] * at[AT_J + m * NX + j] * koopmpc_rest_size[j];
+  for (int i = 0; i < SIZE; i++) W[(ROWS_R + i) * SIZE + i] = KOOPMPC_SMALL;
+}
+
+/** Rows A - I, B by sizes: what holds the equilibrium. */
+static void holding(const koopmpc_real *at, koopmpc_real *E) {
+  for (int i = 0; i < NX; i++)
+    for (int j = 0; j < SIZE; j++) {
+      const koopmpc_real value = j < NX ? at[AT_A + i * NX + j] - (i == j) : at[AT_B + i * NV + j - NX];
+      E[i * SIZE + j] = value * koopmpc_rest_size[j] / koopmpc_rest_size[i];
+    }
+}
+
+/** What is left of the residuals at s. */
+static void residual(const koopmpc_real *row, const koopmpc_real *of, const koopmpc_real *s, koopmpc_real *left) {
+  for (int i = 0; i < ROWS_R; i++) {
+    left[i] = 0;
+    for (int j = 0; j < ROWS_R; j++) left[i] += koopmpc_rest_weight[i * ROWS_R + j] * (row[j] - of[j]);
+  }
+  for (int i = 0; i < SIZE; i++) left[ROWS_R + i] = -KOOPMPC_SMALL * s[i];
+}
+
+/** to = least |W (free to') - left|, to = free to': (SIZE) from left (LEFT); `back` (SIZE, LEFT) is that map. */
+static void least(const koopmpc_real *W, const koopmpc_real *null, int count, koopmpc_real *back) {
+  koopmpc_real turned[LEFT * SIZE], inverted[SIZE * LEFT];
+  for (int i = 0; i < LEFT; i++)
+    for (int j = 0; j < count; j++) {
+      turned[i * count + j] = 0;
+      for (int m = 0; m < SIZE; m++) turned[i * count + j] += W[i * SIZE + m] * null[m * SIZE + j];
+    }
+  koopmpc_fill(back, 0, SIZE * LEFT);
+  if (!count) return;
+  (void)inverse(turned, LEFT, count, KOOPMPC_TURN, inverted, 0);
+  for (int i = 0; i < SIZE; i++)
+    for (int j = 0; j < count; j++)
+      for (int m = 0; m < LEFT; m++) back[i * LEFT + m] += null[i * SIZE + j] * inverted[j * LEFT + m];
+}
+
+/** (x, u) in their sizes. */
+static void scaled(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *s) {
+  for (int i = 0; i < SIZE; i++) s[i] = (i < NX ? x[i] : u[i - NX]) / koopmpc_rest_size[i];
+}
+
+/** One step with the factors of an earlier equilibrium as long as that was close by; 0 where it is not close. */
+static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopmpc_real *row, const koopmpc_real *e) {
+  koopmpc_real s[SIZE], at[AT], left[LEFT], step[SIZE], missed[NX], close, far = 0;
+  scaled(x, u, s);
+  close = CLOSE * (1 + largest_of(s, SIZE));
+  koopmpc_local(x, u, at);
+  for (int i = 0; i < SIZE; i++) far = koopmpc_abs(s[i] - k->chord_s[i]) > far ? koopmpc_abs(s[i] - k->chord_s[i]) : far;
+  if (!k->has_chord || far > close) {
+    koopmpc_real E[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE], W[LEFT * SIZE];
+    int count;
+    holding(at, E);
+    count = inverse(E, NX, SIZE, RANK, gain, null);
+    residuals(at, W);
+    least(W, null, count, k->chord_T);
+    for (int j = 0; j < NX; j++)
+      for (int i = 0; i < SIZE; i++) {
+        koopmpc_real sum = -gain[i * NX + j];
+        for (int m = 0; m < LEFT; m++) {
+          koopmpc_real through = 0;
+          for (int n = 0; n < SIZE; n++) through += W[m * SIZE + n] * gain[n * NX + j];
+          sum += k->chord_T[i * LEFT + m] * through;
+        }
+        k->chord_H[i * NX + j] = sum;
+      }
+    koopmpc_copy(k->chord_G, at + AT_DG, BOX * NX);
+    koopmpc_copy(k->chord_s, s, SIZE);
+    k->has_chord = 1;
+  }
+  residual(row, at + AT_OF, s, left);
+  for (int i = 0; i < NX; i++) missed[i] = (at[i] + e[i] - x[i]) / koopmpc_rest_size[i];
+  for (int i = 0; i < SIZE; i++)
+    step[i] = koopmpc_dot(k->chord_H + i * NX, missed, NX) + koopmpc_dot(k->chord_T + i * LEFT, left, LEFT);
+  if (!(largest_of(step, SIZE) <= close)) return 0;
+  for (int i = 0; i < LIMITS; i++) {
+    koopmpc_real reached;
+    if (i < NV) {
+      reached = u[i] + step[NX + i] * koopmpc_rest_size[NX + i];
+    } else {
+      reached = at[AT_G + i - NV];
+      for (int j = 0; j < NX; j++) reached += k->chord_G[(i - NV) * NX + j] * step[j] * koopmpc_rest_size[j];
+    }
+    if (reached > koopmpc_rest_high[i] || reached < koopmpc_rest_low[i]) return 0;
+  }
+  for (int i = 0; i < NX; i++) x[i] = (s[i] + step[i]) * koopmpc_rest_size[i];
+  for (int i = 0; i < NV; i++) u[i] = (s[NX + i] + step[NX + i]) * koopmpc_rest_size[NX + i];
+  return 1;
+}
+
+/** Gauss-Newton steps that hold the active limits, add one that is broken and release one that pulls; 0 if they fail. */
+static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e) {
+  koopmpc_real s[SIZE], held_now[LIMITS];
+  scaled(x, u, s);
+  koopmpc_copy(held_now, active, LIMITS);
+  for (int pass = 0; pass < NEWTON; pass++) {
+    koopmpc_real at[AT], E[MOST_ROWS * SIZE], kept[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE];
+    koopmpc_real W[LEFT * SIZE], back[SIZE * LEFT], left[LEFT], missed[MOST_ROWS], step[SIZE], rows[LIMITS * SIZE];
+    koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], worst = 0, least_pull = 0;
+    koopmpc_real most_pull = 0, off = 0;
+    int held[LIMITS], n = 0, count, release = -1, broken = -1;
+    for (int i = 0; i < NX; i++) here[i] = s[i] * koopmpc_rest_size[i];
+    for (int i = 0; i < NV; i++) input[i] = s[NX + i] * koopmpc_rest_size[NX + i];
+    koopmpc_local(here, input, at);
+    koopmpc_fill(rows, 0, LIMITS * SIZE);
+    for (int i = 0; i < LIMITS; i++) {
+      if (i < NV) {
+        rows[i * SIZE + NX + i] = 1;
+        value[i] = input[i] / koopmpc_rest_limit[i];
+      } else {
+        value[i] = at[AT_G + i - NV] / koopmpc_rest_limit[i];
+        for (int j = 0; j < NX; j++)
+          rows[i * SIZE + j] = at[AT_DG + (i - NV) * NX + j] * koopmpc_rest_size[j] / koopmpc_rest_limit[i];
+      }
+      if (held_now[i] > 0 || held_now[i] < 0) held[n++] = i;
+    }
+    holding(at, E);
+    for (int i = 0; i < NX; i++) missed[i] = (at[i] + e[i] - here[i]) / koopmpc_rest_size[i];
+    for (int i = 0; i < n; i++) {
+      const koopmpc_real end = held_now[held[i]] > 0 ? koopmpc_rest_high[held[i]] : koopmpc_rest_low[held[i]];
+      koopmpc_copy(E + (NX + i) * SIZE, rows + held[i] * SIZE, SIZE);
+      missed[NX + i] = value[held[i]] - end / koopmpc_rest_limit[held[i]];
+    }
+    koopmpc_copy(kept, E, (NX + n) * SIZE);
+    count = inverse(E, NX + n, SIZE, RANK, gain, null);
+    residuals(at, W);
+    residual(row, at + AT_OF, s, left);
+    for (int i = 0; i < SIZE; i++) step[i] = -koopmpc_dot(gain + i * (NX + n), missed, NX + n);
+    least(W, null, count, back);
+    for (int i = 0; i < LEFT; i++) pull[i] = left[i] - koopmpc_dot(W + i * SIZE, step, SIZE);
+    for (int i = 0; i < SIZE; i++) step[i] += koopmpc_dot(back + i * LEFT, pull, LEFT);
+    if (!koopmpc_usable(step, SIZE)) return 0;
+    reach = 1 + largest_of(s, SIZE);
+    for (int i = 0; i < SIZE; i++) s[i] += step[i];
+    for (int i = 0; i < LEFT; i++) pull[i] = left[i] - koopmpc_dot(W + i * SIZE, step, SIZE);
+    for (int j = 0; j < SIZE; j++) {
+      turned[j] = 0;
+      for (int i = 0; i < LEFT; i++) turned[j] += W[i * SIZE + j] * pull[i];
+    }
+    for (int i = 0; i < n; i++) { /* a limit that holds has a positive multiplier */
+      koopmpc_real multiplier = 0;
+      for (int j = 0; j < SIZE; j++) multiplier += gain[j * (NX + n) + NX + i] * turned[j];
+      multiplier *= held_now[held[i]];
+      if (koopmpc_abs(multiplier) > most_pull) most_pull = koopmpc_abs(multiplier);
+      if (multiplier < least_pull) {
+        least_pull = multiplier;
+        release = held[i];
+      }
+    }
+    for (int i = 0; i < LIMITS; i++) {
+      const koopmpc_real to = value[i] + koopmpc_dot(rows + i * SIZE, step, SIZE);
+      const koopmpc_real over = to - koopmpc_rest_high[i] / koopmpc_rest_limit[i];
+      const koopmpc_real under = koopmpc_rest_low[i] / koopmpc_rest_limit[i] - to;
+      const koopmpc_real past = (over > under ? over : under) - KOOPMPC_REACH * (1 + koopmpc_abs(value[i]));
+      if (!(held_now[i] > 0 || held_now[i] < 0) && past > worst) {
+        worst = past;
+        broken = over > under ? i : -2 - i;
+      }
+    }
+    if (least_pull < -KOOPMPC_REACH * most_pull) {
+      held_now[release] = 0;
+    } else if (worst > 0) {
+      held_now[broken >= 0 ? broken : -2 - broken] = broken >= 0 ? 1 : -1;
+    } else if (largest_of(step, SIZE) <= CLOSE * reach) {
+      for (int i = 0; i < NX + n; i++) {
+        const koopmpc_real still = koopmpc_abs(koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
+        if (still > off) off = still;
+      }
+      if (!(off <= KOOPMPC_HELD * reach)) return 0;
+      for (int i = 0; i < NX; i++) x[i] = s[i] * koopmpc_rest_size[i];
+      for (int i = 0; i < NV; i++)
+        u[i] = koopmpc_clip(s[NX + i] * koopmpc_rest_size[NX + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+      koopmpc_copy(active, held_now, LIMITS);
+      return 1;
+    }
+  }
+  return 0;
+}
+
+void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_real *e) {
+  koopmpc_real x[NX], u[NV], active[LIMITS], at[AT];
+  int found, limited = 0;
+  koopmpc_copy(x, s->has_rest ? s->rest : target + TARGET_X, NX);
+  koopmpc_copy(u, s->has_rest ? s->rest_u : target + TARGET_U, NV);
+  koopmpc_copy(active, s->has_rest ? s->rest_active : target + TARGET_ACTIVE, LIMITS);
+  for (int i = 0; i < LIMITS; i++) limited |= active[i] > 0 || active[i] < 0;
+  found = (!limited && chord(s, x, u, target, e)) || near(x, u, active, target, e);
+  if (!(target[TARGET_FOUND] > 0)) found = 0;
+  if (!found) {
+    koopmpc_copy(x, target + TARGET_X, NX);
+    koopmpc_copy(u, target + TARGET_U, NV);
+    koopmpc_copy(active, target + TARGET_ACTIVE, LIMITS);
+  }
+  s->has_rest = 1;
+  koopmpc_copy(s->rest, x, NX);
+  koopmpc_copy(s->rest_u, u, NV);
+  koopmpc_copy(s->rest_active, active, LIMITS);
+  koopmpc_copy(s->rest_goal, target + TARGET_GOAL, KOOPMPC_GOAL);
+  koopmpc_copy(s->rest_input, target + TARGET_INPUT, NV);
+  if (!found) return;
+  for (int i = 0; i < NV; i++) s->rest_input[i] = KOOPMPC_HOLDS ? u[i] : 0;
+  if (!KOOPMPC_GIVEN_END) {
+    koopmpc_local(x, u, at);
+    for (int i = 0; i < KOOPMPC_GOAL; i++)
+      s->rest_goal[i] = koopmpc_dot(target + TARGET_M + i * KOOPMPC_NR, at + AT_OF, KOOPMPC_NR) +
+                        koopmpc_dot(target + TARGET_L + i * NX, x, NX) +
+                        koopmpc_dot(target + TARGET_V + i * NV, s->rest_input, NV);
+  }
+}
+#else
+typedef int koopmpc_no_disturbance; /* a file of C holds something */
+#endif

@@ -1,0 +1,499 @@
+/**
+ * @file koopmpc_staged.c
+ * @brief Real-time iteration: linearise along the plan, solve the program of its stages, add the step.
+ *
+ * Diehl, Bock & Schloeder, SIAM J. Control Optim. 43, 2005. Without rates a stage is s = x and v = u. Where changes of
+ * inputs are weighed or limited, or moves are blocked, s = [x; u_{k-1}; v_{k-1}] and v is the change of u.
+ */
+#include <math.h>
+
+#include "koopmpc_limits.h"
+#include "koopmpc_observer.h"
+#include "koopmpc_plan.h"
+#include "koopmpc_solver.h"
+#include "koopmpc_stages.h"
+#include "koopmpc_table.h"
+
+enum { EACH = 12, AGAIN = 10, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
+#define NEAR_OF ((koopmpc_real)0.2)      /* of a change: how far F may be from its linearisation */
+#define SHORTEST ((koopmpc_real)0.001)   /* of a step */
+#define FOLLOWED ((koopmpc_real)0.02)    /* a plan follows the model whose defects are below this share of a range */
+#define NEARLY ((koopmpc_real)1e-2)      /* share of a plan that moves when it is compared with others */
+#define FAR_OFF ((koopmpc_real)3)        /* sizes of a state between y and what was expected: the plan begins anew */
+
+static int is_good(koopmpc_status status) { return status <= KOOPMPC_SOFTENED; }
+
+static koopmpc_real most_of(koopmpc_real most, koopmpc_real value) {
+  value = koopmpc_abs(value);
+  return value <= most ? most : value; /* NaN stays */
+}
+
+/** Write states X (N+1, nx) and inputs U (N, nu) as the plan: inputs inside their limits and held in each block. */
+static void enter(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real *U, const koopmpc_real *u_prev) {
+  for (int k = STEPS; k >= 0; k--) {
+    for (int i = NX - 1; i >= 0; i--) s->S[k * NS + i] = X[k * NX + i];
+  }
+  for (int k = 0; k < STEPS; k++)
+    for (int i = 0; i < NV; i++) {
+#if KOOPMPC_WITH_RATES
+      const koopmpc_real u = koopmpc_clip(U[koopmpc_held_from[k] * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+      koopmpc_real *before = s->S + k * NS + NX;
+      if (k == 0) before[i] = u_prev[i];
+      before[NS + i] = u;
+      s->V[k * NV + i] = u - before[i];
+#else
+      s->V[k * NV + i] = koopmpc_clip(U[k * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+#endif
+    }
+  for (int k = 0; k <= STEPS; k++)
+    for (int i = 0; i < KOOPMPC_SOFT_RATES; i++)
+      s->S[k * NS + NX + NV + i] = k ? s->V[(k - 1) * NV + koopmpc_soft_rates[i]] : 0;
+  (void)u_prev;
+}
+
+/** Write the states and the inputs of the plan, these inside their limits. */
+static void trajectory(const koopmpc_state *s, koopmpc_real *X, koopmpc_real *U) {
+  for (int k = 0; k <= STEPS; k++) koopmpc_copy(X + k * NX, s->S + k * NS, NX);
+  for (int i = 0; i < NV; i++) {
+#if KOOPMPC_WITH_RATES
+    koopmpc_real u = s->S[NX + i];
+    for (int k = 0; k < STEPS; k++) {
+      if (koopmpc_free[k]) u += s->V[k * NV + i];
+      U[k * NV + i] = koopmpc_clip(u, koopmpc_input_low[i], koopmpc_input_high[i]);
+    }
+#else
+    for (int k = 0; k < STEPS; k++)
+      U[k * NV + i] = koopmpc_clip(s->V[k * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+#endif
+  }
+}
+
+/** One step of the model from a stage, disturbed as the plan is. */
+static void follow(const koopmpc_state *s, int k, const koopmpc_real *x, const koopmpc_real *v, koopmpc_real *next) {
+  koopmpc_stage_map(x, v, next);
+  if (KOOPMPC_DISTURBED)
+    for (int i = 0; i < NX; i++) next[i] += s->e[k * NX + i];
+}
+
+/** Add the step to the plan: all of it, or the half, quarter, ... along which F is near its linearisation. */
+static void add_program(koopmpc_state *s, const koopmpc_real *x) {
+  koopmpc_real reach[NS], gap[NS], *left = s->c;
+  int fits = 0;
+  for (int i = 0; i < NS; i++) left[i] += koopmpc_dot(s->A + i * NS, s->start, NS); /* dx_0 is taken whole */
+  for (int i = 0; i < NS; i++) {
+    koopmpc_real change = 0, size = 0;
+    gap[i] = 0;
+    for (int k = 0; k < STEPS; k++) {
+      gap[i] = most_of(gap[i], left[k * NS + i]);
+      change = most_of(change, s->dX[k * NS + i]);
+      size = most_of(size, s->S[(k + 1) * NS + i]);
+    }
+    reach[i] = NEAR_OF * (change > gap[i] ? change : gap[i]) + KOOPMPC_REACH * (koopmpc_sizes[i] + size);
+  }
+  for (s->length = 1;; s->length /= 2) {
+    const koopmpc_real length = s->length;
+    koopmpc_real found[NS], before[NS], error[NS];
+    if (length < SHORTEST) break;
+    fits = 1;
+    koopmpc_copy(before, x, NS);
+    koopmpc_fill(error, 0, NS);
+    for (int k = 0; k < STEPS && fits; k++) {
+      koopmpc_real *next = s->newX + k * NS, *u = s->newU + k * NV;
+      for (int i = 0; i < NS; i++) next[i] = s->S[(k + 1) * NS + i] + length * s->dX[k * NS + i];
+      for (int i = 0; i < NV; i++) u[i] = s->V[k * NV + i] + length * s->dU[k * NV + i];
+      follow(s, k, before, u, found);
+      for (int i = 0; i < NS; i++) {
+        const koopmpc_real off = found[i] - next[i];
+        error[i] = most_of(error[i], off);
+        fits &= koopmpc_abs(off - (1 - length) * left[k * NS + i]) <= length * reach[i];
+      }
+      koopmpc_copy(before, next, NS);
+    }
+    if (fits) {
+      koopmpc_copy(gap, error, NS);
+      break;
+    }
+  }
+  koopmpc_copy(s->defects, gap, NS);
+  if (!fits) { /* F is nowhere near its linearisation: the plan stays as it was */
+    s->length = 0;
+  } else {
+    koopmpc_copy(s->S, x, NS);
+    koopmpc_copy(s->S + NS, s->newX, STEPS * NS);
+    koopmpc_copy(s->V, s->newU, STEPS * NV);
+  }
+  s->slack = 0;
+  for (int k = 0; k < STEPS; k++)
+    for (int i = 0; i < SOFT; i++) {
+      const koopmpc_real past = s->eps[i * STEPS + k] * koopmpc_side_span[HARD + i];
+      if (past > koopmpc_allowance[i] && past > s->slack) s->slack = past;
+    }
+}
+
+/** The largest defect that the last step has left, as a share of the range of its state in the plan. */
+static koopmpc_real gap_of(const koopmpc_state *s) {
+  koopmpc_real most = 0;
+  for (int i = 0; i < NS; i++) {
+    koopmpc_real low = s->S[i], high = s->S[i];
+    for (int k = 1; k <= STEPS; k++) {
+      if (s->S[k * NS + i] < low) low = s->S[k * NS + i];
+      if (s->S[k * NS + i] > high) high = s->S[k * NS + i];
+    }
+    most = most_of(most, s->defects[i] / (high - low + KOOPMPC_REACH * (koopmpc_sizes[i] + koopmpc_abs(s->S[i]))));
+  }
+  return most;
+}
+
+/** Whether no input and no state moved by more than this share of its size and the plan's. */
+static int rests(const koopmpc_state *s, koopmpc_real settled) {
+  koopmpc_real moved = 0, size = 0, plan = 0, input = 0;
+  for (int k = 0; k <= STEPS; k++)
+    for (int i = 0; i < NS; i++) {
+      if (k) moved = most_of(moved, s->dX[(k - 1) * NS + i] / koopmpc_sizes[i]);
+      size = most_of(size, s->S[k * NS + i] / koopmpc_sizes[i]);
+    }
+  for (int k = 0; k < STEPS; k++)
+    for (int i = 0; i < NV; i++) {
+      input = most_of(input, s->dU[k * NV + i] / koopmpc_input_sizes[i]);
+      plan = most_of(plan, s->V[k * NV + i] / koopmpc_input_sizes[i]);
+    }
+  return moved <= settled * (1 + size) && input <= settled * (1 + plan);
+}
+
+/** At most this many iterations from the plan; how the last one ended. */
+static koopmpc_status improve(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev, int most,
+                              koopmpc_real settled, int *iterations) {
+  koopmpc_status status = KOOPMPC_FAILED;
+  for (int k = 0; k < most; k++) {
+    int taken = 0;
+    const koopmpc_status found = koopmpc_program(s, x, s->without_limits, &taken);
+    *iterations += taken;
+    if (!is_good(found)) return found;
+    add_program(s, x);
+    if (!(s->length > 0)) return gap_of(s) < NEAR_OF ? found : KOOPMPC_FAILED;
+    trajectory(s, s->draftX, s->draftU);
+    enter(s, s->draftX, s->draftU, u_prev);
+    status = s->slack > 0 ? KOOPMPC_SOFTENED : found;
+    if (k + 1 < most && rests(s, settled)) break;
+  }
+  return status;
+}
+
+/** Make the plan of the last step the start of this one; its last stage is one step of the model. */
+static void shift(koopmpc_state *s, const koopmpc_real *u_prev) {
+  koopmpc_real *X = s->draftX, *U = s->draftU;
+  trajectory(s, X, U);
+  for (int i = 0; i < STEPS * NX; i++) X[i] = X[i + NX];
+  for (int i = 0; i < (STEPS - 1) * NV; i++) U[i] = U[i + NV];
+  koopmpc_map(X + (STEPS - 1) * NX, U + (STEPS - 1) * NV, X + STEPS * NX);
+  if (KOOPMPC_DISTURBED)
+    for (int i = 0; i < NX; i++) X[STEPS * NX + i] += s->e[(STEPS - 1) * NX + i];
+  enter(s, X, U, u_prev);
+}
+
+/** Write start `which` as the plan: rest at x, the line from x to the equilibrium, the motion from x; 0 if it leaves. */
+static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopmpc_real *u_prev) {
+  koopmpc_real *X = s->draftX, *U = s->draftU;
+  for (int k = 0; k < STEPS; k++)
+    for (int i = 0; i < NV; i++)
+      U[k * NV + i] =
+          koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_input_low[i], koopmpc_input_high[i]);
+  for (int k = 0; k <= STEPS; k++)
+    for (int i = 0; i < NX; i++) {
+      const koopmpc_real share = (koopmpc_real)k / (koopmpc_real)STEPS;
+      X[k * NX + i] = which == 1 ? x[i] + share * (s->rest[i] - x[i]) : x[i];
+    }
+  if (which == 2) {
+    for (int k = 0; k < STEPS; k++) {
+      koopmpc_map(X + k * NX, U + k * NV, X + (k + 1) * NX);
+      if (KOOPMPC_DISTURBED)
+        for (int i = 0; i < NX; i++) X[(k + 1) * NX + i] += s->e[k * NX + i];
+    }
+    if (!koopmpc_usable(X, (STEPS + 1) * NX)) return 0;
+  }
+  enter(s, X, U, u_prev);
+  return 1;
+}
+
+/** Keep the plan, or take back the one that was kept. */
+static void save(koopmpc_state *s) {
+  koopmpc_copy(s->bestS, s->S, PLAN_S);
+  koopmpc_copy(s->bestV, s->V, PLAN_V);
+  s->best_slack = s->slack;
+}
+
+static void restore(koopmpc_state *s) {
+  koopmpc_copy(s->S, s->bestS, PLAN_S);
+  koopmpc_copy(s->V, s->bestV, PLAN_V);
+  s->slack = s->best_slack;
+}
+
+/** Take the cheapest of the plans to which several starts lead; those that follow the model come first. */
+static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev,
+                                 int *iterations) {
+  koopmpc_status status = KOOPMPC_FAILED, polished;
+  koopmpc_real best = KOOPMPC_HUGE;
+  int best_kind = 3;
+  save(s);
+  s->best_slack = 0;
+  for (int which = 0; which < 2 + KOOPMPC_GIVEN_MAP; which++) {
+    koopmpc_status ended;
+    koopmpc_real value = 0;
+    int kind = 2;
+    if (!begin(s, which, x, u_prev)) continue;
+    ended = improve(s, x, u_prev, EACH, NEARLY, iterations);
+    if (is_good(ended)) {
+      const koopmpc_real gap = gap_of(s);
+      kind = gap < FOLLOWED ? 0 : 1;
+      value = kind == 0 ? koopmpc_cost(s) : gap;
+    }
+    if (kind < best_kind || (kind == best_kind && value < best)) {
+      best_kind = kind;
+      best = value;
+      status = ended;
+      save(s);
+    }
+  }
+  restore(s);
+  if (!is_good(status)) return status;
+  polished = improve(s, x, u_prev, KOOPMPC_ITERATIONS > AGAIN ? KOOPMPC_ITERATIONS : AGAIN, KOOPMPC_SETTLED, iterations);
+  if (!is_good(polished)) {
+    restore(s);
+    return status;
+  }
+  return polished;
+}
+
+/** Write down e_k = E w_k + d; whether it is finite. */
+static int disturb(koopmpc_state *s) {
+#if KOOPMPC_DISTURBED
+  koopmpc_real last[NX];
+  int good = 1;
+  for (int k = 0; k < STEPS && good; k++) {
+    koopmpc_real e[NX];
+    koopmpc_fill(e, 0, NX);
+    if (KOOPMPC_NW) koopmpc_add(e, koopmpc_E, NX, s->known + KOOPMPC_PREVIEW + k * KOOPMPC_NW, KOOPMPC_NW);
+    if (KOOPMPC_ESTIMATOR)
+      for (int i = 0; i < NX; i++) e[i] += s->known[KOOPMPC_DRIFT + i];
+    good = koopmpc_usable(e, NX);
+    koopmpc_copy(s->draftX + k * NX, e, NX);
+  }
+  if (!good) return 0;
+  koopmpc_copy(last, s->e + (STEPS - 1) * NX, NX);
+  koopmpc_copy(s->e, s->draftX, STEPS * NX);
+  for (int i = 0; i < NX; i++) s->moved_on |= last[i] < s->e[(STEPS - 1) * NX + i] || last[i] > s->e[(STEPS - 1) * NX + i];
+#else
+  (void)s;
+#endif
+  return 1;
+}
+
+/** The target of a reference row, looked for from the one that was found last; NULL where the table lacks it. */
+static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row) {
+  for (int tried = 0; tried < s->target_count; tried++) {
+    const koopmpc_real *target = s->targets + s->found * KOOPMPC_TARGET;
+    int same = 1;
+    for (int i = 0; i < KOOPMPC_NR && same; i++) same = target[i] == row[i];
+    if (same) return target;
+    s->found = s->found + 1 < s->target_count ? s->found + 1 : 0;
+  }
+  return 0;
+}
+
+/** Find the targets of the stages where the reference or the disturbance moved; 0 where a row has none. */
+static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
+  const koopmpc_real *end = 0, *last = s->reference + STEPS * KOOPMPC_NR;
+  koopmpc_real own[KOOPMPC_TARGET], *u_end = own + TARGET_INPUT;
+  int same = s->aimed, trajectory_ends = 0;
+  for (int k = 0; k <= STEPS; k++) {
+    const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
+    for (int i = 0; i < KOOPMPC_NR; i++) {
+      same &= s->reference[k * KOOPMPC_NR + i] == row[i];
+      s->reference[k * KOOPMPC_NR + i] = row[i];
+    }
+  }
+  if (same && !s->moved_on) return 1;
+  s->aimed = 0;
+  if (!koopmpc_usable(s->reference, (STEPS + 1) * KOOPMPC_NR)) return 0;
+  for (int k = 0; k <= STEPS; k++) {
+    const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
+    int repeated = k > 0;
+    for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
+    if (!repeated) end = target_of(s, row);
+    if (!end) return 0;
+    if (k < STEPS) {
+      koopmpc_copy(s->u_r + k * NV, end + TARGET_INPUT, NV);
+      if (KOOPMPC_DISTURBED)
+        for (int i = 0; i < NV; i++)
+          s->u_r[k * NV + i] += koopmpc_dot(end + TARGET_SLOPE + i * NX, s->e + (STEPS - 1) * NX, NX);
+    }
+  }
+  koopmpc_copy(own, end, KOOPMPC_TARGET);
+#if KOOPMPC_DISTURBED
+  koopmpc_rest(s, own, s->e + (STEPS - 1) * NX);
+  koopmpc_copy(own + TARGET_X, s->rest, NX);
+  koopmpc_copy(u_end, s->rest_input, NV);
+  koopmpc_copy(own + TARGET_GOAL, s->rest_goal, KOOPMPC_GOAL);
+#else
+  koopmpc_copy(s->rest, end + TARGET_X, NX);
+#endif
+  for (int k = 0; k < STEPS; k++) {
+    int held = 1;
+    for (int i = 0; i < KOOPMPC_NR && held; i++) held = s->reference[k * KOOPMPC_NR + i] == last[i];
+    if (k == STEPS - 1) trajectory_ends = KOOPMPC_GIVEN && !held;
+    if (!KOOPMPC_DISTURBED) continue;
+    for (int i = 0; i < NV; i++)
+      s->u_r[k * NV + i] = held ? u_end[i] : koopmpc_clip(s->u_r[k * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+  }
+  s->moved_on = 0;
+#if KOOPMPC_GIVEN
+  for (int k = 0; k <= STEPS; k++) { /* row k of a given u_target counts at the k-th step */
+    const int row = s->row + KOOPMPC_LATENCY + k;
+    const koopmpc_real *given = koopmpc_given + NV * (row < KOOPMPC_GIVEN ? row : KOOPMPC_GIVEN - 1);
+    koopmpc_copy(k < STEPS ? s->u_r + k * NV : u_end, given, NV);
+  }
+  for (int i = 0; i < KOOPMPC_GOAL; i++)
+    own[TARGET_GOAL + i] += koopmpc_dot(own + TARGET_V + i * NV, u_end, NV);
+  s->moved_on = s->row + 1 < KOOPMPC_GIVEN;
+  s->row += s->moved_on;
+#endif
+  if (KOOPMPC_STAGE_END == 2 || (KOOPMPC_STAGE_END == 1 && trajectory_ends)) { /* no tail: the last row is weighed */
+    koopmpc_fill(own + TARGET_M, 0, TARGET_FOUND - TARGET_M);
+    for (int i = 0; i < KOOPMPC_NR; i++) {
+      koopmpc_copy(own + TARGET_M + i * KOOPMPC_NR, koopmpc_Q_root + i * KOOPMPC_NR, KOOPMPC_NR);
+      own[TARGET_GOAL + i] = koopmpc_dot(koopmpc_Q_root + i * KOOPMPC_NR, last, KOOPMPC_NR);
+    }
+  }
+  koopmpc_fill(s->end_M, 0, KOOPMPC_END * NR);
+  koopmpc_fill(s->end_L, 0, KOOPMPC_END * NS);
+  for (int i = 0; i < KOOPMPC_GOAL; i++) {
+    koopmpc_copy(s->end_M + i * NR, own + TARGET_M + i * KOOPMPC_NR, KOOPMPC_NR);
+    koopmpc_copy(s->end_L + i * NS, own + TARGET_L + i * NX, NX);
+    if (KOOPMPC_WITH_RATES) koopmpc_copy(s->end_L + i * NS + NX, own + TARGET_V + i * NV, NV);
+    s->end_m[i] = own[TARGET_GOAL + i];
+  }
+#if KOOPMPC_WITH_RATES
+  for (int i = 0; i < NV; i++) {
+    const koopmpc_real *row = koopmpc_R_root + i * NV;
+    koopmpc_copy(s->end_L + (KOOPMPC_GOAL + i) * NS + NX, row, NV);
+    s->end_m[KOOPMPC_GOAL + i] = koopmpc_dot(row, s->u_r + (STEPS - 1) * NV, NV);
+  }
+#endif
+  for (int k = 0; k < STEPS; k++) {
+    koopmpc_copy(s->R + k * NR, s->reference + (k + 1) * KOOPMPC_NR, KOOPMPC_NR);
+    if (KOOPMPC_WITH_RATES) {
+      koopmpc_copy(s->R + k * NR + KOOPMPC_NR, s->u_r + k * NV, NV);
+      koopmpc_fill(s->U_r + k * NV, 0, NV);
+    } else {
+      koopmpc_copy(s->U_r + k * NV, s->u_r + k * NV, NV);
+    }
+  }
+  s->aimed = 1;
+  return 1;
+}
+
+/** Write s_0 and the limits of v_0; whether rates were widened because they exclude the limits of u. */
+static int first_stage(koopmpc_state *s, const koopmpc_real *u_prev, koopmpc_real *stage) {
+  int conflict = 0;
+  koopmpc_fill(stage, 0, NS);
+  koopmpc_copy(stage, s->known, NX);
+#if KOOPMPC_WITH_RATES
+  koopmpc_copy(stage + NX, u_prev, NV);
+  for (int i = 0; i < NV; i++) {
+    const koopmpc_real low = koopmpc_change_low[i], high = koopmpc_change_high[i];
+    const koopmpc_real most = koopmpc_input_high[i] - u_prev[i], least = koopmpc_input_low[i] - u_prev[i];
+    const koopmpc_real reach = KOOPMPC_REACH * (koopmpc_abs(u_prev[i]) + koopmpc_input_sizes[i]);
+    s->first_low[i] = low < most ? low : most;
+    s->first_high[i] = high > least ? high : least;
+    conflict |= s->first_low[i] < low - reach || s->first_high[i] > high + reach;
+  }
+#else
+  (void)u_prev;
+#endif
+  return conflict;
+}
+
+/** The plan from `stage` on. */
+static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const koopmpc_real *u_prev, int *iterations) {
+  koopmpc_status status = KOOPMPC_FAILED;
+  if (s->warm) {
+    int near = 1;
+    for (int i = 0; i < NX; i++) near &= koopmpc_abs(stage[i] - s->S[NS + i]) <= FAR_OFF * koopmpc_sizes[i];
+    if (near) {
+      shift(s, u_prev);
+      status = improve(s, stage, u_prev, KOOPMPC_ITERATIONS, KOOPMPC_SETTLED, iterations);
+    }
+  }
+  if (!is_good(status)) status = begin_anew(s, stage, u_prev, iterations);
+  return status;
+}
+
+void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev) {
+  koopmpc_start(s, x0, u_prev);
+  s->targets = koopmpc_table;
+  s->target_count = KOOPMPC_TARGETS;
+}
+
+void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count) {
+  s->targets = targets;
+  s->target_count = count;
+  s->found = 0;
+}
+
+void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
+                  const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report) {
+  koopmpc_report own;
+  koopmpc_real stage[NS], u_prev[NV];
+  koopmpc_status status = KOOPMPC_BAD_MEASUREMENT;
+  int conflict, known;
+  if (!report) report = &own;
+  report->fallback = KOOPMPC_NONE;
+  report->iterations = 0;
+  report->slack = 0;
+  koopmpc_take(s, y, applied, w);
+  koopmpc_copy(u_prev, s->given, NV);
+  if (KOOPMPC_WITH_RATES) {
+    if (koopmpc_usable(s->known + KOOPMPC_U_PREV, NV))
+      koopmpc_copy(u_prev, s->known + KOOPMPC_U_PREV, NV);
+    else
+      koopmpc_copy(s->known + KOOPMPC_U_PREV, u_prev, NV);
+  }
+  conflict = first_stage(s, u_prev, stage);
+  known = koopmpc_usable(s->known, NX) && disturb(s) && aim(s, reference);
+  if (known) status = solve(s, stage, u_prev, &report->iterations);
+  if (!is_good(status)) {
+    koopmpc_real free_input[NV];
+    for (int i = 0; i < NV; i++) free_input[i] = s->without_limits[i] + (KOOPMPC_WITH_RATES ? u_prev[i] : 0);
+    koopmpc_fail(s, known && koopmpc_usable(free_input, NV) ? free_input : 0, applied, u, report, status);
+    return;
+  }
+  s->warm = 1;
+  report->slack = s->slack;
+  trajectory(s, s->draftX, s->kept);
+  if (KOOPMPC_HARD_RATED) {
+    koopmpc_admit(s->kept, koopmpc_hard_rate_low, koopmpc_hard_rate_high, u_prev);
+    for (int i = 0; i < NV && conflict; i++) {
+      const koopmpc_real change = s->kept[i] - u_prev[i];
+      const koopmpc_real over = change - koopmpc_hard_rate_high[i], under = koopmpc_hard_rate_low[i] - change;
+      if (over > report->slack) report->slack = over;
+      if (under > report->slack) report->slack = under;
+    }
+  } else {
+    conflict = 0;
+  }
+  s->has_kept = s->planned = 1;
+  s->age = 0;
+  koopmpc_copy(s->given, s->kept, NV);
+  koopmpc_copy(u, s->kept, NV);
+  report->status = conflict ? KOOPMPC_SOFTENED : status;
+}
+
+int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U) {
+  if (s->planned) koopmpc_copy(U, s->kept, STEPS * NV);
+  return s->planned;
+}
+
+int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X) {
+  for (int k = 0; k <= STEPS && s->planned; k++) koopmpc_copy(X + k * KOOPMPC_NX, s->S + k * NS, KOOPMPC_NX);
+  return s->planned;
+}

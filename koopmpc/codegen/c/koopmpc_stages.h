@@ -1,0 +1,65 @@
+/** @file koopmpc_stages.h @brief The quadratic program of a plan's stages, and the model and the targets behind it. */
+#ifndef KOOPMPC_STAGES_H
+#define KOOPMPC_STAGES_H
+
+#include "koopmpc_receding.h"
+
+/** Sizes: the model's x, a stage's state s and input v, tracked and limited outputs, the sides of the limits, rows of the end's cost. */
+enum {
+  NX = KOOPMPC_NZ,
+  NS = KOOPMPC_POINT,
+  NV = KOOPMPC_NU,
+  NR = KOOPMPC_TRACKED,
+  NG = KOOPMPC_LIMITED,
+  NQ = KOOPMPC_NU + KOOPMPC_LIMITED,
+  SIDES = KOOPMPC_SIDES,
+  SOFT = KOOPMPC_SOFT,
+  HARD = KOOPMPC_SIDES - KOOPMPC_SOFT,
+  STEPS = KOOPMPC_N
+};
+
+/** Parts of a target: its row, equilibrium (x, u), active limits, u_r, du_r/de, and |M of(x) + L x + V u - m|^2. */
+enum {
+  TARGET_X = KOOPMPC_NR,
+  TARGET_U = TARGET_X + KOOPMPC_NZ,
+  TARGET_ACTIVE = TARGET_U + KOOPMPC_NU,
+  TARGET_INPUT = TARGET_ACTIVE + KOOPMPC_NU + KOOPMPC_BOX,
+  TARGET_SLOPE = TARGET_INPUT + KOOPMPC_NU,
+  TARGET_M = TARGET_SLOPE + KOOPMPC_NU * KOOPMPC_NZ,
+  TARGET_L = TARGET_M + KOOPMPC_GOAL * KOOPMPC_NR,
+  TARGET_V = TARGET_L + KOOPMPC_GOAL * KOOPMPC_NZ,
+  TARGET_GOAL = TARGET_V + KOOPMPC_GOAL * KOOPMPC_NU,
+  TARGET_FOUND = TARGET_GOAL + KOOPMPC_GOAL
+};
+
+/** A and B, row after row, and F of a stage; its next state alone. */
+void koopmpc_slopes(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *out);
+void koopmpc_stage_map(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *next);
+
+/** Tracked outputs of a stage and their derivative, row after row; the same of limited ones. */
+void koopmpc_tracked(const koopmpc_real *s, koopmpc_real *out);
+void koopmpc_limited(const koopmpc_real *s, koopmpc_real *out);
+
+/** Q, row after row, and q of a stage that tracks r, by Gauss-Newton. */
+void koopmpc_stage(const koopmpc_real *s, const koopmpc_real *r, koopmpc_real *out);
+
+/** F, A, B, of, J, g and G at (x, u): all that an equilibrium is found from. */
+void koopmpc_local(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *out);
+
+/** The lower and the upper limit of entry i of [v_k; g(s_{k+1})]. */
+koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i);
+koopmpc_real koopmpc_high_of(const koopmpc_state *s, int k, int i);
+
+/**
+ * Solve the program along the plan for the state x: the step is s->dX and s->dU, soft limits give way by s->eps.
+ * @param first (KOOPMPC_NU) becomes the first input of the program without limits
+ */
+koopmpc_status koopmpc_program(koopmpc_state *s, const koopmpc_real *x, koopmpc_real *first, int *iterations);
+
+/** What the plan costs, its breaches of soft limits included. */
+koopmpc_real koopmpc_cost(const koopmpc_state *s);
+
+/** Move the equilibrium of a target, and its cost, to where x = F(x, u) + e. */
+void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_real *e);
+
+#endif

@@ -1,0 +1,290 @@
+"""An LQR's and a KoopmanMPC's tables: gains, the unconstrained plan, its limits, targets, and the QP for DAQP."""
+
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.codegen.tables import Tables, add_observer, amplified, columns, model_tables
+from koopmpc.control.limits import Interval
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.lqr import LQR
+from koopmpc.control.solvers.daqp import DAQP, FEW
+from koopmpc.control.target import ROUNDING, Targets
+from koopmpc.errors import DataError
+from koopmpc.predict.predictors import LinearPredictor
+
+_ZERO_ROW = 1e-11  # squared length below which DAQP leaves a row as it is
+
+# DAQP's tolerances in single precision: its own are below the rounding of a float.
+_SINGLE = {
+    "primal_tol": 1e-5,
+    "dual_tol": 1e-6,
+    "zero_tol": 1e-6,
+    "pivot_tol": 1e-4,
+    "progress_tol": 1e-7,
+    "sing_tol": 1e-6,
+    "refactor_tol": 1e-5,
+}
+_REALS = ("primal_tol", "dual_tol", "zero_tol", "pivot_tol", "progress_tol", "sing_tol", "refactor_tol", "fval_bound")
+_OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
+_C_SETTINGS = (*_REALS, *_OTHERS)
+
+
+def lqr_tables(controller: LQR, *, single: bool) -> Tables:
+    """Return the tables of a feedback law."""
+    predictor, targets = controller.predictor, controller._targets
+    tables = _shared(predictor, targets, controller._inputs)
+    given, rates = controller._given_rows, controller._rates
+    nothing = np.zeros(predictor.nu)
+    tables.sizes |= {
+        "IS_LQR": 1,
+        "HORIZON": 0,
+        "LATENCY": 0,
+        "N": 1,
+        "WITH_RATES": int(controller._K_rate.size > 0),
+        "RATED": int(rates is not None),
+        "GIVEN": 0 if given is None else len(given),
+    }
+    low, high = (nothing, nothing) if rates is None else rates
+    tables.limits |= {"rate_low": low, "rate_high": high}
+    na = targets.Z.shape[1]
+    tables.plan = {
+        "E": columns(predictor.E),
+        "gain": columns(-controller._K),
+        "gain_rate": columns(-controller._K_rate),
+        "feedforward": columns(controller._v),
+        "given": np.zeros(0) if given is None else given,
+        "target_input": targets.u0,
+        "target_span": columns(targets.W if na else np.zeros((predictor.nu, 1))),
+        "target_push": columns(targets.u_disturbance),
+    }
+    probe = cast("DAQP", targets._solver(len(targets.rows))) if na else None
+    known = _defaults() if probe is None else dict(probe._model.settings)
+    _solver_settings(tables, known, single=single)
+    _memory(tables, 1, 0, 0)
+    tables.conditioning = _amplified(tables, predictor, -controller._K)
+    return tables
+
+
+def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
+    """Return the tables of a KoopmanMPC; one that solves with OSQP has those of its twin with DAQP."""
+    saved = controller.as_data()
+    own = saved.options["solver"] == "daqp"
+    twin = controller
+    if not own:
+        twin = KoopmanMPC(
+            controller.predictor,
+            saved.cost,
+            saved.limits,
+            saved.horizon,
+            estimator=controller._estimator,
+            latency=saved.latency,
+            moves=saved.moves,
+            solver="daqp",
+        )
+    predictor, plan = twin.predictor, twin._map
+    tables = _shared(predictor, plan.targets, plan.track.inputs)
+    if not own:
+        tables.notes.append(
+            "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
+        )
+    track, maps, qp = plan.track, plan.maps, plan.qp
+    N, nu, nz, na = twin._N, predictor.nu, predictor.nz, max(1, plan.targets.Z.shape[1])
+    observer = twin._initial.observer
+    driven = plan.disturbance.shape[1] > 0
+    checked = int(plan.checked.sum())
+    given = track.given
+    tables.sizes |= {
+        "N": N,
+        "LATENCY": twin._latency,
+        "HORIZON": twin.horizon,
+        "WITH_RATES": int(track.with_rates),
+        "RATED": int(track.rates is not None),
+        "HARD_RATED": int(track.hard_rates is not None),
+        "KNOWN": plan.matrix.shape[1] - 1,
+        "NT": len(plan.matrix),
+        "MOVES": plan.moves,
+        "PLANNED": plan.planned,
+        "AIMED": int(plan.aimed),
+        "CHECKED": checked,
+        "CHECKED_LIMITS": int(driven),
+        "GIVEN": 0 if given is None else len(given),
+        "CONSTANT": -1 if predictor.lifting.constant_index is None else predictor.lifting.constant_index,
+        "ESTIMATOR": 0,
+        "NS": nz,
+    }
+    none = np.zeros(nu)
+    for name, box in (("rate", track.rates), ("hard_rate", track.hard_rates)):
+        low, high = (none, none) if box is None else box
+        tables.limits |= {f"{name}_low": low, f"{name}_high": high}
+    tables.limits["move_of"] = np.asarray(twin._move_of, dtype=np.intc)
+    solver = cast("DAQP", twin._qps._solvers[0])
+    M, scaling = _normalised(solver._M)
+    rate_input = np.full(len(qp.source), -1, dtype=np.intc)
+    rate_input[qp.rate_rows] = qp.rate_inputs
+    shift = np.asarray(qp.shift_dual, dtype=np.intc)
+    if not np.array_equal(solver._H, np.eye(plan.moves)):
+        raise AssertionError("the Hessian of Riccati coordinates is the identity")
+    tables.plan = {
+        "map": columns(plan.matrix[:, :-1]),
+        "low": plan.low,
+        "high": plan.high,
+        "offset": maps.offset,
+        "from_reference": columns(maps.from_reference),
+        "from_target": columns(maps.from_target) if plan.aimed and plan.targets.Z.shape[1] else np.zeros(0),
+        "from_given": np.zeros(0) if given is None else columns(maps.from_given),
+        "given": np.zeros(0) if given is None else given,
+        "checked": plan.targets.rows[plan.checked] if checked else np.zeros(0),
+        "disturbance": columns(plan.disturbance) if checked else np.zeros(0),
+        "M": M,
+        "scaling": scaling,
+        "unit": solver._rows,
+        "sense": solver._sense.astype(np.intc),
+        "linear": np.where(solver._sense != 0, solver._linear, 0.0),
+        "rho": np.where(solver._sense != 0, 1 / solver._curved, 0.0),
+        "source": np.asarray(qp.source, dtype=np.intc),
+        "scale": qp.scale,
+        "qp_low": np.maximum(qp.low, -1e30),
+        "qp_high": np.minimum(qp.high, 1e30),
+        "allowance": qp.softness.allowance,
+        "rate_input": rate_input,
+        "shift": shift,
+        "deviation": columns(plan.deviation),
+    }
+    if tables.sizes["AIMED"] and not plan.targets.Z.shape[1]:
+        tables.sizes["AIMED"] = 0
+    add_observer(tables, observer, predictor, twin._latency)
+    _solver_settings(tables, dict(solver._model.settings), single=single)
+    _memory(tables, plan.moves, len(qp.source), int((solver._sense != 0).sum()))
+    steep = bool(len(qp.source)) and solver._steep()
+    tables.sizes |= {"QP_MIXED": int(solver._mixed), "STEEP": int(steep), "FEW": FEW}
+    if steep:
+        values, V = np.linalg.eigh(solver._metric())
+        tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver._M @ V}
+    assert na == tables.sizes["NA"]
+    tables.conditioning = _amplified(tables, predictor, plan.matrix[: plan.moves, :nz])
+    return tables
+
+
+def _defaults() -> dict[str, Any]:
+    """Return the settings that DAQP has here where none are given."""
+    from koopmpc.control.solvers.qp import QP
+
+    one = np.ones(1)
+    return dict(DAQP(QP(np.eye(1), 0 * one, np.eye(1), -one, one))._model.settings)
+
+
+def _shared(predictor: LinearPredictor, targets: Targets, inputs: Interval) -> Tables:
+    """Return the part that both have: sizes, the lifting, limits of the inputs, targets."""
+    sizes = {
+        "NX": predictor.nx,
+        "NY": predictor.nx,
+        "NZETA": len(predictor.lifting.bound_states),
+        "NZ": predictor.nz,
+        "LEARNED": predictor.nz,
+        "NU": predictor.nu,
+        "NR": targets.from_reference.shape[1],
+        "NW": predictor.nw,
+        "NA": max(1, targets.Z.shape[1]),
+        "NL": max(1, len(targets.rows)),
+    }
+    tables = model_tables(predictor, sizes, predictor.lifting.symbolic, predictor.embedding, inputs)
+    _add_targets(tables, targets)
+    return tables
+
+
+def _amplified(tables: Tables, predictor: LinearPredictor, gain: Float[np.ndarray, "n nz"]) -> float:
+    """Return how many times a rounding of z, as large as the data were, moves the plan."""
+    scale = predictor.scale
+    size = np.ones(predictor.nz) if scale is None else np.asarray(np.linalg.norm(scale, axis=0))
+    return amplified(tables, gain, size)
+
+
+def _add_targets(tables: Tables, found: Targets) -> None:
+    """Write the targets and the two problems that move one inside its limits.
+
+    Where there are no coordinates C has one that means nothing.
+    """
+    na = found.Z.shape[1]
+
+    def pad(rows: np.ndarray) -> np.ndarray:
+        return rows if na else np.zeros((1, *rows.shape[1:]))
+
+    def wide(matrix: np.ndarray) -> np.ndarray:
+        return matrix if na else np.zeros((len(matrix), 1))
+
+    tables.targets = {
+        "target_offset": pad(found.offset),
+        "target_reference": columns(pad(found.from_reference)),
+        "target_disturbance": columns(pad(found.from_disturbance)),
+        "target_rows": columns(wide(found.rows)),
+        "target_rows_disturbance": columns(found.rows_disturbance),
+        "target_low": found.low,
+        "target_high": found.high,
+        "target_size": found.size,
+    }
+    for which, count in enumerate((len(found.rows), found.hard)):
+        if na:
+            solver = cast("DAQP", found._solver(count))
+            rinv = np.linalg.inv(np.linalg.cholesky(solver._H).T)
+            M, unit = solver._M @ rinv, solver._rows
+            rinv = solver._columns[:, None] * rinv
+        else:
+            M, unit, rinv = np.zeros((count, 1)), np.ones(count), np.eye(1)
+        M, scaling = _normalised(M)
+        mine = {
+            "M": M,
+            "scaling": scaling,
+            "rinv": rinv[np.triu_indices(len(rinv))],
+            "sense": np.zeros(count, dtype=np.intc),
+            "unit": unit,
+        }
+        tables.targets |= {f"target_{name}_{which}": values for name, values in mine.items()}
+        tables.target_qps.append((max(1, na), count))
+
+
+def _normalised(rows: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
+    """Return rows of length 1, and by what they were multiplied, as DAQP does it."""
+    squares = (rows**2).sum(axis=1)
+    scaling = np.where(squares < _ZERO_ROW, 1.0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)))
+    return rows * scaling[:, None], scaling
+
+
+def _solver_settings(tables: Tables, known: dict[str, Any], *, single: bool) -> None:
+    if known["time_limit"] > 0:
+        raise DataError(
+            'a time_limit cannot be exported, C has no clock; bound the iterations: settings={"iter_limit": 100}'
+        )
+    settings = {name: float(value) for name, value in known.items() if name in _C_SETTINGS}
+    if single:
+        settings |= {name: max(settings[name], least) for name, least in _SINGLE.items()}
+    tables.settings = settings
+    tables.reals |= {
+        "PRIMAL_TOL": settings["primal_tol"],
+        "ZERO_TOL": settings["zero_tol"],
+        "WIDER": 1e-5 if single else 1e-8,
+        "ACCURACY": 5e-3 if single else 1e-6,
+        "ROUNDING": 1e-6 if single else ROUNDING,
+    }
+
+
+def _memory(tables: Tables, n: int, m: int, soft: int) -> None:
+    """Set the sizes of the solver's memory: that of the plan's problem, and that of the targets'."""
+    reals, ints = zip(*(_shares(n, m, 0) for n, m in tables.target_qps), strict=True)
+    sizes = _shares(n, m, soft)
+    tables.sizes |= {
+        "QP_M": m,
+        "QP_M1": max(1, m),
+        "QP_SOFT": soft,
+        "QP_REALS": sizes[0],
+        "QP_INTS": sizes[1],
+        "TARGET_REALS": max(reals),
+        "TARGET_INTS": max(ints),
+    }
+
+
+def _shares(n: int, m: int, soft: int) -> tuple[int, int]:
+    """Return how many numbers and integers a problem of n variables and m rows, some of them soft, takes."""
+    rank = n + soft + 1
+    return 6 * m + 2 * n + 5 * rank + rank * (rank + 1) // 2, m + rank + 3

@@ -1,0 +1,246 @@
+"""A BilinearMPC in C against itself in Python: every step is told the same, and both must answer alike."""
+
+import copy
+import pickle
+import shutil
+import subprocess
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+COST = km.Cost(Q=[10.0, 1.0], R=0.1)
+BOX = {"u_min": -8.0, "u_max": 8.0}
+SWING = km.Cost(
+    Q=[5.0, 5.0, 0.1],
+    R=0.05,
+    of=km.Expressions(lambda x: [ca.sin(x[0]), ca.cos(x[0]), x[1]], ("sin", "cos", "omega [rad/s]")),
+)
+
+
+class Asked(NamedTuple):
+    """A controller of a model and of its plant, what its steps are told, and statuses that have to come up."""
+
+    make: object
+    seen: tuple[str, ...]
+    rows: int = 1
+    acts: bool = False
+    reference: tuple[float, ...] = (0.2, 0.0)
+
+
+def mpc(limits, horizon=12, cost=COST, **options):
+    return lambda model, plant: km.BilinearMPC(model, cost, km.Limits(**limits), horizon, **options)
+
+
+CONTROLLERS = {
+    "inputs": Asked(mpc(BOX), ("UNCONSTRAINED", "OPTIMAL", "BAD_MEASUREMENT")),
+    "swing": Asked(mpc(BOX, 25, SWING), ("OPTIMAL",), reference=(0.0, 1.0, 0.0)),
+    "equations": Asked(
+        lambda model, plant: km.BilinearMPC(plant, COST, km.Limits(**BOX), 12, sqp_iterations=2), ("OPTIMAL",)
+    ),
+    "soft": Asked(mpc(BOX | {"x_min": [-0.5, -1.0], "x_max": [0.5, 1.0]}), ("SOFTENED",), rows=20),
+    "hard": Asked(mpc(BOX | {"x_min": [-0.9, -2.0], "x_max": [0.9, 2.0], "slack": None}, 8), ("OPTIMAL", "INFEASIBLE")),
+    "rates": Asked(
+        mpc(
+            BOX | {"du_max": 2.0, "x_max": [0.8, np.inf]},
+            cost=km.Cost(Q=[10.0, 1.0], R=0.1, R_delta=0.3),
+            moves=(1, 1, 2, 3, 5),
+            latency=1,
+        ),
+        ("OPTIMAL", "SOFTENED"),
+        rows=4,
+    ),
+    "soft rates": Asked(mpc(BOX | {"du_max": 1.0, "du_slack": (50.0, 5.0)}), ("OPTIMAL", "SOFTENED")),
+    "disturbance": Asked(mpc(BOX | {"x_max": [0.6, 9.0]}, estimator=km.LiftedDisturbance()), ("OPTIMAL",), acts=True),
+    "late": Asked(
+        mpc(BOX, estimator=km.LiftedDisturbance(0.3), latency=2, cost=km.Cost([10.0, 1.0], 0.1, R_delta=0.1)),
+        ("OPTIMAL",),
+        acts=True,
+        rows=3,
+    ),
+    "given": Asked(mpc(BOX, cost=km.Cost([10.0, 1.0], 0.1, u_target=np.linspace(0, 3, 30)[:, None])), ("OPTIMAL",)),
+    "weighed end": Asked(mpc(BOX, cost=km.Cost([10.0, 1.0], 0.1, Q_N=[50.0, 5.0], u_target="zero")), ("OPTIMAL",)),
+    "no tail": Asked(mpc(BOX, cost=km.Cost([10.0, 1.0], 0.1, tail=0)), ("OPTIMAL",), rows=5),
+}
+
+
+@pytest.fixture(scope="module")
+def swung():
+    """A pendulum, θ = 0 upright, and a bilinear model of nine observables."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    ahead = ca.vertcat(x[0] + 0.05 * x[1], x[1] + 0.05 * (4.9 * ca.sin(x[0]) + 0.5 * u - 0.1 * x[1]))
+    plant = km.StepMap(ca.Function("F", [x, u], [ahead]), 0.05, states=("theta", "omega"), inputs=("torque",))
+    start = km.Uniform([-np.pi, -5.0], [np.pi, 5.0])
+    data = km.collect(plant, start, km.Noise(-8.0, 8.0), episodes=300, steps=10, rng=0)
+    lifting = km.State() + km.Fourier(2, states=[0]) + km.Constant()
+    return plant, km.bilinear_edmd(data, lifting)
+
+
+def steps_of(config, plant, steps, rng):
+    """What the steps are told: measurements of a run with noise and jumps, missed samples, moving references."""
+    x = np.array([0.6, 0.0])
+    pool = np.array(config.reference) + 0.1 * (np.arange(6)[:, None] % 3) * (len(config.reference) == 2)
+    for k in range(steps):
+        if k % 40 == 0:
+            x = rng.uniform([-1.5, -2.0], [1.5, 2.0])
+        y = x + rng.normal(0.0, 0.01, 2)
+        if k % 19 == 7:
+            y[rng.integers(2)] = np.nan
+        first = (k // 15) % 3
+        reference = pool[first] if config.rows == 1 else pool[np.minimum(first + np.arange(config.rows), 5)]
+        if k % 97 == 13:
+            reference = np.full_like(reference, np.nan)
+        applied = None if k % 5 else rng.uniform(-8, 8, 1)
+        u = yield y, reference, applied
+        x = np.array(plant(x, u if applied is None or config.acts else applied)) + rng.normal(0.0, 0.02, 2)
+
+
+def told(name, steps, swung, precision="double"):
+    """Both controllers' moves and plans of these steps, and how far rounding moves Python's own answer.
+
+    A third controller gets y times 1 + 1e-13: what that changes in u, 1e-13 of y does to this problem.
+    """
+    plant, model = swung
+    asked = CONTROLLERS[name]
+    controller, other = (asked.make(model, plant) for _ in range(2))
+    twin = km.compiled(controller, precision=precision)
+    rows = steps_of(asked, plant, steps, np.random.default_rng(2))
+    said, pairs, spread = next(rows), [], 0.0
+    while True:
+        a, b, c = controller(*said), twin(*said), other(said[0] * (1 + 1e-13), *said[1:])
+        pairs.append((a, b, controller.plan(), twin.plan()))
+        spread = max(spread, float(np.abs(a.u - c.u).max()))
+        try:
+            said = rows.send(a.u)
+        except StopIteration:
+            return pairs, spread
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("steps", [150, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_every_step_is_answered_as_in_python(name, steps, swung):
+    pairs, spread = told(name, steps, swung)
+    seen, other, off = set(), 0, []
+    for a, b, first, second in pairs:
+        seen.add(a.status.name)
+        if (a.status, a.fallback) != (b.status, b.fallback):
+            other += 1
+            continue
+        off.append(float(np.abs(b.u - a.u).max()))
+        assert (first is None) == (second is None)
+        if first is not None and a.iterations == b.iterations:
+            np.testing.assert_allclose(second.X[:2], first.X[:2], atol=1e-6 + spread)
+            np.testing.assert_allclose(second.U, first.U, atol=1e-3 + 10 * spread)
+    assert other <= 0.002 * steps
+    assert np.quantile(off, 0.5) <= 1e-9 * 16
+    assert np.quantile(off, 0.99) <= 1e-6 * 16 + 2 * spread
+    assert set(CONTROLLERS[name].seen) <= seen
+
+
+def test_a_closed_loop_under_soft_limits_costs_the_same(swung):
+    plant, model = swung
+    limits = km.Limits(**BOX, x_min=[-0.4, -1.0], x_max=[1.5, 1.2])
+    controller = km.BilinearMPC(model, COST, limits, 15, estimator=km.LiftedDisturbance())
+    fast = km.compiled(controller)
+    rows = np.column_stack([0.3 * np.sin(0.05 * np.arange(121)), np.zeros(121)])
+    runs = [
+        km.simulate(plant, one, x0=[1.2, 0.0], reference=rows, steps=120, cost=COST, limits=limits)
+        for one in (controller, fast)
+    ]
+    costs = [km.metrics(run).cost for run in runs]
+    assert abs(costs[1] / costs[0] - 1) < 1e-6
+    assert runs[1].status == runs[0].status
+    assert km.Status.SOFTENED in runs[0].status
+
+
+def test_it_swings_up_in_c_as_it_does_in_python(swung):
+    plant, model = swung
+    controller = km.BilinearMPC(model, SWING, km.Limits(**BOX), 30)
+    fast = km.compiled(controller)
+    found = fast.runs(plant, [[np.pi, 0.1], [2.5, 0.0]], [0.0, 1.0, 0.0], steps=120)
+    for X, U in zip(found.X, found.U, strict=True):
+        run = km.simulate(plant, controller, x0=X[0], reference=[0.0, 1.0, 0.0], steps=120)
+        np.testing.assert_allclose(X, run.X, atol=1e-5)
+        np.testing.assert_allclose(U, run.U, atol=1e-5)
+        assert abs(np.cos(X[-1, 0]) - 1) < 1e-3
+
+
+def test_floats_follow_the_plan_to_a_thousandth_of_the_range(swung):
+    pairs, _ = told("swing", 100, swung, "float")
+    off = [float(np.abs(a.u - b.u).max()) for a, b, *_ in pairs if a.status is b.status]
+    assert np.median(off) <= 1e-3 * 16
+    assert len(off) >= 95
+
+
+def test_a_pickle_goes_on_with_the_targets_that_it_knew(swung):
+    fast = km.compiled(km.BilinearMPC(swung[1], COST, km.Limits(**BOX), 10))
+    fast([0.5, 0.0], [0.1, 0.0])
+    twin, other = pickle.loads(pickle.dumps(fast)), copy.copy(fast)
+    for x in ([0.45, -0.1], [0.4, -0.2]):
+        moves = [one(x, [0.1, 0.0]) for one in (fast, twin, other)]
+        assert moves[0].u == moves[1].u == moves[2].u
+    assert other([0.4, 0.0], [0.2, 0.0]).status is km.Status.UNCONSTRAINED
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_the_folder_builds_without_a_warning_and_runs_clean(swung, tmp_path, precision):
+    plant, model = swung
+    limits = km.Limits(**BOX, du_max=3.0, x_max=[2.0, 1.5])
+    controller = km.BilinearMPC(model, COST, limits, 12, latency=1, estimator=km.LiftedDisturbance())
+    rows = np.column_stack([np.linspace(0.0, 0.3, 40), np.zeros(40)])
+    folder = km.export(controller, tmp_path / "c", precision=precision, plant=plant, x0=[0.8, 0], reference=rows)
+    for compiler in filter(shutil.which, ("gcc", "clang")):
+        done = subprocess.run(["make", "-s", "strict", f"CC={compiler}"], cwd=folder, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[:2000]
+    done = subprocess.run(["make", "-s", "sanitize"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[:2000]
+    assert not (folder / "daqp").exists()
+    printed = subprocess.run(["make", "-s", "run"], cwd=folder, capture_output=True, text=True, check=True).stdout
+    table = np.array([[float(word) for word in line.split(",")] for line in printed.splitlines()[1:]])
+    x, acting, close = np.array([0.8, 0.0]), np.zeros(1), 1e-5 if precision == "double" else 1e-2
+    controller.reset()
+    for k, row in enumerate(table[:60]):
+        move = controller(x, rows[min(k, 39) :])
+        np.testing.assert_allclose(row[1:3], x, atol=close)
+        np.testing.assert_allclose(row[3], move.u, atol=10 * close)
+        x, acting = plant(x, acting), move.u
+    assert "KOOPMPC_BAD_MEASUREMENT" in (folder / "README.md").read_text()
+
+
+def test_a_reference_that_the_table_lacks_is_answered_by_a_fallback_and_said(swung, tmp_path):
+    folder = km.export(
+        km.BilinearMPC(swung[1], COST, km.Limits(**BOX), 5), tmp_path / "c", reference=[[0.1, 0], [0.2, 0]]
+    )
+    program = r"""
+#include <stdio.h>
+#include "koopmpc.h"
+static koopmpc_state s;
+int main(void) {
+  const koopmpc_real y[2] = {0.3, 0}, rows[6] = {0.2, 0, 0.1, 0, 0.25, 0};
+  koopmpc_real u[1];
+  koopmpc_report report;
+  koopmpc_init(&s, 0, 0);
+  for (int i = 0; i < 3; i++) {
+    const koopmpc_rows reference = {rows + 2 * i, 1};
+    koopmpc_step(&s, y, &reference, 0, 0, u, &report);
+    printf("%d %d\n", (int)report.status, (int)report.fallback);
+  }
+  return 0;
+}
+"""
+    (tmp_path / "main.c").write_text(program)
+    command = ["cc", "-std=c99", "-Ic", *map(str, folder.glob("koopmpc_*.c")), "main.c", "-lm", "-o", "main"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    printed = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=True).stdout
+    assert printed.split("\n")[:3] == ["0 0", "0 0", f"{km.Status.BAD_MEASUREMENT.value} 1"]
+
+
+def test_an_implicit_integrator_is_refused_with_what_would_do(tmp_path):
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, 0.05, km.Collocation(2))
+    controller = km.BilinearMPC(plant, COST, km.Limits(**BOX), 5)
+    with pytest.raises(km.errors.DataError, match=r"implicit integrator .* discretize with RK4"):
+        km.compiled(controller)
