@@ -76,6 +76,7 @@ class DAQP(QPSolver):
         known = self._model.settings
         self._time_limit = self._allowed = known["time_limit"]
         self._most = self._few = known["iter_limit"]
+        self._last_most: int | None = None
         self._pace = 1e-9  # how long an iteration takes [s], once it is known
         self._scale()
         free = np.full(len(self.low), INFINITY)
@@ -137,12 +138,19 @@ class DAQP(QPSolver):
     ) -> QPSolution:
         """Solve from the rows that y pushes to, for None from those of the last solve.
 
-        DAQP looks at the clock every 32 iterations, so that it gets as many as fit in, too.
+        DAQP looks at the clock every 32 iterations, so that it gets as many as fit in, too. Where more rows than there
+        are variables push, as on a plant that is lost, it needs either a few iterations or thousands; then it starts
+        again from the hard rows alone, and needs one or two hundred.
         """
         limit = self._time_limit if time_limit is None else time_limit
         start = perf_counter() if limit else 0.0
         self._send(None if y is None else self._active(y))
-        x, multipliers, flag, iterations = self._run(limit)
+        crowded = y is not None and self._soft and np.count_nonzero(y) > len(v)
+        x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else None)
+        if y is not None and crowded and flag == _ITERATIONS:
+            self._send(self._active(np.where(self._sense == _SOFT, 0.0, y)))
+            x, multipliers, flag, more = self._run(max(limit - (perf_counter() - start), 1e-6) if limit else limit)
+            iterations += more
         good = (flag == _OPTIMAL and self._exact) or (flag > 0 and self._accurate(x, multipliers))
         self.resumes = good and int(np.count_nonzero(multipliers)) <= FEW
         if not good and flag != _TIME_LIMIT:
@@ -289,19 +297,22 @@ class DAQP(QPSolver):
         if len(self._rows):
             self._refused = self._model.update(bupper=self._high, blower=self._low, sense=sense)
 
-    def _run(self, limit: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], int, int]:
-        """Return what DAQP says of the limits that it has: x, multipliers, exit flag, iterations."""
+    def _run(
+        self, limit: float, most: int | None = None
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], int, int]:
+        """Return what DAQP says of the limits that it has: x, multipliers, exit flag, iterations (at most `most`)."""
         if self._refused < 0:
             return np.zeros_like(self._f), np.zeros_like(self._rows), self._refused, 0
-        if limit != self._allowed:
+        if limit != self._allowed or most != self._last_most:
             few = self._most if not limit else min(self._most, 1 + int(limit / self._pace))
+            few = few if most is None else min(few, most)
             self._model.settings = {"time_limit": limit, "iter_limit": few}
-            self._allowed, self._few = limit, few
+            self._allowed, self._few, self._last_most = limit, few, most
         x, _, flag, info = self._model.solve()
         iterations = info["iterations"]
         if limit and iterations > _MANY:
             self._pace += 0.5 * (info["solve_time"] / iterations - self._pace)
-        if flag == _ITERATIONS and self._few < self._most:
+        if flag == _ITERATIONS and limit and self._few < (most or self._most):
             flag = _TIME_LIMIT
         return x, info["lam"], flag, iterations
 

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.control.limits import Softness
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.qp import QP
 from tests.bare import shown
@@ -65,6 +66,26 @@ def test_inputs_that_cannot_hold_an_unstable_plant_are_not_called_infeasible(see
     u = cp.Variable(n)  # the same in u, whose limits have no rounding; its cost is near 1
     least = cp.Problem(cp.Minimize(cp.sum_squares(back @ (u + p))), [cp.abs(u) <= 1, cp.abs(change @ u) <= 0.2])
     assert abs(least.solve(solver="CLARABEL") - 1) < 1e-7
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_more_rows_than_variables_to_start_from_lead_to_the_same_answer_in_few_iterations(seed):
+    """|u_k| ≤ 1 and soft x_{k+1} = 1.3 x_k + u_k ≤ 1 from 50 to 1e4 times as far out: all of them give way."""
+    n, rng = 30, np.random.default_rng(seed)
+    reach = np.linalg.inv(np.eye(n) - 1.3 * np.eye(n, k=-1))
+    x = 1.3 ** np.arange(1, n + 1) * rng.uniform(20, 60)
+    rows, none = np.vstack([np.eye(n), reach]), np.zeros(n)
+    low, high = np.append(-np.ones(n), np.full(n, -np.inf)), np.append(np.ones(n), 1 - x)
+    prices = Softness(np.append(none + np.inf, none + 1e3), np.append(none, none + 0.1), none)
+    solver = DAQP(QP(np.eye(n), none, rows, low, high, prices))
+    cold = solved(solver, n, 2 * n)
+    assert np.count_nonzero(cold.y) > n
+    wrong = cold.y.copy()
+    wrong[rng.permutation(2 * n)[:8]] *= -1
+    again = solver.solve(none, wrong)
+    assert again.status is cold.status is km.Status.OPTIMAL
+    np.testing.assert_allclose(again.v, cold.v, atol=1e-7)
+    assert again.iterations <= 10 * n
 
 
 def test_equalities_come_and_go():
@@ -145,6 +166,7 @@ def test_settings_that_daqp_would_swallow():
     (line,) = shown(
         """
 from koopmpc.control.solvers.qp import QP
+from koopmpc.control.limits import Softness
 from koopmpc.control.solvers.daqp import DAQP
 one = np.ones(1)
 show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5}))
