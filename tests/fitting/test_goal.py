@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
+from koopmpc.control.base import MPCBase
 from koopmpc.fitting.check import check_controller
 from koopmpc.fitting.control import design_data
 from koopmpc.fitting.goal import goal_template, read_goal
@@ -102,6 +103,23 @@ def test_a_controller_that_misses_its_goal_fails_the_check_with_the_reason(tmp_p
     assert not done.kept
     assert any("off its reference, 5 % are allowed" in reason for reason in done.reasons)
     assert str(done).startswith("THE GOAL IS NOT KEPT")
+
+
+def test_an_input_beyond_its_limits_under_a_fault_fails_the_check(made, tmp_path, monkeypatch):
+    ours = MPCBase._fail
+
+    def careless(self, *arguments):
+        move = ours(self, *arguments)
+        move.u = move.u + 10.0
+        return move
+
+    monkeypatch.setattr(MPCBase, "_fail", careless)
+    done = check_controller(made.controller, tmp_path, runs=2)
+    outside = {one.kind.name: one.outside for one in done.figures}
+    assert outside["sensor NaN"] > 0
+    assert outside["as in the data"] == 0
+    assert not done.kept
+    assert any("sensor NaN: " in one and "outside their limits" in one for one in done.reasons)
 
 
 def test_a_controller_without_evidence_cannot_be_checked(tmp_path):
