@@ -68,6 +68,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.identify.fits.dmd import dmd as dmd
     from koopmpc.identify.fits.dmd import dmdc as dmdc
     from koopmpc.identify.fits.edmd import edmd as edmd
+    from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
     from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
     from koopmpc.identify.fits.prior import Prior as Prior

@@ -29,6 +29,9 @@ def test_the_examples_show_what_the_page_says(found):
     assert offsets[1] < 1e-6
     assert abs(found["state"][0] - 0.5) < 1e-3
     assert abs(found["swing"][0]) < 1e-2
+    assert abs(found["energy"](found["up"].X)[-1] - found["upright"]) < 1e-2
+    assert np.abs(found["up"].U).max() <= 2.0
+    assert np.abs(found["up"].X[:, 0]).min() < 0.2
     assert found["again"].iterations < found["move"].iterations
     assert np.abs(found["run"].U).max() <= 25
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.control.eigenfunction_lqr import EigenfunctionLQR as EigenfunctionLQR
     from koopmpc.control.move import Controller as Controller
     from koopmpc.control.move import Fallback as Fallback
     from koopmpc.control.move import Fallible as Fallible
