@@ -149,3 +149,21 @@ def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equili
     )
     np.testing.assert_allclose(silent.u, told.u, rtol=1e-6)
     assert abs(silent.x[1] - 340.0) < 0.2
+
+
+def test_the_rows_of_a_reference_that_moves_are_followed_and_ipopt_is_asked_once(monkeypatch):
+    plant = two_tanks()
+    seen = state_tracking(plant.states, plant.nu, COST, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+    targets = TerminalTargets(learned_map(plant), COST, seen, 300)
+    asked, own = [], targets.equilibria.find
+    monkeypatch.setattr(targets.equilibria, "find", lambda row: asked.append(row) or own(row))
+    t = np.linspace(0, 3, 60)
+    rows = np.column_stack([0.8 + 0.6 * np.sin(t), 0.7 + 0.5 * np.cos(t)])  # some ask for more than the limits allow
+    followed = [targets(row) for row in rows]
+    assert len(asked) == 1
+    for row, target in zip(rows, followed, strict=True):
+        alone = TerminalTargets(learned_map(plant), COST, seen, 300)(row)
+        np.testing.assert_allclose(target.u, alone.u, atol=1e-4)
+        np.testing.assert_allclose(target.equilibrium.x, alone.equilibrium.x, atol=1e-4)
+    targets(np.array([0.1, 0.1]))  # far from the last row
+    assert len(asked) == 2

@@ -26,6 +26,7 @@ CLOSE = 1e-2  # the same where the next control step goes on: the error left is 
 _QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
 _NEWTON = 20  # Gauss–Newton steps, at most
 _AT = 1e-6  # share of a limit's size and value within which ipopt ends at a limit that is active
+_BESIDE = 0.3  # share of a reference row within which the next one is sought from its equilibrium
 _STARTS = 12  # guesses of an equilibrium where the reference is not of the state
 _MISSED = 1e-6  # share of ‖r‖²_Q that a good equilibrium may leave
 _MOST = 10_000  # terminal targets remembered before the memory starts anew
@@ -322,6 +323,7 @@ class TerminalTargets:
                 raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
         self._known: dict[bytes, TerminalTarget] = {}
         self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
+        self._last: tuple[Float[np.ndarray, " nr"], Equilibrium] | None = None  # the row found last, and where
 
     def forget_missed(self) -> None:
         """Look again for the equilibria that were not found."""
@@ -333,6 +335,7 @@ class TerminalTargets:
         """Go on with another θ: the last target is found anew, from where it was."""
         self.equilibria.update(model)
         self.forget_missed()
+        self._last = None
         last, self._known = list(self._known.items())[-1:], {}
         for key, target in last:
             row = np.frombuffer(key)
@@ -347,11 +350,22 @@ class TerminalTargets:
             if len(self._known) > _MOST:
                 self._known.clear()
                 self._missed.clear()
-            found = self.equilibria.find(row)
+            found = self._beside(row) or self.equilibria.find(row)
+            self._last = None if found is None else (row.copy(), found)
             if found is None:
                 self._missed.add(key)
             self._known[key] = self._unheld(row) if found is None else self._target(row, found)
         return self._known[key]
+
+    def _beside(self, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
+        """Return the equilibrium of a row close to the last one, from where that was; None where it is not close."""
+        if self._last is None:
+            return None
+        weight, (last, begin) = self._outputs.Q_root, self._last
+        sizes = [float(np.linalg.norm(weight @ each)) for each in (row - last, row, last)]
+        if sizes[0] > _BESIDE * max(sizes[1:]):
+            return None
+        return self.equilibria.near(begin, row, np.zeros(self.equilibria.model.nx))
 
     def _unheld(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
         """Return the target of a row whose equilibrium was not found: ‖of(x_N) − r‖²_Q, and inputs at zero."""
