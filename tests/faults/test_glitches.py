@@ -147,3 +147,25 @@ def test_a_plant_without_an_equilibrium_inside_its_limits_is_controlled_by_the_r
     controller = km.BilinearMPC(plant, km.Cost(Q=[1.0, 1.0], R=0.1), km.Limits(u_min=-1, u_max=1), 10)
     moves = [controller([0.1 * k, 0.5], [0.0, 0.0]) for k in range(3)]
     assert all(move.u[0] == pytest.approx(-1.0, abs=1e-3) for move in moves)  # it holds against the drift
+
+
+@pytest.mark.parametrize("begin", [10, 200])  # before there are forecasts, and after
+@pytest.mark.parametrize("size", [50.0, 1e5])
+def test_a_burst_of_bad_readings_that_was_learned_is_left_behind(begin, size):
+    learner, twin, rng = online(), online(), np.random.default_rng(0)
+    for k, (x, u, x_next) in enumerate(pairs(PLANT, 2300)):
+        bad = size * rng.standard_normal((2, 2)) if begin <= k < begin + 25 else np.zeros((2, 2))
+        learner.learn(x + bad[0], u, x_next + bad[1])
+        twin.learn(x, u, x_next)
+    assert worst(learner.predictor(), PLANT) < 2 * worst(twin.predictor(), PLANT)
+
+
+def test_a_plant_at_rest_keeps_its_model():
+    learner, rng = online(), np.random.default_rng(0)
+    for x, u, x_next in pairs(PLANT, 300):
+        learner.learn(x, u, x_next)
+    before = worst(learner.predictor(), PLANT)
+    for _ in range(5000):
+        x, u = 1e-4 * rng.standard_normal(2), 1e-4 * rng.standard_normal(1)
+        learner.learn(x, u, PLANT(x, u))
+    assert worst(learner.predictor(), PLANT) < 2 * before

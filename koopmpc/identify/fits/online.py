@@ -11,7 +11,7 @@ from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.rows import row_columns
-from koopmpc.identify.moments.sliding import Forgetting, Gate, Window
+from koopmpc.identify.moments.sliding import Forgetting, Gate, Rival, Window
 from koopmpc.identify.regression import linear_predictor, regression_of, unreduced
 from koopmpc.identify.solve import Ridge, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting, buffered, lifting_of
@@ -31,7 +31,9 @@ class OnlineEDMD:
     far is an outlier: it is not learned, and counted in `outliers`. One reading that is far off would else be
     remembered for thousands of pairs. As long as there are no forecasts, a value beyond 1000 times the size of its
     observable is one. A plant that has changed is learned after a few pairs, for spreads grow with outliers. A memory
-    of less than four pairs a regressor knows no outliers.
+    of less than four pairs a regressor knows no outliers. Readings that are bad for longer are learned, and spoil the
+    model for as long as they stay in the memory; where they are so far off that it would hold them for good, what is
+    learned once they are over takes its place ten to twenty memories later.
 
     It takes no embedding, because it keeps no past steps. A model with delays learns from points ζ as states:
     ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.
@@ -95,6 +97,7 @@ class OnlineEDMD:
         self._memory: Forgetting | Window
         if window is None:
             self._memory = Forgetting(width, self._n, factor, float(keep))
+            self._forgetting = width, self._n, factor, float(keep)
         elif factor < 1:
             raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
         else:
@@ -103,6 +106,7 @@ class OnlineEDMD:
         self._waiting: int = 0
         long = factor < 1 and 1 / (1 - factor) > 4 * self._n  # else forecasts say nothing of outliers
         self._gate = Gate(width, self._n, nz) if long else None
+        self._rival: Rival | None = None
         self.pairs = self.outliers = 0
 
     @classmethod
@@ -202,9 +206,21 @@ class OnlineEDMD:
             if self._waiting == len(self._rows):
                 self._memory.push(self._rows)
                 self._waiting = 0
-                if self._gate is not None and isinstance(self._memory, Forgetting):
-                    self._gate.learn(self._memory.R)
+                if self._gate is not None:
+                    self._judge(self._gate)
         self.pairs = self.pairs + count - (self.outliers - before)
+
+    def _judge(self, gate: Gate) -> None:
+        """Begin a rival once signals have fallen, let it take over where it is better, and renew the forecasts."""
+        if gate.fell:
+            factor = self._forgetting[2]
+            gate.fell, self._rival = False, Rival(Forgetting(*self._forgetting), self._n, 1 / (1 - factor))
+        elif self._rival is not None and self._rival.push(self._rows, gate.K):
+            self._memory, self.pairs = self._rival.memory, self._rival.rows
+            gate.renew(self._rival.memory.R, self._rival.spread, self._rival.size)
+            self._rival = None
+        assert isinstance(self._memory, Forgetting)
+        gate.learn(self._memory.R)
 
     def predictor(self) -> LinearPredictor:
         """Return the fit of all pairs that count now. Doubts stand in its report; no warning is raised.

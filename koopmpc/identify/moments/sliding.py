@@ -126,9 +126,18 @@ class Window:
             self._back, self._R = [], empty(self._nd)
 
 
+def _forecaster(R: Triangle, n: int) -> Table | None:
+    """Return K of R K = T, with which t is forecast as Kᵀr; None where the rows do not say what it is."""
+    diagonal = np.abs(R.diagonal()[:n])
+    if diagonal.min(initial=np.inf) <= 1e-12 * diagonal.max(initial=0.0):
+        return None
+    return solve_triangular(R[:n, :n], R[:n, n:], check_finite=False)
+
+
 BEYOND, LEAST, MEMORY = 30.0, 0.01, 0.01  # of a spread; of a column's size; share that a new row has in both
 FEW = 20  # innovations, or rows, that say nothing of their spread yet
 FAR = 1000.0  # of a column's size: what no signal reaches, where there is no forecast to compare it with
+FALLEN = 0.01  # of a column's size: what stays below it for FEW rows was another signal before
 
 
 class Gate:
@@ -140,7 +149,8 @@ class Gate:
 
     Until there is a forecast, a row is an outlier where a value is beyond 1000 times the size of its column, the
     root-mean-square over about 100 rows, or among the first rows beyond 1000 times all others of its column. Inputs are
-    what they are: nothing is said of them.
+    what they are: nothing is said of them. `fell` tells that 20 rows in sequence stayed below 1 % of the size of some
+    column: the plant came to rest, or what was learned before was no signal.
 
     Parameters
     ----------
@@ -153,13 +163,21 @@ class Gate:
         self.begun, self._measured = False, (np.arange(nd) < nz) | (np.arange(nd) >= n)
         self._K: Table | None = None
         self._spread, self._size = np.zeros(nd - n), np.zeros(nd)  # mean squares
+        self.fell, self._low = False, np.zeros(nd)  # _low: rows in sequence below FALLEN
 
     def learn(self, R: Triangle) -> None:
         """Take over the regression R K = T of all rows so far."""
-        A, T = R[: self._n, : self._n], R[: self._n, self._n :]
-        diagonal = np.abs(A.diagonal())
-        if diagonal.min(initial=np.inf) > 1e-12 * diagonal.max(initial=0.0) and self._rows > 4 * self._n:
-            self._K = solve_triangular(A, T, check_finite=False)
+        if self._rows > 4 * self._n and (K := _forecaster(R, self._n)) is not None:
+            self._K = K
+
+    def renew(self, R: Triangle, spread: np.ndarray, size: np.ndarray) -> None:
+        """Begin anew with the regression R K = T, and mean squares of innovations and columns."""
+        self._K, self._spread, self._size = _forecaster(R, self._n), spread, size
+
+    @property
+    def K(self) -> Table | None:
+        """The forecast t = Kᵀr that innovations are taken from; None as long as there is none."""
+        return self._K
 
     def first(self, rows: Table) -> int:
         """Look at the first rows as a whole: move those that are no outliers to the front, and return their number."""
@@ -190,7 +208,59 @@ class Gate:
             if good or self._seen <= FEW:
                 self._size += max(MEMORY, 1.0 / (self._rows + 1)) * (square - self._size)
             if good:
+                self._low = np.where(self._measured & (row**2 < FALLEN**2 * self._size), self._low + 1, 0)
+                self.fell |= bool((self._low == FEW).any())
                 rows[kept] = row
                 kept += 1
                 self._rows += 1
         return kept
+
+
+class Rival:
+    """A second factor, of the rows since signals fell, which takes over where the first one is spoilt.
+
+    Bad readings that went on until they were learned leave information in the first factor that a thousand ordinary
+    rows cannot outweigh, and that `keep` holds for ever. Over the second half of each ten memories both forecast the
+    rows that come: the rival is better where the first is off by more than 0.1 % of some column, and by more than twice
+    as much as the rival. A plant that came to rest keeps its model: in that time the first one has adapted to what is
+    left to forecast.
+
+    Parameters
+    ----------
+    memory
+        A factor of no rows yet.
+    n
+        Regressors.
+    memory_rows
+        Rows that it remembers, 1 / (1 − λ).
+    """
+
+    def __init__(self, memory: Forgetting, n: int, memory_rows: float) -> None:
+        self.memory, self._n, self._period = memory, n, int(10 * memory_rows)
+        self.rows, self._judged = 0, 0
+        self._errors = np.zeros((2, len(memory.R) - n))
+        self.size = np.zeros(len(memory.R))  # mean square of each column
+
+    @property
+    def spread(self) -> np.ndarray:
+        """The mean square of innovations of each column."""
+        return self._errors[1]
+
+    def push(self, rows: Table, K: Table | None) -> bool:
+        """Take in rows that the first factor forecasts by K; return whether the rival takes its place from now on."""
+        n, own = self._n, _forecaster(self.memory.R, self._n)
+        if 2 * (self.rows % self._period) >= self._period and K is not None and own is not None:
+            r, t = rows[:, :n], rows[:, n:]
+            share = len(rows) / (self._judged + len(rows))
+            self._judged += len(rows)
+            self._errors += share * (np.array([((t - r @ k) ** 2).mean(axis=0) for k in (K, own)]) - self._errors)
+            self.size += share * ((rows**2).mean(axis=0) - self.size)
+        self.memory.push(rows)
+        self.rows += len(rows)
+        if self.rows // self._period == (self.rows - len(rows)) // self._period or not self._judged:
+            return False
+        first, second = self._errors
+        off = (first > 1e-6 * self.size[n:]) & (first > 4 * second)
+        better = bool(off.any() and (second <= np.maximum(first, 0.01 * self.size[n:])).all())
+        self._judged = 0
+        return better
