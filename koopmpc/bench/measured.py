@@ -149,8 +149,8 @@ def measure(names: Sequence[str]) -> None:
         write_measured(found)
         for row in rows:
             if row.failure:
-                print(f"{row.problem}:{row.case} {row.controller}: {row.failure}")  # noqa: T201
-        print(markdown(found))  # noqa: T201
+                sys.stdout.write(f"{row.problem}:{row.case} {row.controller}: {row.failure}\n")
+        sys.stdout.write(f"{markdown(found)}\n")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.format.reader import load_run
 from koopmpc.validate.text import markdown_table
 
-_RESAMPLES, _SURE = 1000, (0.025, 0.975)  # of the bootstrap, and the ends of its interval
+_SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
 _LOGS = 12  # runs over one another, at most
 
@@ -56,21 +56,24 @@ class Summary:
     cold_p50: float
 
 
-def median_interval(values: Float[np.ndarray, " n"], rng: np.random.Generator) -> tuple[float, float, float]:
-    """Return the median, and the ends of a 95 % interval by the percentile bootstrap; NaN where there is no value."""
-    good = values[np.isfinite(values)]
-    if not len(good):
+def median_interval(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """Return the median of n values, and the ends of its 95 % interval by the ideal bootstrap; NaN without a value.
+
+    A resample has Bin(n, k/n) values up to x_(k), so its median is at most x_(k) where these are half of it or more:
+    with probability P(Bin(n, k/n) ≥ m) = I_{k/n}(m, n − m + 1), which needs no drawing. The ends are the first x_(k) at
+    which this is 2.5 % for the lower median, m = ⌈n/2⌉, and 97.5 % for the upper one, m = ⌊n/2⌋ + 1.
+    """
+    from scipy.stats import beta
+
+    ordered = np.sort(values[np.isfinite(values)])
+    n = len(ordered)
+    if not n:
         return float("nan"), float("nan"), float("nan")
-    # The median of a resample is an order statistic, whose rank is that of a median of n uniform ranks.
-    ranks = np.sort(rng.integers(0, len(good), (_RESAMPLES, min(len(good), 2001))), axis=1)
-    if len(good) > ranks.shape[1]:  # the interval of n values is that of fewer, narrower by the root of the shares
-        middle = (len(good) - 1) / 2
-        ranks = middle + (ranks - middle) * np.sqrt(ranks.shape[1] / len(good))
-    n = ranks.shape[1]
-    ordered = np.sort(good)
-    pair = ordered[np.rint(ranks[:, [(n - 1) // 2, n // 2]]).astype(np.int64)]
-    low, high = np.quantile(pair.mean(axis=1), _SURE)
-    return float(np.median(good)), float(low), float(high)
+    low, high = (
+        ordered[int(np.ceil(n * beta.ppf(share, m, n - m + 1))) - 1]
+        for share, m in zip(_SURE, ((n + 1) // 2, n // 2 + 1), strict=True)
+    )
+    return float(np.median(ordered)), float(low), float(high)
 
 
 def condition_of(row: RunRow) -> str:
@@ -82,7 +85,7 @@ def condition_of(row: RunRow) -> str:
 def summaries(rows: Sequence[RunRow]) -> list[Summary]:
     """Return a summary for each case, condition and controller."""
     best = {_pair(row): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics is not None}
-    rng, found = np.random.default_rng(0), list[Summary]()
+    found: list[Summary] = []
     groups: dict[tuple[str, str, str], list[RunRow]] = {}
     for row in rows:
         groups.setdefault((f"{row.problem}:{row.case}", condition_of(row), row.controller), []).append(row)
@@ -104,8 +107,8 @@ def summaries(rows: Sequence[RunRow]) -> list[Summary]:
                 runs=len(own),
                 failed=sum(row.failure is not None for row in own),
                 reached=sum(row.reached for row in own) / len(own),
-                **dict(zip(("cost", "cost_low", "cost_high"), median_interval(costs, rng), strict=True)),
-                **dict(zip(("ratio", "ratio_low", "ratio_high"), median_interval(ratios, rng), strict=True)),
+                **dict(zip(("cost", "cost_low", "cost_high"), median_interval(costs), strict=True)),
+                **dict(zip(("ratio", "ratio_low", "ratio_high"), median_interval(ratios), strict=True)),
                 violation=float(np.median(over)) if len(over) else float("nan"),
                 worst_violation=float(over.max(initial=0.0)),
                 fell_back=1.0 - kept / steps if steps else float("nan"),

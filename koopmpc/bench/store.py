@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from koopmpc import disk
-from koopmpc.bench.results import RESULTS, RunRow, record_of, row_of, write_results
+from koopmpc.bench.results import RunRow, record_of, row_of
 from koopmpc.errors import LogError, ProblemError
 
 MANIFEST, ROWS = "sweep.json", "rows"
@@ -191,8 +191,3 @@ def _processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-def table_written(folder: Path, rows: list[RunRow]) -> None:
-    """Write results.parquet of these runs."""
-    write_results(rows, folder / RESULTS)

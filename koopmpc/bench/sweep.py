@@ -19,9 +19,9 @@ from koopmpc import checks
 from koopmpc.bench.controllers import LEARNED, Prepared, controller_names
 from koopmpc.bench.library import load_problem
 from koopmpc.bench.problem import Problem
-from koopmpc.bench.results import RunRow
+from koopmpc.bench.results import RESULTS, RunRow, write_results
 from koopmpc.bench.single import FAULTS, row_of_run
-from koopmpc.bench.store import ROWS, Journal, load_rows, next_batch, opened, table_written
+from koopmpc.bench.store import ROWS, Journal, load_rows, next_batch, opened
 from koopmpc.control.limits import Limits
 from koopmpc.errors import ProblemError
 from koopmpc.parallel import map_tasks
@@ -178,13 +178,13 @@ def sweep(
                 done |= {row.key: replace(row, log=row.log and folder / row.log.name) for row in finished}
                 told.say(finished[-1].name if len(done) < len(rows) else "done", len(finished))
                 if (begin := time.monotonic()) >= due:
-                    table_written(folder, _in_order(rows, done))
+                    write_results(_in_order(rows, done), folder / RESULTS)
                     due = begin + _SHARE * (time.monotonic() - begin)
         except BaseException:  # Ctrl-C, above all: runs of the batch under way are finished, too
             done = {row.key: row for row in load_rows(folder)}
             raise
         finally:
-            table_written(folder, _in_order(rows, done))
+            write_results(_in_order(rows, done), folder / RESULTS)
     return _in_order(rows, done)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost, Sizes
-from koopmpc.control.limits import SOFTENED
+from koopmpc.control.limits import SOFTENED, Limits
 from koopmpc.errors import ShapeError
 from koopmpc.loop.run import Run
 from koopmpc.values import Value
@@ -226,19 +226,14 @@ def _violation(run: Run) -> tuple[float, float]:
     """Return the largest violation of a limit in its unit, and the largest as a share of the limit's size."""
     if run.limits is None:
         return 0.0, 0.0
-    limits, nu, values = run.limits, run.U.shape[1], _states(run)[1:]
-    nx, ny, cost = values.shape[1], 0, run.cost or Cost(1, 1)
-    if limits.of is not None:
-        outputs = limits.of.bind(run.states)(values)
-        ny, values = outputs.shape[1], np.hstack([values, outputs])
+    nu, cost, (states, rates) = run.U.shape[1], run.cost or Cost(1, 1), _broken(run, run.limits)
     tracked = cost.of.bind(run.states)
-    size = Sizes.of(tracked, *cost.matrices(tracked.nz, nu), limits, run.states, None).rows
-    beyond = _excess(values, *limits.ends(nx, ny))
-    rates = limits.rates(nu)
-    if rates is not None:
-        beyond = np.concatenate([beyond, _excess(np.diff(run.U, axis=0), *rates)])
-        size = np.concatenate([size, limits.rate_softness(nu).allowance / SOFTENED])
-    return float(beyond.max(initial=0.0)), float((beyond / size).max(initial=0.0))
+    size = Sizes.of(tracked, *cost.matrices(tracked.nz, nu), run.limits, run.states, None).rows
+    most = states.max(axis=0, initial=0.0)
+    if run.limits.rates(nu) is not None:
+        most = np.concatenate([most, rates.max(axis=0, initial=0.0)])
+        size = np.concatenate([size, run.limits.rate_softness(nu).allowance / SOFTENED])
+    return float(most.max(initial=0.0)), float((most / size).max(initial=0.0))
 
 
 def beyond(run: Run) -> Float[np.ndarray, " T1"]:
@@ -247,29 +242,33 @@ def beyond(run: Run) -> Float[np.ndarray, " T1"]:
     x_0 is given, so its row is 0. In the unit of that limit.
     """
     most = np.zeros(len(run.X))
-    if run.limits is None:
-        return most
-    values, ny = _states(run)[1:], 0
-    if run.limits.of is not None:
-        outputs = run.limits.of.bind(run.states)(values)
-        ny, values = outputs.shape[1], np.hstack([values, outputs])
-    ends = run.limits.ends(values.shape[1] - ny, ny)
-    most[1:] = [_excess(row[None], *ends).max(initial=0.0) for row in values]
-    rates = run.limits.rates(run.U.shape[1])
-    if rates is not None:
-        changed = [_excess(row[None], *rates).max(initial=0.0) for row in np.diff(run.U, axis=0)]
-        most[2:] = np.maximum(most[2:], changed)
+    if run.limits is not None:
+        states, rates = _broken(run, run.limits)
+        most[1:] = states.max(axis=1, initial=0.0)
+        most[2:] = np.maximum(most[2:], rates.max(axis=1, initial=0.0))
     return most
+
+
+def _broken(run: Run, limits: Limits) -> tuple[Float[np.ndarray, "T n"], Float[np.ndarray, "T0 nu"]]:
+    """Return by how much x_1 … x_T and their limited outputs are beyond their limits, and each change of the input."""
+    values, nu, ny = _states(run)[1:], run.U.shape[1], 0
+    if limits.of is not None:
+        outputs = limits.of.bind(run.states)(values)
+        ny, values = outputs.shape[1], np.hstack([values, outputs])
+    changed, rates = np.diff(run.U, axis=0), limits.rates(nu)
+    free = np.full(nu, np.inf)
+    low, high = (-free, free) if rates is None else rates
+    return _excess(values, *limits.ends(values.shape[1] - ny, ny)), _excess(changed, low, high)
 
 
 def _excess(
     values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
-    """Return by how much each column is beyond its limits at most; where there is no limit, not even inf is beyond."""
-    beyond = np.zeros(len(low))
+) -> Float[np.ndarray, "T n"]:
+    """Return by how much each value is beyond its limits; where there is no limit, not even inf or NaN is beyond."""
+    beyond = np.zeros(values.shape)
     for end, sign in ((low, -1.0), (high, 1.0)):
         known = np.isfinite(end)
-        beyond[known] = np.maximum(beyond[known], (sign * (values[:, known] - end[known])).max(axis=0, initial=0.0))
+        beyond[:, known] = np.maximum(beyond[:, known], sign * (values[:, known] - end[known]))
     return beyond
 
 

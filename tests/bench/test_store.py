@@ -1,16 +1,11 @@
 """A sweep's store: many starts, seeds and noises, workers, kill -9, and two sweeps that do not mix."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import binom
 
 import koopmpc as km
 from tests.bench.tiny import write
@@ -113,14 +108,6 @@ def test_another_sweep_is_refused_in_the_same_folder(problem, whole, tmp_path):
         km.sweep([changed], TWO, folder=whole[1], **GRID)
 
 
-def test_two_sweeps_at_once_in_one_folder_are_refused(problem, tmp_path):
-    def second(*told):
-        with pytest.raises(km.errors.ProblemError, match="another process runs a sweep in"):
-            km.sweep([problem], ["lqr"], folder=tmp_path)
-
-    assert len(km.sweep([problem], ["lqr"], folder=tmp_path, progress=second)) == 2
-
-
 def test_wrong_parameters_move_the_plant_and_no_controller(tmp_path):
     problem = km.load_problem("pendulum:upright")
     rows = km.sweep([problem], TWO, folder=tmp_path, wrong=[0.0, 0.1], starts=2)
@@ -136,101 +123,25 @@ def test_a_problem_that_cannot_be_sent_says_so(problem, tmp_path):
         km.sweep([local], ["lqr"], folder=tmp_path, workers=2)
 
 
-def killed_and_resumed(problem, folder, moments, grid):
-    """Start the sweep in a process of its own, kill it at each moment [s], and end it in peace."""
-    code = (
-        "import koopmpc as km, sys\n"
-        "if __name__ == '__main__':\n"
-        f"    km.sweep([km.load_problem({problem.file!r})], {TWO!r}, folder={str(folder)!r}, workers=2, **{grid!r})\n"
-    )
-    script = Path(f"{folder}.py")
-    script.write_text(code)
-    for moment in moments:
-        before = {row.key for row in km.bench.load_rows(folder)} if (folder / "sweep.json").exists() else set()
-        process = subprocess.Popen([sys.executable, script], start_new_session=True)
-        time.sleep(moment)
-        process.kill()
-        process.wait()
-        if (folder / "sweep.json").exists():
-            assert before <= {row.key for row in km.bench.load_rows(folder)}
-    deadline = time.monotonic() + 20  # workers end with their parent
-    while time.monotonic() < deadline:
-        try:
-            return km.sweep([problem], TWO, folder=folder, **grid)
-        except km.errors.ProblemError as error:
-            if "another process" not in str(error):
-                raise
-            time.sleep(0.2)
-    raise AssertionError("a worker of a killed sweep still holds the folder")
-
-
-def once_each(folder):
-    """Return how many lines the store has for each run."""
-    found = [
-        line
-        for path in (folder / "rows").glob("*.jsonl")
-        for line in path.read_bytes().split(b"\n")
-        if b'"cost"' in line
-    ]
-    return len(found)
-
-
-def test_a_sweep_that_was_killed_goes_on_where_it_was(problem, whole, tmp_path):
-    rows = killed_and_resumed(problem, tmp_path / "killed", [4.0], GRID)
-    assert figures(rows) == figures(whole[0])
-    assert once_each(tmp_path / "killed") == len(rows)
-
-
-@pytest.mark.slow
-def test_twenty_kills_at_random_moments_lose_nothing_and_repeat_nothing(problem, tmp_path):
-    grid = {**GRID, "starts": 300}
-    undisturbed = km.sweep([problem], TWO, folder=tmp_path / "peace", **grid)
-    moments = np.random.default_rng(0).uniform(1.0, 8.0, 20).tolist()
-    rows = killed_and_resumed(problem, tmp_path / "killed", moments, grid)
-    assert figures(rows) == figures(undisturbed)
-    assert once_each(tmp_path / "killed") == len(rows)
-
-
-def test_a_worker_that_is_killed_costs_its_current_run_alone(tmp_path):
-    source = {
-        "return -0.5 * x[0]": "import os; os.kill(os.getpid(), 9) if os.environ.get('X') else 0\n        return -0.5 * x[0]"
-    }
-    deadly = km.load_problem(write(tmp_path, **source))
-    os.environ["X"] = "1"
-    try:
-        rows = km.sweep([deadly], ["lqr"], folder=tmp_path / "deadly", workers=2)
-    finally:
-        del os.environ["X"]
-    assert [row.failure for row in rows] == ["its worker process died 2 times"] * 2
-
-
-def test_ctrl_c_leaves_a_store_that_reads(problem, tmp_path):
-    script = tmp_path / "swept.py"
-    grid = {**GRID, "starts": 2000}
-    script.write_text(
-        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it\n"
-        f"import koopmpc as km\nkm.sweep([km.load_problem({problem.file!r})], {TWO!r}, folder={str(tmp_path / 'f')!r}, **{grid!r})\n"
-    )
-    process = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and once_each(tmp_path / "f") < 5:
-        time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    process.wait(60)
-    rows = km.bench.load_rows(tmp_path / "f")
-    assert 0 < len(rows) < 24000
-    assert pq.read_table(tmp_path / "f" / "results.parquet").num_rows == len(rows)
-
-
 def test_the_interval_of_a_median_holds_it_as_often_as_it_says():
     rng = np.random.default_rng(3)
     for n in (15, 2001, 40000):
         inside = 0
         for _ in range(100):
-            middle, low, high = km.bench.median_interval(rng.exponential(size=n), rng)
+            middle, low, high = km.bench.median_interval(rng.exponential(size=n))
             assert low <= middle <= high
             inside += low <= np.log(2.0) <= high
         assert 85 <= inside <= 100
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 15, 40])
+def test_the_interval_of_a_median_is_what_resamples_tend_to(n):
+    """The oracle counts, by the binomial distribution, the resamples whose lower and upper median is at most x_(k)."""
+    values = np.random.default_rng(n).permutation(np.arange(1.0, n + 1))
+    k = np.arange(1, n + 1)
+    up_to = [binom.sf((n + 1) // 2 - 1, n, k / n), binom.sf(n // 2, n, k / n)]
+    ends = [float(k[np.argmax(share >= least)]) for share, least in zip(up_to, (0.025, 0.975), strict=True)]
+    assert km.bench.median_interval(np.append(values, [np.nan, np.inf]))[1:] == tuple(ends)
 
 
 def test_a_report_is_one_file_with_every_case_and_controller(whole):

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared
 
 HERE = Path(__file__).parent
 PROBLEMS = ("pendulum:upright", "cart_pole", "pendulum_swing")
@@ -51,7 +50,7 @@ def main() -> int:
 def exported(name: str, folder: Path) -> Path:
     """Export the Koopman MPC of a problem in single precision, its example on the problem's own plant."""
     problem = km.load_problem(name)
-    parts = Prepared(problem)
+    parts = km.bench.Prepared(problem)
     case = next(iter(problem.cases.values()))
     limits = problem.limits if case.limits is None else case.limits
     controller = km.KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, solver="daqp")

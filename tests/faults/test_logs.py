@@ -148,6 +148,31 @@ def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> No
     assert found[-1] == 450
 
 
+@pytest.mark.parametrize("count", [6, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("grown", [False, True], ids=["record", "Recorder"])
+def test_a_log_cut_at_a_random_byte_is_read_and_repaired_or_refused(
+    written: Path, tmp_path: Path, grown: bool, count: int
+) -> None:
+    """Half of the thousand are logs of `record`, half grew while their loop ran."""
+    run, path, repaired = make_run(T=60), tmp_path / "cut.rrd", tmp_path / "cut.repaired.rrd"
+    if not grown:
+        km.record(run, path)
+    data, read = (written if grown else path).read_bytes(), 0
+    for end in np.random.default_rng(0).integers(0, len(data), (count + 1) // 2).tolist():
+        path.write_bytes(data[:end])
+        repaired.unlink(missing_ok=True)
+        (found,) = km.bench.inspected([path], repair=True)
+        if found.refused is not None:
+            assert str(path) in found.refused
+            assert not repaired.exists()
+            continue
+        read += 1
+        assert found.cut is not None
+        again = km.load_run(repaired)
+        assert again == head(run, again.steps)
+    assert 0 < read < count
+
+
 def test_a_recorded_log_says_what_it_was_however_little_is_left(tmp_path: Path) -> None:
     km.record(make_run(T=200), tmp_path / "run.rrd")
     data = (tmp_path / "run.rrd").read_bytes()
