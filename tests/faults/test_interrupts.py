@@ -85,8 +85,6 @@ def _interrupt():
     os.kill(os.getpid(), signal.SIGINT)
 
 
-# Rerun's recordings are deleted by the garbage collector, where Python prints an interrupt; `record` raises it all the same.
-@pytest.mark.filterwarnings("ignore:Exception ignored in.*RecordingStream:pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", BUSY)
 @pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.slow)])
 def test_an_interrupt_is_never_swallowed_in_python(tmp_path: Path, name: str, count: int) -> None:

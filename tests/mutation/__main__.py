@@ -32,6 +32,7 @@ ROOMS = ("control", "identify", "estimate", "loop", "data", "predict")
 MORE = ("tests/faults",)  # tests of several rooms
 COPIED = ("koopmpc", "problems", "tests", "docs", "pyproject.toml", "README.md", "CHANGELOG.md", "Makefile")
 ENOUGH = 20.0  # seconds of processor time of tests that a change has to outlive
+FEW = 5  # tests that may fail before anything is changed, as those of real time on a machine that is busy; none counts
 PYTEST = (sys.executable, "-m", "pytest", "-q", "--benchmark-disable", "-p", "no:cacheprovider")
 
 
@@ -60,7 +61,7 @@ def measured(folder: Path, workers: int) -> tuple[Map, dict[str, float]]:
     Raises
     ------
     SystemExit
-        A test fails before anything is changed.
+        More than a few tests fail before anything is changed.
     """
     where = [f"tests/{room}" for room in ROOMS] + list(MORE)
     done = subprocess.run(
@@ -73,8 +74,10 @@ def measured(folder: Path, workers: int) -> tuple[Map, dict[str, float]]:
         stderr=subprocess.STDOUT,
         text=True,
     )
-    if done.returncode:
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    if done.returncode > 1 or len(failed) > FEW:
         raise SystemExit(f"the tests fail without any change:\n{done.stdout[-3000:]}")
+    sys.stdout.write("".join(f"left out, for it fails without any change: {line}\n" for line in failed))
     data, found = CoverageData(str(folder / ".coverage")), {}
     data.read()
     for file in data.measured_files():
@@ -87,9 +90,9 @@ def measured(folder: Path, workers: int) -> tuple[Map, dict[str, float]]:
 def tests_of(mutant: Mutant, covering: Map, seconds: dict[str, float]) -> list[str]:
     """Return the tests that run this line, as many as take ENOUGH; the room's own and short files of tests first."""
     lines = covering.get(mutant.file, {})
-    some = {test for n in range(mutant.first, mutant.last + 1) for test in lines.get(n, ())}
+    some = {test for n in range(mutant.first, mutant.last + 1) for test in lines.get(n, ()) if test in seconds}
     if not some and any(n in lines for n in range(mutant.first, mutant.last + 1)):  # it runs when it is imported
-        some = {test for tests in lines.values() for test in tests}
+        some = {test for tests in lines.values() for test in tests if test in seconds}
     own = f"tests/{mutant.file.split('/')[1]}/"
     files: dict[str, list[str]] = {}
     for test in sorted(some, key=lambda test: seconds.get(test, 0.0)):

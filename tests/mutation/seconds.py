@@ -1,4 +1,4 @@
-"""A pytest plugin that writes the seconds of processor time of each test to seconds.json."""
+"""A pytest plugin that writes the seconds of processor time of each test that passes to seconds.json."""
 
 import json
 import os
@@ -12,9 +12,10 @@ _seconds: Counter[str] = Counter()
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    before = sum(os.times()[:4])  # of this process and of its children
+    before, failed = sum(os.times()[:4]), item.session.testsfailed  # of this process and of its children
     result = yield
-    _seconds[item.nodeid] += sum(os.times()[:4]) - before
+    if item.session.testsfailed == failed:
+        _seconds[item.nodeid] += sum(os.times()[:4]) - before
     return result
 
 

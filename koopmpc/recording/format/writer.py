@@ -56,9 +56,10 @@ def _new_recording(application: str) -> Any:
     import rerun as rr
     import rerun_bindings
 
-    if rr.get_global_data_recording() is None:
-        rerun_bindings.flush_and_cleanup_orphaned_recordings()
-    return rr.RecordingStream(application, recording_id=uuid.uuid4())
+    with deferred():  # Python drops a Ctrl-C that comes in a deletion
+        if rr.get_global_data_recording() is None:
+            rerun_bindings.flush_and_cleanup_orphaned_recordings()
+        return rr.RecordingStream(application, recording_id=uuid.uuid4())
 
 
 def _send_blueprint(rec: Any, application: str, layout: Any) -> None:
@@ -66,16 +67,16 @@ def _send_blueprint(rec: Any, application: str, layout: Any) -> None:
     import rerun as rr
     import rerun_bindings
 
-    own = rerun_bindings.new_blueprint(
-        application_id=application, make_default=False, make_thread_default=False, default_enabled=True
-    )
-    stream = rr.RecordingStream._from_native(own)
-    try:
+    with deferred():
+        own = rerun_bindings.new_blueprint(
+            application_id=application, make_default=False, make_thread_default=False, default_enabled=True
+        )
+        stream = rr.RecordingStream._from_native(own)
         stream.set_time("blueprint", sequence=0)
         layout.to_blueprint()._log_to_stream(stream)
         rerun_bindings.send_blueprint(stream.memory_recording().storage, False, True, recording=rec.to_native())
-    finally:
         stream.disconnect()  # else what it holds and the stream hold each other
+        del stream
 
 
 @contextmanager
@@ -247,7 +248,7 @@ class Writer:
             self._file.discard()
 
     def _release(self) -> None:
-        """Close the recording and let go of it; a Ctrl-C waits, for Python drops one that comes in a deletion."""
+        """Close the recording and let go of it."""
         with deferred():
             if self._rec is not None:
                 self._rec.disconnect()
