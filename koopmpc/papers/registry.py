@@ -22,7 +22,14 @@ from koopmpc.figures.plots import Plot, plots
 from koopmpc.recording.page import Page
 from koopmpc.recording.views.curves import record_curves
 
-PAPERS = ("snyder", "brunton", "proctor", "williams", "korda")
+PAPERS = (
+    "snyder",
+    "brunton",
+    "proctor",
+    "williams",
+    "korda",
+    "kaiser",
+)
 
 _ROUNDING = 1e-10
 Tell = Callable[[str], None]  # is called with what runs now

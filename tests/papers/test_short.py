@@ -15,6 +15,7 @@ QUICK = (
     "brunton",
     "proctor",
     "williams",
+    "kaiser",
     *(pytest.param(name, marks=pytest.mark.slow) for name in ("korda",)),
 )
 
