@@ -175,6 +175,7 @@ def check(
 def export(
     controller: Annotated[Path, typer.Argument(help="What the save of a controller or of a design wrote.")],
     out: Annotated[Path, typer.Option("--out", help="The folder to write; it may hold an older export.")],
+    name: Annotated[str, typer.Option("--name", help="What its files and symbols start with.")] = "koopmpc",
     precision: Annotated[str, typer.Option("--precision", help="double or float.")] = "double",
     problem: Annotated[
         str | None, typer.Option("--problem", help="The example controls the plant of this problem: name or name:case.")
@@ -194,9 +195,9 @@ def export(
         if problem is not None:
             given = load_problem(problem)
             name, case = next(iter(given.cases.items()))
-            row = np.atleast_2d(np.asarray(case.reference))[0]
+            row = np.atleast_2d(np.asarray(case.reference))
             example = {"plant": Prepared(given).truth_of(name), "x0": case.x0, "reference": row, "steps": case.steps}
-        folder = write(loaded, out, precision=cast("Any", precision), **example)
+        folder = write(loaded, out, name=name, precision=cast("Any", precision), **example)
     console().print(Text(f"{folder}: make run builds it and prints its closed loop"), soft_wrap=True)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.codegen.machine import Precision
-from koopmpc.codegen.sources import constants, flops, iteration_flops, shipped, sources_of, tables_of
+from koopmpc.codegen.sources import constants, flops, iteration_flops, named, shipped, sources_of, tables_of
 from koopmpc.codegen.tables import Exportable, Tables, refusal
 from koopmpc.codegen.text import Language, function, traced
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
@@ -40,6 +40,7 @@ def export(
     controller: Controller,
     folder: str | Path,
     *,
+    name: str = "koopmpc",
     precision: Precision = "double",
     plant: StepMap | None = None,
     x0: ArrayLike | None = None,
@@ -58,6 +59,8 @@ def export(
         An LQR, a KoopmanMPC, a LinearMPC or a BilinearMPC, without a time_limit.
     folder
         Is made; one that holds other files than those of an export is refused.
+    name
+        What files and symbols start with: ``name_step``, ``name.h``. Controllers of different names link together.
     precision
         "double" or "float".
     plant
@@ -97,11 +100,13 @@ def export(
     texts = sources_of(tables, single=single)
     texts |= {name: shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
     texts |= _plant(controller, tables, plant, x0, rows, checks.count(steps, "steps"), Language(single))
+    texts = named(texts, name)
     root = Path(folder)
-    _refuse_others(root, {*texts, "README.md"})
+    _refuse_others(root, {*texts, "README.md"}, name)
     for path, text in texts.items():
         _write(root / path, text)
-    _write(root / "README.md", _readme(controller, tables, root, precision))
+    readme = {"README.md": _readme(controller, tables, _measure_objects(root, name), precision)}
+    _write(root / "README.md", named(readme, name)["README.md"])
     return root
 
 
@@ -122,13 +127,13 @@ def _reference_of(controller: Exportable, reference: ArrayLike | None) -> Float[
     return checks.array(rows, "reference", (None, nr))
 
 
-def _refuse_others(root: Path, known: set[str]) -> None:
+def _refuse_others(root: Path, known: set[str], prefix: str) -> None:
     """Raise DataError where the folder holds what no export has written."""
     if root.exists() and not root.is_dir():
         raise DataError(f"{root} is a file; pass a folder")
     for path in sorted(root.rglob("*")) if root.exists() else []:
         name = path.relative_to(root).as_posix()
-        ours = name in known or path.suffix in _BUILT or name in _PROGRAMS or name.startswith("koopmpc_")
+        ours = name in known or path.suffix in _BUILT or name in _PROGRAMS or name.startswith(f"{prefix}_")
         if path.is_file() and not ours:
             raise DataError(f"{root} holds {name}, which no export wrote; pass an empty folder, or remove that file")
 
@@ -205,16 +210,16 @@ def _start(model: LinearPredictor | BilinearPredictor | StepMap, nx: int) -> Flo
     return np.resize(np.linalg.norm(model.scale @ model.C.T, axis=0), nx)
 
 
-def _measure_objects(root: Path) -> tuple[int, int, int] | None:
+def _measure_objects(root: Path, name: str) -> tuple[int, int, int] | None:
     """Return bytes of code and constants, of the state, and of the stack of all functions; None without a compiler."""
     command = compiler()
     if command is None:
         return None
-    probe = '#include "koopmpc.h"\nkoopmpc_state probe;\n'
+    probe = f'#include "{name}.h"\n{name}_state probe;\n'
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         (place / "probe.c").write_text(probe)
-        files = [*sorted(root.glob("koopmpc_*.c")), place / "probe.c"]
+        files = [*sorted(root.glob(f"{name}_*.c")), place / "probe.c"]
         try:
             for file in files:
                 out = place / (file.stem + ".o")
@@ -230,18 +235,17 @@ def _measure_objects(root: Path) -> tuple[int, int, int] | None:
             return None
         rows = [line.split() for line in printed.splitlines()[1:]]
         stack = sum(
-            int(line.split("\t")[1]) for path in place.glob("koopmpc_*.su") for line in path.read_text().splitlines()
+            int(line.split("\t")[1]) for path in place.glob(f"{name}_*.su") for line in path.read_text().splitlines()
         )
     flash = sum(int(row[0]) + int(row[1]) for row in rows if "probe" not in row[-1])
     state = sum(int(row[2]) for row in rows if "probe" in row[-1])
     return flash, state, stack
 
 
-def _readme(controller: Exportable, tables: Tables, root: Path, precision: Precision) -> str:
+def _readme(controller: Exportable, tables: Tables, measured: tuple[int, int, int] | None, precision: Precision) -> str:
     """Return what there is to know of the folder."""
     sizes, model, single = tables.sizes, tables.model, precision == "float"
     numbers_held = constants(tables) * (4 if single else 8)
-    measured = _measure_objects(root)
     rows = [("constants", f"{numbers_held} bytes")]
     if measured is not None:
         flash, state, stack = measured

@@ -60,8 +60,8 @@ def lqr_tables(controller: LQR, *, single: bool) -> Tables:
         "target_push": columns(targets.u_disturbance),
     }
     probe = cast("DAQP", targets._solver(len(targets.rows))) if na else None
-    known = _defaults() if probe is None else dict(probe._model.settings)
-    _solver_settings(tables, known, single=single)
+    known = daqp_defaults() if probe is None else dict(probe._model.settings)
+    solver_settings(tables, known, single=single)
     _memory(tables, 1, 0, 0)
     tables.conditioning = _amplified(tables, predictor, -controller._K)
     return tables
@@ -155,7 +155,7 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
     if tables.sizes["AIMED"] and not plan.targets.Z.shape[1]:
         tables.sizes["AIMED"] = 0
     add_observer(tables, observer, predictor, twin._latency)
-    _solver_settings(tables, dict(solver._model.settings), single=single)
+    solver_settings(tables, dict(solver._model.settings), single=single)
     _memory(tables, plan.moves, len(qp.source), int((solver._sense != 0).sum()))
     steep = bool(len(qp.source)) and solver._steep()
     tables.sizes |= {"QP_MIXED": int(solver._mixed), "STEEP": int(steep), "FEW": FEW}
@@ -167,7 +167,7 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
     return tables
 
 
-def _defaults() -> dict[str, Any]:
+def daqp_defaults() -> dict[str, Any]:
     """Return the settings that DAQP has here where none are given."""
     from koopmpc.control.solvers.qp import QP
 
@@ -251,7 +251,8 @@ def _normalised(rows: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "m n"
     return rows * scaling[:, None], scaling
 
 
-def _solver_settings(tables: Tables, known: dict[str, Any], *, single: bool) -> None:
+def solver_settings(tables: Tables, known: dict[str, Any], *, single: bool) -> None:
+    """Write DAQP's settings and the tolerances beside them."""
     if known["time_limit"] > 0:
         raise DataError(
             'a time_limit cannot be exported, C has no clock; bound the iterations: settings={"iter_limit": 100}'
@@ -271,8 +272,8 @@ def _solver_settings(tables: Tables, known: dict[str, Any], *, single: bool) -> 
 
 def _memory(tables: Tables, n: int, m: int, soft: int) -> None:
     """Set the sizes of the solver's memory: that of the plan's problem, and that of the targets'."""
-    reals, ints = zip(*(_shares(n, m, 0) for n, m in tables.target_qps), strict=True)
-    sizes = _shares(n, m, soft)
+    reals, ints = zip(*(memory_shares(n, m, 0) for n, m in tables.target_qps), strict=True)
+    sizes = memory_shares(n, m, soft)
     tables.sizes |= {
         "QP_M": m,
         "QP_M1": max(1, m),
@@ -284,7 +285,7 @@ def _memory(tables: Tables, n: int, m: int, soft: int) -> None:
     }
 
 
-def _shares(n: int, m: int, soft: int) -> tuple[int, int]:
+def memory_shares(n: int, m: int, soft: int) -> tuple[int, int]:
     """Return how many numbers and integers a problem of n variables and m rows, some of them soft, takes."""
     rank = n + soft + 1
     return 6 * m + 2 * n + 5 * rank + rank * (rank + 1) // 2, m + rank + 3

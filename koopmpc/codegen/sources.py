@@ -1,5 +1,6 @@
 """All the C of a controller: files that are the same for every one, and those with its own numbers."""
 
+import re
 from importlib.resources import files
 
 import numpy as np
@@ -11,12 +12,14 @@ from koopmpc.codegen.tables import Exportable, Tables, refusal
 from koopmpc.codegen.text import Language, function
 from koopmpc.control.lqr import LQR
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.errors import DataError
 
 OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
 _RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c")
-_QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_target.c", "koopmpc_daqp.c")
-_STAGED = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c", "koopmpc_rest.c")
+_QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
+_STAGED = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c", "koopmpc_rest.c", "koopmpc_finish.c")
 SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
+_COLUMNS = " Matrices stand column after column."
 SOLVER_FILES = (*SOLVER, "factorization.h", "LICENSE")
 
 
@@ -46,19 +49,26 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
     """Return the text of every file by its name: header, controller, model, numbers, solver."""
     language = Language(single)
     if tables.is_staged:
-        own = (*OWN, *_RECEDING, *_STAGED)
+        own = (*OWN, *_RECEDING, *_STAGED, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
     else:
-        own = (*OWN, *_QP, *(("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")))
+        own = (
+            *OWN,
+            *_QP,
+            "koopmpc_target.c",
+            *(("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")),
+        )
     result = {name: shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _sizes(tables, single=single)
     result["koopmpc_solver.h"] = _solver(tables, language)
     result["koopmpc_limits.h"] = _header("limits", "Limits of the inputs.", language.arrays(tables.limits))
     result["koopmpc_observer.h"] = _header("observer", "The observer's model.", language.arrays(tables.observer))
     result["koopmpc_plan.h"] = _header("plan", "The plan and its limits.", language.arrays(tables.plan))
+    if "koopmpc_qp.c" in own:
+        result |= {f"daqp/{name}": shipped("daqp", name) for name in SOLVER_FILES}
+        result["koopmpc_names.h"] = _names()
     if tables.is_staged:
         result["koopmpc_table.h"] = _header("table", "Targets of reference rows.", language.arrays(tables.targets))
     else:
-        result |= {f"daqp/{name}": shipped("daqp", name) for name in SOLVER_FILES}
         result["koopmpc_targets.h"] = _header("targets", "Targets and their limits.", _targets(tables, language))
     header = "koopmpc_stages.h" if tables.is_staged else "koopmpc.h"
     result["koopmpc_model.c"] = (
@@ -70,6 +80,33 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
         )
     )
     return result
+
+
+def named(texts: dict[str, str], name: str) -> dict[str, str]:
+    """Return files whose names and symbols start with another name than `koopmpc`, so that several link together.
+
+    Raises
+    ------
+    DataError
+        The name is none that C takes in lower case.
+    """
+    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise DataError(f"name is {name!r}; pass one of lower-case letters, digits and _, a letter first")
+
+    def ours(text: str) -> str:
+        return text.replace("koopmpc", name).replace("KOOPMPC", name.upper())
+
+    return {path if "/" in path else ours(path): text if "/" in path else ours(text) for path, text in texts.items()}
+
+
+def _names() -> str:
+    """Return the header that gives DAQP's functions names of this controller, for two may be in one program."""
+    found = [
+        re.findall(r"\b(\w*(?:daqp|ldp)_?\w*)\s*\(DAQP", shipped("daqp", name)) for name in SOLVER if name[-1] == "h"
+    ]
+    found.append(re.findall(r"\b(\w+)\s*\(DAQP", shipped("daqp", "factorization.h")))
+    lines = [f"#define {name} koopmpc_{name}" for name in sorted({name for names in found for name in names})]
+    return _header("names", "DAQP's functions in this controller.", "\n".join(lines) + "\n").replace(_COLUMNS, "")
 
 
 def shipped(folder: str, name: str) -> str:
@@ -123,9 +160,9 @@ def _sweeps(tables: Tables, gradients: int) -> int:
 
 def _header(name: str, what: str, body: str) -> str:
     guard = f"KOOPMPC_{name.upper()}_H"
-    includes = '#include "koopmpc.h"\n\n' if name != "sizes" else ""
+    includes = '#include "koopmpc.h"\n\n' if name not in ("sizes", "names") else ""
     return (
-        f"/** @file koopmpc_{name}.h @brief {what} Matrices stand column after column. */\n#ifndef {guard}\n"
+        f"/** @file koopmpc_{name}.h @brief {what}{_COLUMNS} */\n#ifndef {guard}\n"
         f"#define {guard}\n\n{includes}{body}\n#endif\n"
     )
 
@@ -136,7 +173,7 @@ def _sizes(tables: Tables, *, single: bool) -> str:
     functions = "#define KOOPMPC_FN(name) name##f\n" if single else "#define KOOPMPC_FN(name) name\n"
     dt = f"#define KOOPMPC_DT {tables.model.dt!r}\n"
     body = precision + functions + "#define KOOPMPC_SQRT KOOPMPC_FN(sqrt)\n" + dt + "\n".join(lines) + "\n"
-    return _header("sizes", "Sizes of this controller.", body).replace(" Matrices stand column after column.", "")
+    return _header("sizes", "Sizes of this controller.", body).replace(_COLUMNS, "")
 
 
 def _solver(tables: Tables, language: Language) -> str:
@@ -148,9 +185,7 @@ def _solver(tables: Tables, language: Language) -> str:
     )
     if settings:
         lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
-    return _header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n").replace(
-        " Matrices stand column after column.", ""
-    )
+    return _header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n").replace(_COLUMNS, "")
 
 
 def _targets(tables: Tables, language: Language) -> str:

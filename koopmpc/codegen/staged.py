@@ -5,12 +5,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve
 
+from koopmpc.codegen.linear import daqp_defaults, memory_shares, solver_settings
 from koopmpc.codegen.tables import CFunction, Tables, add_observer, amplified, columns, model_tables
 from koopmpc.codegen.text import traced
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED, BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
-from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, PRECISE, STUCK
+from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, MOST, PRECISE, STUCK
 from koopmpc.control.nonlinear.stagewise import sides, weights
 from koopmpc.errors import DataError
 from koopmpc.plants.step_map import StepMap
@@ -78,7 +79,7 @@ def bilinear_tables(
         "PAIRS": max(1, N * len(side.row)),
         "EASED": max(1, N * side.soft),
         "SOFT_RATES": len(problem.soft_rates),
-        "HARD_STATES": int(controller._iteration._hard_states),
+        "INTERIOR": MOST,
         "DISTURBED": int(disturbed),
         "PUSHES": N * nx if disturbed else 1,
         "GIVEN_MAP": int(isinstance(given.model, StepMap)),
@@ -139,7 +140,9 @@ def bilinear_tables(
             "rest_low": equilibria._low,
             "rest_high": equilibria._high,
         }
-    tables.reals = {name: values[single] for name, values in _TOLERANCES.items()}
+    solver_settings(tables, daqp_defaults(), single=single)
+    tables.reals |= {name: values[single] for name, values in _TOLERANCES.items()}
+    _add_finish(tables, controller, low, high)
     add_observer(tables, observer, None, 0)
     tables.observer |= {"C": columns(np.eye(ny, nx)), "E": columns(given.E)}
     table = np.zeros((0, 1)) if references is None else target_rows(controller, references)
@@ -153,6 +156,34 @@ def bilinear_tables(
     if references is not None and len(references):
         tables.conditioning = _conditioning(controller, tables, references[0])
     return tables
+
+
+def _add_finish(
+    tables: Tables, controller: BilinearMPC, low: Float[np.ndarray, "b nq"], high: Float[np.ndarray, "b nq"]
+) -> None:
+    """Write which rows DAQP gets where interior points end early, their prices, and the sizes of its memory."""
+    problem, N, nu, softness = controller._problem, controller._N, controller.nu, controller._iteration._softness
+    kept = np.tile((np.isfinite(low) | np.isfinite(high))[:1], (N, 1))
+    kept[~problem.free, :nu] = False
+    place = np.flatnonzero(kept)
+    soft = np.isfinite(softness.linear)
+    sense = 8 * soft[place % kept.shape[1]]
+    n = nu * int(problem.free.sum())
+    reals, ints = memory_shares(n, len(place), int((sense > 0).sum()))
+    tables.sizes |= {
+        "FINISH_ROWS": len(place),
+        "FINISH_WIDTH": n,
+        "FINISH_SOFT": int((sense > 0).sum()),
+        "FINISH_REALS": reals,
+        "FINISH_INTS": ints,
+    }
+    tables.plan |= {
+        "finish_row": place.astype(np.intc),
+        "finish_at": (np.cumsum(problem.free) - problem.free).astype(np.intc),
+        "finish_sense": sense.astype(np.intc),
+        "finish_linear": np.where(soft, softness.linear, 0.0),
+        "finish_quadratic": softness.quadratic,
+    }
 
 
 def target_rows(controller: BilinearMPC, rows: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "rows size"]:

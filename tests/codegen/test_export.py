@@ -154,3 +154,39 @@ def test_every_operation_of_a_graph_is_the_same_in_c():
         got, first, second = np.zeros(len(names)), row[:1].copy(), row[1:].copy()
         code.all_of_them(*(ctypes.c_void_p(x.ctypes.data) for x in (first, second, got)))
         np.testing.assert_allclose(got, want, rtol=1e-13, atol=1e-15)
+
+
+def test_two_controllers_link_into_one_program(pendulum, tmp_path):
+    plant, model = pendulum
+    made = {
+        "pitch": km.KoopmanMPC(model, COST, LIMITS, 10, solver="daqp"),
+        "yaw": km.KoopmanMPC(model, km.Cost(Q=[1.0, 1.0], R=0.5), km.Limits(-9.0, 9.0), 5, solver="daqp"),
+        "roll": km.BilinearMPC(plant, COST, km.Limits(-25.0, 25.0), 6),
+    }
+    for name, controller in made.items():
+        km.export(controller, tmp_path / name, name=name, precision="float" if name == "yaw" else "double")
+    calls = "".join(
+        f"  {{{name}_real y[2] = {{0.5, 0}}, r[2] = {{0, 0}}, u[1]; {name}_rows rows = {{r, 1}};\n"
+        f'   {name}_init(&{name}, 0, 0); {name}_step(&{name}, y, &rows, 0, 0, u, 0); printf("%.9g\\n", (double)u[0]); }}\n'
+        for name in made
+    )
+    heads = "".join(f'#include "{name}/{name}.h"\nstatic {name}_state {name};\n' for name in made)
+    (tmp_path / "main.c").write_text(f"#include <stdio.h>\n{heads}int main(void) {{\n{calls}  return 0;\n}}\n")
+    sources = [str(file) for name in made for file in (tmp_path / name).glob(f"{name}_*.c")]
+    subprocess.run(["cc", "-std=c99", *sources, "main.c", "-lm", "-o", "main"], cwd=tmp_path, check=True)
+    printed = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=True).stdout
+    for said, controller in zip(printed.split(), made.values(), strict=True):
+        np.testing.assert_allclose(float(said), controller([0.5, 0.0], [0.0, 0.0]).u, rtol=1e-4)
+    with pytest.raises(km.errors.DataError, match="name is 'Yaw 1'; pass one of lower-case letters"):
+        km.export(made["yaw"], tmp_path / "other", name="Yaw 1")
+
+
+def test_cmake_builds_it(exported, tmp_path):
+    if shutil.which("cmake") is None:
+        pytest.skip("cmake is not here")
+    folder = km.export(exported[1], tmp_path / "c", plant=exported[0], steps=80)
+    for words in (["-S", str(folder), "-B", "build"], ["--build", "build"]):
+        done = subprocess.run(["cmake", *words], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, (done.stdout + done.stderr)[-2000:]
+    printed = subprocess.run([str(tmp_path / "build" / "example")], capture_output=True, text=True, check=True).stdout
+    assert len(table(printed)) == 80

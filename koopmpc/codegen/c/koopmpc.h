@@ -117,6 +117,13 @@ typedef struct {
   koopmpc_real first_low[KOOPMPC_NU], first_high[KOOPMPC_NU]; /**< limits of the first change of the inputs */
   koopmpc_real without_limits[KOOPMPC_NU], defects[KOOPMPC_POINT], length, slack, best_slack;
   koopmpc_real e[KOOPMPC_PUSHES]; /**< E w + d of the stages */
+#if KOOPMPC_FINISH_ROWS
+  koopmpc_real finish_M[KOOPMPC_FINISH_ROWS * KOOPMPC_FINISH_WIDTH], finish_reals[KOOPMPC_FINISH_REALS];
+  koopmpc_real finish_size[KOOPMPC_FINISH_ROWS], finish_scaling[KOOPMPC_FINISH_ROWS]; /**< the active-set method */
+  koopmpc_real finish_linear[KOOPMPC_FINISH_ROWS], finish_rho[KOOPMPC_FINISH_ROWS];
+  koopmpc_real finish_free[KOOPMPC_FINISH_ROWS], finish_dual[KOOPMPC_FINISH_ROWS];
+  int finish_ints[KOOPMPC_FINISH_INTS];
+#endif
 #if KOOPMPC_DISTURBED
   koopmpc_real rest_u[KOOPMPC_NU], rest_active[KOOPMPC_NU + KOOPMPC_BOX];
   koopmpc_real rest_goal[KOOPMPC_GOAL], rest_input[KOOPMPC_NU];
@@ -126,6 +133,7 @@ typedef struct {
   int has_rest, has_chord;
 #endif
   const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
+  int finishing;               /**< whether the active-set method finished the last program of this step */
   int target_count, found;     /**< its rows, and the one that was found last */
   int moved_on;                /**< whether the disturbance or the row of given input targets has moved */
 #else

@@ -136,66 +136,15 @@ static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, in
   return conflict;
 }
 
-/** Whether x + M' lambda = 0 and low <= M x <= high hold, and soft rows give way at their price. */
-static int accurate(const koopmpc_qp_memory *qp) {
-  koopmpc_real stationarity = 0, size = 1, near = 1;
-  for (int j = 0; j < MOVES; j++) {
-    koopmpc_real pull = 0;
-    for (int i = 0; i < ROWS; i++)
-      if (qp->dual[i] < 0 || qp->dual[i] > 0) pull += qp->dual[i] * koopmpc_M[i * MOVES + j] / koopmpc_scaling[i];
-    if (koopmpc_abs(pull) > size) size = koopmpc_abs(pull);
-    if (koopmpc_abs(qp->primal[j]) > size) size = koopmpc_abs(qp->primal[j]);
-    if (!(koopmpc_abs(pull + qp->primal[j]) <= stationarity)) stationarity = koopmpc_abs(pull + qp->primal[j]);
-  }
-#ifdef KOOPMPC_FLOAT
-  for (int i = 0; i < ROWS; i++) /* the sum above is rounded by a share of its largest term */
-    if (koopmpc_abs(qp->dual[i]) > size) size = koopmpc_abs(qp->dual[i]);
-#endif
-  if (!(stationarity <= KOOPMPC_ACCURACY * size)) return 0;
-  for (int i = 0; i < ROWS; i++) {
-    const koopmpc_real value = koopmpc_abs(qp->product[i]);
-    if (value > near) near = value;
-  }
-  near *= KOOPMPC_ACCURACY;
-  for (int i = 0; i < ROWS; i++) {
-    const koopmpc_real over = qp->product[i] - qp->high[i], under = qp->low[i] - qp->product[i];
-    const koopmpc_real outside = over > under ? over : under, push = koopmpc_abs(qp->dual[i]);
-    if (!koopmpc_sense[i]) {
-      if (!(outside <= near)) return 0;
-    } else {
-      const koopmpc_real linear = koopmpc_linear[i], curved = 1 / koopmpc_rho[i];
-      const koopmpc_real slack = outside > 0 ? outside : 0, price = linear + curved * slack;
-      const koopmpc_real little = KOOPMPC_ACCURACY * (size + linear);
-      if (!(push - price <= little + curved * near)) return 0;
-      if (slack > near && !(price - push - curved * near <= little)) return 0;
-      if (push > KOOPMPC_ACCURACY * size && !(-(qp->dual[i] > 0 ? over : under) <= near)) return 0;
-    }
-  }
-  return 1;
-}
-
-/** Solve within qp->low and high; `good` tells whether it is the solution. */
-static koopmpc_qp_end attempt(koopmpc_qp_memory *qp, const koopmpc_real *push, koopmpc_real wider, int resume,
-                              int *good) {
-  const koopmpc_qp_end end = koopmpc_qp_solve(&problem, qp, push, wider, resume);
-  *good = end.flag == 1;
-  if (end.flag > 1) {
-    for (int i = 0; i < ROWS; i++)
-      qp->product[i] = koopmpc_dot(koopmpc_M + i * MOVES, qp->primal, MOVES) / koopmpc_scaling[i];
-    *good = accurate(qp);
-  }
-  return end;
-}
-
 /** Whether the hard rows alone have no point in common. */
 static int contradictory(koopmpc_state *s, koopmpc_qp_memory *qp) {
   int good;
   koopmpc_qp_end end;
   (void)set_limits(s, qp, 1);
-  end = attempt(qp, 0, 0, 0, &good);
+  end = koopmpc_qp_attempt(&problem, qp, 0, 0, 0, &good);
   if (!good && end.flag == -1) {
     (void)set_limits(s, qp, 1);
-    end = attempt(qp, 0, KOOPMPC_WIDER, 0, &good);
+    end = koopmpc_qp_attempt(&problem, qp, 0, KOOPMPC_WIDER, 0, &good);
   }
   return s->unmet = !good && end.flag == -1;
 }
@@ -300,14 +249,14 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   if (!resume && s->far) {
     status = KOOPMPC_FAILED;
   } else {
-    end = attempt(qp, resume ? 0 : push, 0, resume, &good);
+    end = koopmpc_qp_attempt(&problem, qp, resume ? 0 : push, 0, resume, &good);
     report->iterations += end.iterations;
     for (int i = 0; i < ROWS; i++) active += qp->dual[i] < 0 || qp->dual[i] > 0;
     s->resumes = good && active <= KOOPMPC_FEW;
     if (end.flag == -1 && KOOPMPC_QP_MIXED && !KOOPMPC_STEEP && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
     if (!good && !(end.flag == -1 && KOOPMPC_STEEP)) {
       (void)set_limits(s, qp, 0);
-      end = attempt(qp, 0, KOOPMPC_WIDER, 0, &good);
+      end = koopmpc_qp_attempt(&problem, qp, 0, KOOPMPC_WIDER, 0, &good);
       report->iterations += end.iterations;
     }
     status = end.flag == -1 ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;

@@ -1,10 +1,10 @@
 /** @file koopmpc_qp.c @brief DAQP on memory that belongs to the caller. */
+#include "koopmpc_common.h"
+#include "koopmpc_names.h"
 #include "koopmpc_qp.h"
 #include "koopmpc_solver.h"
 
 #include "daqp/daqp.h"
-
-static koopmpc_real magnitude(koopmpc_real a) { return a < 0 ? -a : a; }
 
 #ifdef KOOPMPC_FLOAT
 enum { REFINEMENTS = 2 }; /* floats leave active rows off by their rounding */
@@ -90,8 +90,8 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
   for (int i = 0; i < m; i++) mem->dual[i] = 0;
   if (wider > 0)
     for (int i = 0; i < m; i++) {
-      mem->low[i] -= wider * (1 + magnitude(mem->low[i]));
-      mem->high[i] += wider * (1 + magnitude(mem->high[i]));
+      mem->low[i] -= wider * (1 + koopmpc_abs(mem->low[i]));
+      mem->high[i] += wider * (1 + koopmpc_abs(mem->high[i]));
     }
   rows = marked(qp, mem, push, resume);
   if (!rows) return end;
@@ -148,6 +148,57 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
       for (int j = i; j < n; j++) mem->primal[i] += *r++ * work.u[j];
   } else {
     for (int j = 0; j < n; j++) mem->primal[j] = work.u[j];
+  }
+  return end;
+}
+
+/** Whether x + M' lambda = 0 and low <= M x <= high hold, and soft rows give way at their price. */
+static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
+  const int n = problem->n, m = problem->m;
+  koopmpc_real stationarity = 0, size = 1, near = 1;
+  for (int j = 0; j < n; j++) {
+    koopmpc_real pull = 0;
+    for (int i = 0; i < m; i++)
+      if (qp->dual[i] < 0 || qp->dual[i] > 0) pull += qp->dual[i] * problem->M[i * n + j] / problem->scaling[i];
+    if (koopmpc_abs(pull) > size) size = koopmpc_abs(pull);
+    if (koopmpc_abs(qp->primal[j]) > size) size = koopmpc_abs(qp->primal[j]);
+    if (!(koopmpc_abs(pull + qp->primal[j]) <= stationarity)) stationarity = koopmpc_abs(pull + qp->primal[j]);
+  }
+#ifdef KOOPMPC_FLOAT
+  for (int i = 0; i < m; i++) /* the sum above is rounded by a share of its largest term */
+    if (koopmpc_abs(qp->dual[i]) > size) size = koopmpc_abs(qp->dual[i]);
+#endif
+  if (!(stationarity <= KOOPMPC_ACCURACY * size)) return 0;
+  for (int i = 0; i < m; i++) {
+    const koopmpc_real value = koopmpc_abs(qp->product[i]);
+    if (value > near) near = value;
+  }
+  near *= KOOPMPC_ACCURACY;
+  for (int i = 0; i < m; i++) {
+    const koopmpc_real over = qp->product[i] - qp->high[i], under = qp->low[i] - qp->product[i];
+    const koopmpc_real outside = over > under ? over : under, push = koopmpc_abs(qp->dual[i]);
+    if (!problem->sense[i]) {
+      if (!(outside <= near)) return 0;
+    } else {
+      const koopmpc_real linear = problem->linear[i], curved = 1 / problem->rho[i];
+      const koopmpc_real slack = outside > 0 ? outside : 0, price = linear + curved * slack;
+      const koopmpc_real little = KOOPMPC_ACCURACY * (size + linear);
+      if (!(push - price <= little + curved * near)) return 0;
+      if (slack > near && !(price - push - curved * near <= little)) return 0;
+      if (push > KOOPMPC_ACCURACY * size && !(-(qp->dual[i] > 0 ? over : under) <= near)) return 0;
+    }
+  }
+  return 1;
+}
+
+koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
+                                  koopmpc_real wider, int resume, int *good) {
+  const koopmpc_qp_end end = koopmpc_qp_solve(problem, qp, push, wider, resume);
+  *good = end.flag == 1;
+  if (end.flag > 1) {
+    for (int i = 0; i < problem->m; i++)
+      qp->product[i] = koopmpc_dot(problem->M + i * problem->n, qp->primal, problem->n) / problem->scaling[i];
+    *good = accurate(problem, qp);
   }
   return end;
 }

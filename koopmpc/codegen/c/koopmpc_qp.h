@@ -48,4 +48,8 @@ typedef struct {
 koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push,
                                 koopmpc_real wider, int resume);
 
+/** The same; `good` tells whether the answer is the solution, looked at again where rows give way. */
+koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
+                                  koopmpc_real wider, int resume, int *good);
+
 #endif

@@ -416,6 +416,7 @@ static int first_stage(koopmpc_state *s, const koopmpc_real *u_prev, koopmpc_rea
 /** The plan from `stage` on. */
 static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const koopmpc_real *u_prev, int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED;
+  s->finishing = 0;
   if (s->warm) {
     int near = 1;
     for (int i = 0; i < NX; i++) near &= koopmpc_abs(stage[i] - s->S[NS + i]) <= FAR_OFF * koopmpc_sizes[i];

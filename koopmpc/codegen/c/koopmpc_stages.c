@@ -12,7 +12,7 @@
 #include "koopmpc_solver.h"
 #include "koopmpc_stages.h"
 
-enum { MOST = 300, STALLED = 5 }; /* interior-point steps; steps without half the mu before one is centred */
+enum { STALLED = 5 }; /* steps without half the mu before one is centred */
 #define CENTRING ((koopmpc_real)0.3)
 #define SHORT_OF ((koopmpc_real)0.995)
 
@@ -360,8 +360,11 @@ static koopmpc_real unit_of(const koopmpc_state *s) {
 static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   const koopmpc_real unit = unit_of(s);
   koopmpc_real least = KOOPMPC_HUGE, worst, start, price = 0, left = 1, initial, best = KOOPMPC_HUGE, mu, most = 0;
-  koopmpc_status status = KOOPMPC_MAX_ITERATIONS;
-  int since = 0, enough = 0;
+  int since = 0, enough = 0, narrow = 0;
+  for (int i = 0; i < HARD; i++) /* interior points have nowhere to go between two equal limits */
+    for (int k = 0; k < STEPS; k++)
+      narrow |= !(koopmpc_low_of(s, k, koopmpc_side_row[i]) < koopmpc_high_of(s, k, koopmpc_side_row[i]));
+  if (s->finishing || narrow) return koopmpc_finish(s, iterations);
   koopmpc_fill(s->step_t, 0, PAIRS);
   koopmpc_fill(s->step_lam, 0, PAIRS);
   koopmpc_fill(s->step_eps, 0, EASED);
@@ -395,16 +398,13 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   for (int i = 0; i < PAIRS; i++) most = larger(s->lam[i], most);
   initial = larger(worst, most / unit);
   mu = products(s, 0);
-  while (*iterations < MOST) {
+  while (*iterations < KOOPMPC_INTERIOR) {
     koopmpc_real good, length;
     const koopmpc_real sigma = since == STALLED ? CENTRING : 0;
     since %= STALLED;
     length = interior(s, mu, sigma);
     ++*iterations;
-    if (!(length > 0)) {
-      status = KOOPMPC_FAILED;
-      break; /* with the iterate before */
-    }
+    if (!(length > 0)) break;
     left *= 1 - length;
     mu = products(s, 0);
     if (mu <= best / 2) {
@@ -422,8 +422,10 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
       break;
   }
   if (enough) return KOOPMPC_OPTIMAL;
-  if (KOOPMPC_HARD_STATES && left * worst > (koopmpc_real)1e-6) return KOOPMPC_INFEASIBLE;
-  return status;
+  factor(s, 0);
+  sweep(s, 0);
+  koopmpc_fill(s->eps, 0, EASED);
+  return koopmpc_finish(s, iterations);
 }
 #endif
 

@@ -56,6 +56,9 @@ koopmpc_real koopmpc_high_of(const koopmpc_state *s, int k, int i);
  */
 koopmpc_status koopmpc_program(koopmpc_state *s, const koopmpc_real *x, koopmpc_real *first, int *iterations);
 
+/** Solve the program of newX and newU, its solution without limits, and their Riccati recursion, by an active set. */
+koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations);
+
 /** What the plan costs, its breaches of soft limits included. */
 koopmpc_real koopmpc_cost(const koopmpc_state *s);
 
