@@ -130,7 +130,7 @@ def commands() -> str:
     lines = ["# Commands", "", "What `koopmpc COMMAND --help` says.", ""]
     for name, command in group.commands.items():
         context = typer.Context(command, info_name=name)
-        usage = " ".join(command.collect_usage_pieces(context))
+        usage = " ".join(command.collect_usage_pieces(context)).replace("{", "").replace("}", "")
         lines += [f"## koopmpc {name}", "", inspect.cleandoc(command.help), "", f"    koopmpc {name} {usage}", ""]
         rows = [(_spelled(p), (p.help or "").replace("|", "\\|")) for p in command.params]
         lines += [
