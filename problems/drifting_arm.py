@@ -99,4 +99,5 @@ problem = km.Problem(
         "steady": km.Case(x0=[0.0, 0.0], reference=path(), steps=STEPS),
     },
     controllers=("koopman-mpc", "offset-free", "adaptive"),
+    scene=Arm().scene,
 )

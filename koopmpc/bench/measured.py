@@ -135,6 +135,41 @@ def markdown(found: Mapping[str, Mapping[str, Standing]]) -> str:
     return "\n".join(lines)
 
 
+_SHARE, _LINEAR, _BILINEAR = 1.05, 1 / 20, 1 / 5  # cost and time that a learned controller may take, of the baseline's
+
+
+def frugal(found: Mapping[str, Standing]) -> str | None:
+    """Return the learned controller of the shortest step within 5 % of nonlinear MPC's cost; None where there is none.
+
+    It takes at most 1/20 of its time, or 1/5 if bilinear. One that broke a limit does not count. Where linear MPC is
+    the baseline, time does not.
+    """
+    timed = baseline_of(found) == ORACLE
+    kept = {
+        name: one
+        for name, one in found.items()
+        if name in LEARNED
+        and not one.over
+        and one.ratio <= _SHARE
+        and (not timed or one.time <= (_BILINEAR if "bilinear" in name else _LINEAR))
+    }
+    return min(kept, key=lambda name: kept[name].time) if kept else None
+
+
+def goals(found: Mapping[str, Mapping[str, Standing]]) -> str:
+    """Return the table of the cheapest learned controller that does on each problem, for the docs."""
+    lines = ["| problem | learned controller | cost | time of a step |", "|---|---|--:|--:|"]
+    for problem in sorted(found):
+        name = frugal(found[problem])
+        if name is None:
+            lines.append(f"| `{problem}` | none | | |")
+        else:
+            own, unit = found[problem][name], "" if baseline_of(found[problem]) == ORACLE else ", of linear MPC's"
+            time = f"1/{1 / own.time:.0f}" if own.time < 0.7 else f"{own.time:.1f}"
+            lines.append(f"| `{problem}` | {name} | {own.ratio:.3f}{unit} | {time} |")
+    return "\n".join(lines)
+
+
 def _nothing(x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> list[Shape]:
     return []
 

@@ -10,8 +10,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
-from koopmpc.bench.measured import BASELINE, best_learned, in_words, markdown, measured, standings
-from koopmpc.bench.results import RunRow
+from koopmpc.bench.measured import BASELINE, best_learned, frugal, goals, in_words, markdown, measured, standings
+from koopmpc.bench.results import ORACLE, RunRow
 from koopmpc.loop.metrics import Metrics
 
 FILES = {path.stem: path for path in km.bench.shipped()}
@@ -29,6 +29,18 @@ def test_the_library_holds_what_its_page_lists():
     named = Path(__file__).parents[2].joinpath("docs", "library.md").read_text("utf-8")
     assert [name for name in FILES if f"`{name}`" not in named] == []
     assert markdown(measured()) in named
+    assert goals(measured()) in named
+    pages = Path(__file__).parents[2] / "docs" / "problems"
+    for name, path in FILES.items():
+        text = (pages / f"{name}.md").read_text("utf-8")
+        assert path.read_text("utf-8").rstrip() in text, f"{name}: run docs/tools/gallery.py"
+        for picture in ("run.png", "run.gif"):
+            assert f"({name}/{picture})" in text
+            assert (pages / name / picture).stat().st_size <= 200_000
+
+
+def test_on_a_dozen_problems_a_learned_controller_is_as_good_as_nonlinear_mpc_and_much_faster():
+    assert sum(frugal(found) is not None for found in measured().values() if ORACLE in found) >= 12
 
 
 def test_a_problem_is_one_short_file_that_imports_numpy_casadi_and_koopmpc_alone(path: Path):
