@@ -16,6 +16,7 @@ Ridge = float | Literal["gcv"]
 
 _CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
 _ILL_CONDITIONED = 1e10
+_LIGHT = 1e-3  # factor of the norm of columns on which a ridge counts a millionth
 _NAMED = 3  # dependent columns that a message names
 
 
@@ -88,20 +89,23 @@ def cutoff(rows: RegressionRows) -> float:
     return float(np.finfo(float).eps * max(rows.samples, rows.P.shape[1]))
 
 
-def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True) -> Solution:
+def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True, light: Sequence[int] = ()) -> Solution:
     """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag of the columns' norms.
 
     With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
     takes norm and cut on columns of unit norm, so that units of the data mean nothing. "gcv" chooses the ridge by
-    generalised cross-validation.
+    generalised cross-validation. A ridge above 0 counts a millionth on the columns `light`.
     """
-    return path(rows, (ridge,), scaled=scaled)[0]
+    return path(rows, (ridge,), scaled=scaled, light=light if ridge else ())[0]
 
 
-def path(rows: RegressionRows, ridges: Sequence[Ridge], *, scaled: bool = True) -> list[Solution]:
+def path(
+    rows: RegressionRows, ridges: Sequence[Ridge], *, scaled: bool = True, light: Sequence[int] = ()
+) -> list[Solution]:
     """Return the solution for each ridge, from one decomposition."""
     size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
     size[size == 0] = 1.0
+    size[list(light)] *= _LIGHT
     U, s, Vt = np.linalg.svd(rows.P / size, full_matrices=False)
     cut = cutoff(rows)
     held = s > cut * s.max(initial=0.0)
@@ -143,12 +147,13 @@ def onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m c"]) -> 
     return U @ (U.T @ columns)
 
 
-def rule(rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True) -> str:
+def rule(rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True, light: Sequence[int] = ()) -> str:
     """Return what a solve without a rank cut or added, in words."""
     columns = "unit-norm" if scaled else "unscaled"
+    spared = ", a millionth of it on states, Constant and inputs" if light else ""
     how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
     if ridge > 0:
-        return f"ridge {ridge:.6g} on {columns} columns{how}"
+        return f"ridge {ridge:.6g} on {columns} columns{spared}{how}"
     return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns" + (
         ", ridge 0" + how if how else ""
     )

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.fits.edmd import Towards
 from koopmpc.lifting.algebra import Sum
 from koopmpc.lifting.base import Lifting, lifting_of, short
 from koopmpc.lifting.fourier import Fourier, RandomFourier
@@ -62,6 +63,14 @@ class Candidate(Value):
     def kind(self) -> str:
         """Return "linear" or "bilinear"."""
         return "bilinear" if self.bilinear else "linear"
+
+    @property
+    def towards(self) -> Towards:
+        """What the ridge of its fit pulls to: a linear model without delays to the affine one, see `edmd`.
+
+        With delays a state and its past are almost functions of each other, and a ridge is to weigh on them, too.
+        """
+        return "zero" if self.bilinear or self.embedding is not None else "affine"
 
     def bind(self, states: Sequence[str], inputs: Sequence[str]) -> "Candidate":
         """Return the sized copy for a plant with these names."""

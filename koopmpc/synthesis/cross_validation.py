@@ -180,7 +180,8 @@ def _solutions(candidate: Candidate, task: Regression, ridges: Sequence[float]) 
     P, nz = task.rows.P, task.lifting.nz
     start = np.eye(P.shape[1], nz) * candidate.bilinear
     rows = RegressionRows(P, task.rows.T[:, :nz] - P @ start, task.rows.rest[:nz], task.rows.samples)
-    return [solution.K + start for solution in path(rows, ridges)]
+    light = task.affine if candidate.towards == "affine" else ()
+    return [solution.K + start for solution in path(rows, ridges, light=light)]
 
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:

@@ -118,7 +118,9 @@ class Recipe(Value):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)
             if not one.bilinear:
-                return edmd(data, one.lifting, embedding=one.embedding, ridge=self.ridge, **options)
+                return edmd(
+                    data, one.lifting, embedding=one.embedding, ridge=self.ridge, towards=one.towards, **options
+                )
             return bilinear_edmd(
                 data, one.lifting, embedding=one.embedding, ridge=self.ridge, difference=True, **options
             )

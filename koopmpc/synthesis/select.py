@@ -70,7 +70,8 @@ def select(
     folds
         At least 2.
     ridges
-        Weights to try, on unit-norm columns; those below 1e-9 are raised to it. By default 1e-9 to 1e-3 by decades,
+        Weights to try, on unit-norm columns; those below 1e-9 are raised to it. Linear models without delays are
+        fitted with ``towards="affine"``, see `edmd`. By default 1e-9 to 1e-3 by decades,
         for models with delays from ε² on, ε the share of the states' size that the best candidate misses in one
         step: what the data hold of noise, or of what no candidate knows. Noise ε in the regressors adds
         M ε² rms² = ε² ‖p‖² to the diagonal of PᵀP, which is a ridge ε² on columns of unit norm. With less, a state and
@@ -160,7 +161,8 @@ def select(
         read = ReadOptions(workers=workers, scheduler=scheduler, progress=told)
         psi, embedding, ridge = row.lifting, row.embedding, row.ridge
         if row.kind == "linear":
-            return edmd(source, psi, embedding=embedding, ridge=ridge, **read)
+            towards = "affine" if embedding is None else "zero"
+            return edmd(source, psi, embedding=embedding, ridge=ridge, towards=towards, **read)
         return bilinear_edmd(source, psi, embedding=embedding, ridge=ridge, difference=True, **read)
 
     predictor = refit(rows[chosen])

@@ -1,5 +1,8 @@
 """ridge="gcv" is generalised cross-validation on all the data, though it sees only moments."""
 
+import os
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -140,3 +143,46 @@ def test_a_ridge_that_is_no_number_or_gcv_is_refused() -> None:
     assert shown(code) == ["DataError ridge is 'cv'; pass a number, or \"gcv\""]
     with pytest.raises(km.errors.DataError, match="ridge is -1; it must be 0 or above"):
         km.edmd(noisy(0, 30, 0.1), km.State(), ridge=-1)
+
+
+@pytest.mark.parametrize("ridge", [1e-6, 1e-2, 10.0])
+def test_towards_affine_counts_a_millionth_on_states_constant_and_inputs(ridge: float) -> None:
+    """By its definition, min ‖T − P K‖² + ridge ‖S W K‖², as least squares with rows of their own for the penalty."""
+    data = noisy(1, 60, 0.1)
+    model = km.edmd(data, LIFTING, ridge=ridge, towards="affine")
+    D = brute_force(data, model.lifting)
+    n = model.nz + 1
+    P, T = D[:, :n], D[:, n:]
+    light = [name in ("1", *data.states) for name in model.lifting.names] + [True]
+    assert sum(light) == 4
+    penalty = np.diag(np.sqrt(ridge) * np.linalg.norm(P, axis=0) * np.where(light, 1e-3, 1.0))
+    K = np.linalg.lstsq(np.vstack([P, penalty]), np.vstack([T, np.zeros((n, T.shape[1]))]), rcond=None)[0]
+    np.testing.assert_allclose(np.vstack([model.A.T, model.B.T]), K, atol=1e-9)
+    assert "a millionth of it on states, Constant and inputs" in model.report.route
+
+
+def test_towards_affine_an_unstable_plant_stays_as_unstable_as_it_is() -> None:
+    """Data of a feedback: a ridge on all columns makes the model tame, one on the lifted ones does not."""
+    rng, made = np.random.default_rng(0), []
+    for _ in range(40):
+        X, U = [rng.uniform(-1, 1, 1)], []
+        for noise in rng.uniform(-0.1, 0.1, 30):
+            U.append(-1.1 * X[-1] + noise)
+            X.append(1.2 * X[-1] - 0.1 * X[-1] ** 3 + U[-1])
+        made.append(km.Episode(X=np.array(X), U=np.array(U)))
+    data = km.Episodes(made, 0.1)
+    radius = {
+        towards: np.abs(km.edmd(data, km.State() + km.Monomials(3), ridge=1e-2, towards=towards).A[0, 0])
+        for towards in ("zero", "affine")
+    }
+    assert radius["zero"] < 1.1
+    assert abs(radius["affine"] - 1.2) < 0.03
+
+
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+def test_what_a_ridge_pulls_to_is_checked() -> None:
+    data = noisy(0, 40, 0.1)
+    with pytest.raises(km.KoopmpcError, match='pass "zero" or "affine"'):
+        km.edmd(data, LIFTING, ridge=1e-6, towards=cast("Any", "dmd"))
+    with pytest.raises(km.KoopmpcError, match="rank mixes them; pass one of the two"):
+        km.edmd(data, LIFTING, ridge=1e-6, rank=2, towards="affine")

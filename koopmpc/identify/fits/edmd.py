@@ -21,12 +21,20 @@ from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
 
 Method = Literal["ls", "tls", "fb"]
+Towards = Literal["zero", "affine"]
 _DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is taken
 _REAL = 1e-6  # share of the size of A below which an imaginary part is rounding
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
-def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls") -> FitResult:
+def fit(
+    regression: Regression,
+    *,
+    ridge: Ridge = 0.0,
+    rank: Rank = None,
+    method: Method = "ls",
+    towards: Towards = "zero",
+) -> FitResult:
     """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
 
     Parameters
@@ -42,8 +50,14 @@ def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method
     method
         "ls"; for noisy snapshots "tls" or "fb". These two need a regression that was read with ``noisy=True``, so
         that the rows hold all of T.
+    towards
+        What the ridge pulls to, as in `edmd`.
     """
     ridge = ridge_of(ridge)
+    if towards not in ("zero", "affine"):
+        raise DataError(f'towards is {towards!r}; pass "zero" or "affine"')
+    if towards == "affine" and rank is not None:
+        raise DataError('towards="affine" tells columns apart, and rank mixes them; pass one of the two')
     if method not in _WORDS:
         raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
     if method != "ls" and ridge != 0:
@@ -58,10 +72,11 @@ def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method
         result = _reduced(regression, rows, ridge, rank, method, condition, sentences)
         return result._replace(rule=_WORDS[method] + result.rule, doubts=sentences)
     given, C = rows.leading(nz), regression.C
+    light = [i for i in regression.affine if i < rows.P.shape[1]] if towards == "affine" else []
     if method == "tls":
         given = _denoised(regression, given, nz)
     scaled = regression.scaled
-    solution = _forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled)
+    solution = _forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled, light=light)
     K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
     return FitResult(
         A=K[:nz].T,
@@ -72,7 +87,7 @@ def fit(regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method
         state_residual=regression.state_residual,
         rank=solution.rank,
         condition=condition,
-        rule=_WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled),
+        rule=_WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled, light=light),
         ridge=solution.ridge,
         doubts=sentences,
     )
@@ -241,6 +256,7 @@ def edmd(
     ridge: Ridge = 0.0,
     rank: Rank = None,
     method: Method = "ls",
+    towards: Towards = "zero",
     **options: Unpack[ReadOptions],
 ) -> LinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w by least squares on M snapshot pairs, with u and w where the data have them.
@@ -273,6 +289,10 @@ def edmd(
         ψ(x⁺), relative to each observable's size, and none in the inputs and the Constant. "fb", forward and
         backward, assumes nothing about the size of the noise, but the motion must be reversible in time. Both treat
         the noise as added to ψ(x).
+    towards
+        The model that a large ridge leads to. "affine" is x⁺ = A x + B u + c on the states, the Constant and the
+        inputs of the regression: there the ridge counts a millionth. With "zero" a ridge also makes an unstable plant
+        look tame, and controllers that believe it lose such plants.
     **options
         ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads the data, and
         the weight of each pair.
@@ -280,8 +300,8 @@ def edmd(
     Raises
     ------
     DataError
-        ridge is negative, or is given with "tls" or "fb"; rank is too large; an observable is not finite on the data;
-        "tls" has too few pairs; "fb" meets a motion that cannot be run backward.
+        ridge is negative, or is given with "tls" or "fb"; rank is too large, or is given with towards="affine"; an
+        observable is not finite on the data; "tls" has too few pairs; "fb" meets a motion that cannot be run backward.
 
     Warns
     -----
@@ -305,4 +325,4 @@ def edmd(
     (3, 2)
     """
     regression = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **options)
-    return linear_predictor(regression, fit(regression, ridge=ridge, rank=rank, method=method))
+    return linear_predictor(regression, fit(regression, ridge=ridge, rank=rank, method=method, towards=towards))
