@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from koopmpc.bench.controllers import Prepared as Prepared
     from koopmpc.bench.inspect import Where as Where
     from koopmpc.bench.inspect import inspected as inspected
-    from koopmpc.bench.inspect import replayed as replayed
     from koopmpc.bench.inspect import worst_moments as worst_moments
     from koopmpc.bench.library import list_problems as list_problems
     from koopmpc.bench.library import new_problem as new_problem
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from koopmpc.bench.results import reached as reached
     from koopmpc.bench.results import row_to_view as row_to_view
     from koopmpc.bench.single import FAULTS as FAULTS
+    from koopmpc.bench.single import replayed as replayed
     from koopmpc.bench.store import load_rows as load_rows
     from koopmpc.bench.table import results_table as results_table
 else:

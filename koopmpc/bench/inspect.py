@@ -1,9 +1,9 @@
-"""inspected: what logs hold, their figures recomputed, and their worst moments; replayed: the same run again."""
+"""inspected: what logs hold, their figures recomputed, and their worst moments."""
 
 import ast
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from operator import eq, ge, gt, le, lt, ne
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,16 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from koopmpc.bench.controllers import Prepared
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.results import RunRow, reached
-from koopmpc.bench.single import closed_loop
+from koopmpc.bench.results import reached
 from koopmpc.bench.table import plain_table
 from koopmpc.control.move import Fallback, Status
-from koopmpc.errors import DataError, KoopmpcError, LogError, ProblemError
+from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.loop.metrics import Metrics, beyond, duration, metrics
 from koopmpc.loop.run import Run
 from koopmpc.recording.format.reader import load_run
+from koopmpc.recording.model import ModelLog, load_model_log
 from koopmpc.recording.recorder import record
 
 _MOST = 5  # moments of one kind that are named
@@ -50,10 +48,12 @@ class Inspected:
     cut: str | None = None
     refused: str | None = None
     repaired: Path | None = None
+    model: ModelLog | None = None
 
     def __str__(self) -> str:
         """Return the figures, a line each, and the moments."""
-        lines = [str(self.metrics)] + ([f"cut: {self.cut}"] if self.cut else [])
+        figures = str(self.metrics) if self.model is None else _figures(self.model)
+        lines = [figures] + ([f"cut: {self.cut}"] if self.cut else [])
         return "\n".join([*lines, "", "worst moments", *map(str, self.moments)])
 
 
@@ -95,7 +95,7 @@ def _inspected(path: Path, *, repair: bool) -> Inspected:
             run = load_run(path)
             figures = metrics(run)
         except KoopmpcError as error:
-            return Inspected(path, str(path), {}, refused=str(error))
+            return _of_model(path) or Inspected(path, str(path), {}, refused=str(error))
     cut = next((str(each.message) for each in told if issubclass(each.category, UserWarning)), None)
     repaired = None
     if repair and cut is not None:
@@ -106,12 +106,57 @@ def _inspected(path: Path, *, repair: bool) -> Inspected:
     return Inspected(path, title, _values(run, figures, names), figures, worst_moments(run), cut, repaired=repaired)
 
 
+def _of_model(path: Path) -> Inspected | None:
+    """Return what the log of a model holds; None where the log is none."""
+    try:
+        model = load_model_log(path)
+    except LogError:
+        return None  # what `load_run` said of it stands
+    found: list[Moment] = []
+    for i, state in enumerate(model.states):
+        errors = {r: np.abs(p - truth) for (r, j), (p, truth, _) in model.forecasts.items() if j == i}
+        if errors:
+            r = max(errors, key=lambda each: float(np.nanmax(errors[each], initial=-1.0)))
+            k = int(np.nanargmax(errors[r]))
+            found.append(Moment(k, k * model.dt, f"largest error of {state}: {errors[r][k]:.4g}, episode {r}"))
+    for (r, i), (_, truth, band) in model.forecasts.items():
+        outside = np.zeros(0, bool) if band is None else (truth < band[:, 0]) | (truth > band[:, 1])
+        if outside.any():
+            k = int(np.argmax(outside))
+            found.append(Moment(k, k * model.dt, f"{model.states[i]} leaves its band, episode {r}"))
+    radius = {"spectral_radius": float(model.facts["spectral radius"])}
+    return Inspected(
+        path, f"model of {', '.join(model.states)}", _NONE | radius, moments=tuple(sorted(found)), model=model
+    )
+
+
+def _figures(model: ModelLog) -> str:
+    """Return what the model is, and its errors one step, half of the horizon and the whole horizon ahead."""
+    lines = [f"{name:<25} {value}" for name, value in model.facts.items()]
+    for state, errors in zip(model.states, model.errors, strict=True):
+        ahead = sorted({1, (len(errors) + 1) // 2, len(errors)})
+        words = ", ".join(f"{errors[n - 1]:.3g} after {n}" for n in ahead)
+        lines.append(f"{'error of ' + state:<25} {words} step{'s' * (len(errors) > 1)}")
+    return "\n".join(lines)
+
+
+_NONE: dict[str, Any] = {
+    **dict.fromkeys(("problem", "case", "controller", "fault"), ""),
+    **dict.fromkeys(("steps", "fallbacks", "reached", "unknown", "spectral_radius"), float("nan")),
+    **{
+        field.name: float("nan")
+        for field in fields(Metrics)
+        if field.type in ("float", "int", "int | None", float, int)
+    },
+}  # figures that a log does not have: no comparison with NaN holds
+
+
 def _values(run: Run, figures: Metrics, names: Mapping[str, str]) -> dict[str, Any]:
     """Return what `--where` may ask for."""
     scalars = {name: value for name, value in vars(figures).items() if isinstance(value, int | float)}
     fell = sum(count for name, count in figures.fallback.items() if name != Fallback.NONE.name)
     more = {"steps": run.steps, "fallbacks": fell, "reached": reached(run), "unknown": figures.unknown or 0}
-    return {"problem": "", "case": "", "controller": "", "fault": "", **names, **scalars, **more}
+    return {**_NONE, **names, **scalars, **more}
 
 
 @np.errstate(invalid="ignore", over="ignore")
@@ -153,8 +198,10 @@ def inspection_table(found: Sequence[Inspected]) -> Table:
     for heading in ("cost", "violation", "late", "fell back", "slowest", ""):
         lines.add_column(heading, justify="right", no_wrap=True)
     for each in found:
-        if each.metrics is None:
+        if each.refused is not None:
             lines.add_row(each.path.name, "refused", style="red")
+        elif each.metrics is None:
+            lines.add_row(each.path.name, *("–",) * 5, "model")
         else:
             own = each.metrics
             cells = (f"{own.cost:.5g}", f"{own.violation:.2g}", str(own.late), str(each.values["fallbacks"]))
@@ -218,63 +265,3 @@ class Where:
 _COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
     ast.Lt: lt, ast.LtE: le, ast.Gt: gt, ast.GtE: ge, ast.Eq: eq, ast.NotEq: ne,
 }  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Replayed:
-    """The run of a log and the same run made again; `differences` names what is not the same to the bit."""
-
-    logged: Run
-    run: Run
-    differences: tuple[str, ...]
-
-    def __str__(self) -> str:
-        """Return whether they are the same, in one line or more."""
-        if not self.differences:
-            return f"the same to the bit: {self.run.steps} steps, states, inputs, statuses and iterations"
-        return "not the same: " + "\n".join(self.differences)
-
-
-def replayed(log: str | Path) -> Replayed:
-    """Run again what a log of `koopmpc run` or `koopmpc bench` holds: same problem, data, start, noise and faults.
-
-    Raises
-    ------
-    LogError
-        The log cannot be read, or does not say which problem ran.
-    ProblemError
-        The problem's file is no longer there, or has no such case.
-    """
-    logged = load_run(log)
-    known = logged.metadata
-    if not {"problem", "case", "controller"} <= known.keys() or "training" not in known:
-        raise LogError(f"{log} does not say which problem, case and controller ran; logs of `koopmpc run` do")
-    file = str(known.get("file", ""))
-    problem = load_problem(f"{file if Path(file).is_file() else known['problem']}:{known['case']}")
-    own: dict[str, Any] = dict(known.get("sweep", {}))
-    row = RunRow(problem.name, str(known["case"]), str(known["controller"]), fault=known.get("fault"))
-    row = replace(row, **{name: type(getattr(row, name))(value) for name, value in own.items()})
-    trained = known["training"]["seed"] - row.seed
-    if trained != problem.training.seed:
-        raise ProblemError(f"{problem.name} trains with seed {problem.training.seed}, the log's run did with {trained}")
-    parts = Prepared(problem, row.seed, monitored=bool(known.get("monitor")))
-    row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
-    run = closed_loop(parts, row, plans=logged.plans is not None, compiled=bool(known.get("compiled")))
-    return Replayed(logged, run, tuple(_differences(logged, run)))
-
-
-def _differences(logged: Run, run: Run) -> Iterator[str]:
-    """Yield each column that differs, with the first step at which it does."""
-    for name in ("X", "Y", "U", "reference", "u_reference", "slack", "iterations", "status", "fallback"):
-        old, new = np.asarray(getattr(logged, name)), np.asarray(getattr(run, name))
-        if old.shape != new.shape:
-            yield f"{name} has shape {new.shape}, the log's {old.shape}"
-        else:
-            same = (old == new) | ((old != old) & (new != new))  # NaN is NaN
-            if not same.all():
-                yield f"{name} from step {int(np.argwhere(~same)[0][0])} on"
-    if logged.plans != run.plans:
-        yield "plans"
-    for name in ("cost", "limits", "dt"):
-        if getattr(logged, name) != getattr(run, name):
-            yield f"{name}: the problem has changed since"

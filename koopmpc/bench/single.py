@@ -1,10 +1,10 @@
-"""One run of a sweep: a controller on a case, its figures, and its log; what it raises becomes its row."""
+"""One run of a sweep: a controller on a case, its figures, and its log; and the same run again from that log."""
 
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.bench.controllers import LEARNED, Prepared
+from koopmpc.bench.library import load_problem
 from koopmpc.bench.problem import Case
 from koopmpc.bench.results import RunRow, failures, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
 from koopmpc.control.move import Controller
-from koopmpc.errors import DataError, FullDiskError
+from koopmpc.errors import DataError, FullDiskError, LogError, ProblemError
 from koopmpc.loop.faults import (
     ActuatorDelay,
     ActuatorLoss,
@@ -31,6 +32,7 @@ from koopmpc.loop.metrics import metrics
 from koopmpc.loop.realtime import in_real_time
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
+from koopmpc.plants.step_map import StepMap
 from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 
@@ -196,3 +198,104 @@ def _metadata(parts: Prepared, row: RunRow, injected: Sequence[Fault]) -> dict[s
     known |= {"file": problem.file} if problem.file else {}
     known |= {"sweep": sweep} if sweep else {}
     return known | ({"fault": row.fault, "faults": [str(broken) for broken in injected]} if injected else {})
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """The run of a log and the same run made again; `differences` names what is not the same to the bit."""
+
+    logged: Run
+    run: Run
+    differences: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return whether they are the same, in one line or more."""
+        if not self.differences:
+            return f"the same to the bit: {self.run.steps} steps, states, inputs, statuses and iterations"
+        return "not the same: " + "\n".join(self.differences)
+
+
+def replayed(log: str | Path, *, plant: StepMap | None = None, controller: Controller | None = None) -> Replayed:
+    """Run again what a log holds, and compare to the bit.
+
+    A log of `koopmpc run`, `koopmpc bench` or `km.sweep` names all that ran: problem, data, start, noise and faults. Of
+    any other log, as of `km.simulate` or `km.realtime`, pass what ran: the `plant` gets the logged inputs, from each
+    logged state, and the `controller` the logged measurements and references, with their preview.
+
+    Raises
+    ------
+    LogError
+        The log cannot be read, or does not say what ran and nothing is passed; it is of a run with faults that the log
+        of a problem alone can repeat.
+    ProblemError
+        The problem's file is no longer there, or has no such case.
+    """
+    logged = load_run(log)
+    if plant is not None or controller is not None:
+        run = _again(logged, plant, controller, Path(log))
+        return Replayed(logged, run, tuple(_differences(logged, run)))
+    known = logged.metadata
+    if not {"problem", "case", "controller"} <= known.keys() or "training" not in known:
+        raise LogError(
+            f"{log} does not say which problem, case and controller ran; logs of `koopmpc run` and `koopmpc bench` do. "
+            "In Python pass what ran: km.bench.replayed(log, plant=…, controller=…)"
+        )
+    file = str(known.get("file", ""))
+    problem = load_problem(f"{file if Path(file).is_file() else known['problem']}:{known['case']}")
+    own: dict[str, Any] = dict(known.get("sweep", {}))
+    row = RunRow(problem.name, str(known["case"]), str(known["controller"]), fault=known.get("fault"))
+    row = replace(row, **{name: type(getattr(row, name))(value) for name, value in own.items()})
+    trained = known["training"]["seed"] - row.seed
+    if trained != problem.training.seed:
+        raise ProblemError(f"{problem.name} trains with seed {problem.training.seed}, the log's run did with {trained}")
+    parts = Prepared(problem, row.seed, monitored=bool(known.get("monitor")))
+    row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
+    run = closed_loop(parts, row, plans=logged.plans is not None, compiled=bool(known.get("compiled")))
+    return Replayed(logged, run, tuple(_differences(logged, run)))
+
+
+def _again(logged: Run, plant: StepMap | None, controller: Controller | None, log: Path) -> Run:
+    """Return the logged run with the states that the plant makes of its inputs, and the controller's moves."""
+    if "faults" in logged.metadata:
+        faults = ", ".join(logged.metadata["faults"])
+        raise LogError(f"{log} is of a run with faults, {faults}: they cannot be made again from it")
+    X, U, moves = logged.X, logged.U, dict[str, Any]()
+    if plant is not None:
+        if np.isnan(X).any():
+            raise LogError(f"{log} does not hold the states of its plant: pass the controller alone")
+        X = np.vstack([X[:1], *(plant(x, u)[None] for x, u in zip(X, U, strict=False))])
+    if controller is not None:
+        N, W = controller.horizon, logged.metadata.get("measured")
+        rows = np.vstack([logged.reference, np.repeat(logged.reference[-1:], N, axis=0)])
+        w = None if W is None else np.vstack([W, np.repeat(W[-1:], N, axis=0)])
+        controller.reset(None if np.isnan(X[0]).any() else X[0])
+        made = [
+            controller(
+                logged.Y[k],
+                rows[k : k + N + 1],
+                U[k - 1] if k else None,
+                **({} if w is None else {"w": w[k : k + max(N, 1)]}),
+            )
+            for k in range(logged.steps)
+        ]
+        U = np.array([move.u for move in made], dtype=np.float64)
+        moves = {name: tuple(getattr(move, name) for move in made) for name in ("status", "fallback")}
+        moves |= {name: np.array([getattr(move, name) for move in made]) for name in ("iterations", "slack")}
+    return replace(logged, X=X, U=U, **moves)
+
+
+def _differences(logged: Run, run: Run) -> Iterator[str]:
+    """Yield each column that differs, with the first step at which it does."""
+    for name in ("X", "Y", "U", "reference", "u_reference", "slack", "iterations", "status", "fallback"):
+        old, new = np.asarray(getattr(logged, name)), np.asarray(getattr(run, name))
+        if old.shape != new.shape:
+            yield f"{name} has shape {new.shape}, the log's {old.shape}"
+        else:
+            same = (old == new) | ((old != old) & (new != new))  # NaN is NaN
+            if not same.all():
+                yield f"{name} from step {int(np.argwhere(~same)[0][0])} on"
+    if logged.plans != run.plans:
+        yield "plans"
+    for name in ("cost", "limits", "dt"):
+        if getattr(logged, name) != getattr(run, name):
+            yield f"{name}: the problem has changed since"

@@ -153,7 +153,7 @@ def inspect(
 
 def replay(log: Annotated[Path, typer.Argument(help="A log of `koopmpc run` or `koopmpc bench`.")]) -> None:
     """Run again what a log holds, and say whether it is the same to the bit; exit 1 where it is not."""
-    from koopmpc.bench.inspect import replayed
+    from koopmpc.bench.single import replayed
 
     with friendly():
         found = replayed(log)

@@ -63,7 +63,7 @@ def status_words(status: Status, fallback: Fallback) -> str:
 
 def to_json(about: About, steps: int | None) -> str:
     """Return `about` as JSON, exact to the bit; `steps` where the length is known beforehand."""
-    tree = {"format": _FORMAT, "steps": steps, "written_with": _versions(), "about": to_data(about)}
+    tree = {"format": _FORMAT, "steps": steps, "written_with": written_with(), "about": to_data(about)}
     return json.dumps(tree, ensure_ascii=False)
 
 
@@ -99,7 +99,7 @@ def to_markdown(about: About) -> str:
     if about.limits is not None:
         lines += [_table("limits", _fields(about.limits, about)), ""]
     run = {key: value for key, value in about.metadata.items() if key != "title"}
-    lines += [_table("run", run | {"written with": _versions()}), ""]
+    lines += [_table("run", run | {"written with": written_with()}), ""]
     return "\n".join(lines)
 
 
@@ -154,7 +154,7 @@ def _short(value: Any) -> str:
 
 
 @cache
-def _versions() -> dict[str, str]:
+def written_with() -> dict[str, str]:
     """Return the versions of the packages that a run depends on."""
     versions: dict[str, str] = {}
     for package in ("koopmpc", "numpy", "casadi", "osqp", "rerun-sdk"):

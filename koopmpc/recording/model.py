@@ -1,8 +1,10 @@
 # pyright: basic
 """record_model: a predictor and how far it can be trusted, as one Rerun log."""
 
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,13 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, LogError
 from koopmpc.figures.plane import Axes, Plane, plane_through
 from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.recording.description import drawable
+from koopmpc.recording.description import drawable, written_with
+from koopmpc.recording.format.columns import Entity
+from koopmpc.recording.format.rrd import read_columns
 from koopmpc.recording.format.writer import file_recording, times
 from koopmpc.recording.views.blueprint import color, framed, shared_time
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
@@ -31,6 +35,7 @@ _BAND: Color = (70, 125, 185)
 _ESCAPED, _BEFORE = re.compile(r"([*_`])"), r"\\\1"  # signs that Markdown would read as style
 _SHOWN = 6  # plots of states in one column
 _EIGENFUNCTIONS = 2  # drawn unless told
+_FORMAT = "koopmpc-model-1"
 
 Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], one value a step
 Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
@@ -97,6 +102,10 @@ def record_model(
         rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
         text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
         rec.log("report", text, static=True)
+        facts = _facts(predictor) | {"horizon": horizon, "band": ahead[0].band if ahead else ""}
+        about = {"format": _FORMAT, "written_with": written_with(), "dt": predictor.dt, "facts": facts}
+        about |= {"states": list(predictor.states), "forecasts": len(ahead)}
+        rec.log(Entity.DESCRIPTION, rr.AnyValues(json=json.dumps(about, ensure_ascii=False)), static=True)
         drawn = draw_eigenvalues(predictor, residuals)
         for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
             rec.log(entity, archetype, static=True)
@@ -187,6 +196,14 @@ def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str
         note or "Eigenfunctions: dark is the least value, light the largest; of a phase, dark is 0, light ±π.",
         "",
     ]
+    table = markdown_table(
+        ("model", ""), [(key, _ESCAPED.sub(_BEFORE, value)) for key, value in _facts(predictor).items()]
+    )
+    return "\n".join([*lines, table])
+
+
+def _facts(predictor: AnyPredictor) -> dict[str, str]:
+    """Return what the model is, and how it was fitted, in words."""
     rows = {
         "kind": type(predictor).__name__,
         "inputs": ", ".join(predictor.inputs) or "none",
@@ -203,8 +220,7 @@ def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str
             "condition": f"{fit.condition:.3g}",
         }
         rows |= {f"doubt {i + 1}": doubt for i, doubt in enumerate(fit.warnings)}
-    table = markdown_table(("model", ""), [(key, _ESCAPED.sub(_BEFORE, value)) for key, value in rows.items()])
-    return "\n".join([*lines, table])
+    return rows
 
 
 def _blueprint(
@@ -243,3 +259,45 @@ def _blueprint(
             column_shares=[1.0, 1.2],
         )
     )
+
+
+@dataclass(frozen=True, eq=False)
+class ModelLog:
+    """What the log of a model holds: `facts` in words, and curves.
+
+    `errors` has the root-mean-square error of each state 1, 2, … steps ahead. By the numbers of an episode and a state,
+    `forecasts` has the prediction, the truth and, where there is one, the band (T+1, 2).
+    """
+
+    facts: Mapping[str, str]
+    states: tuple[str, ...]
+    dt: float
+    errors: tuple[np.ndarray, ...]
+    forecasts: Mapping[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
+
+
+def load_model_log(path: str | Path) -> ModelLog:
+    """Return what `record_model` wrote about a model.
+
+    Raises
+    ------
+    LogError
+        The file is missing or damaged, or no log of a model whose format this version knows.
+    """
+    path = Path(path)
+    log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**"))
+    text = log.static(Entity.DESCRIPTION, "json")
+    try:
+        about: dict[str, Any] = {} if text is None else json.loads(text)
+        if about.get("format") != _FORMAT:
+            raise LogError(f"{path} holds no model that this koopmpc reads: its format is {about.get('format')!r}")
+        errors = [log.matrix(f"error/{i}")[1][:, 0] for i in range(len(about["states"]))]
+        forecasts = {}
+        for r in range(about["forecasts"]):
+            for i in range(len(about["states"])):
+                curves = log.matrix(f"rollout/{r}/state/{i}")[1]
+                forecasts[r, i] = curves[:, 0], curves[:, -1], curves[:, 1:3] if curves.shape[1] > 2 else None
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise LogError(f"{path} is damaged: {error}") from error
+    facts = {name: str(value) for name, value in about["facts"].items() if value != ""}
+    return ModelLog(facts, tuple(about["states"]), float(about["dt"]), tuple(errors), forecasts)

@@ -115,3 +115,41 @@ def test_a_problem_that_has_changed_since_is_told(swept, tmp_path):
     km.record(replace(run, metadata={}), tmp_path / "own.rrd")
     with pytest.raises(km.errors.LogError, match="does not say which problem, case and controller ran"):
         km.bench.replayed(tmp_path / "own.rrd")
+
+
+def test_a_run_of_your_own_replays_with_the_plant_and_the_controller_that_ran(tmp_path):
+    problem, log = km.load_problem("pendulum:upright"), tmp_path / "own.rrd"
+    plant = km.discretize(problem.dynamics, problem.dt)
+    mpc = km.LinearMPC(plant, *problem.equilibrium, problem.cost, problem.limits, 20)
+    about = {"x0": [0.5, 0], "reference": [0, 0], "steps": 60}
+    km.record(km.simulate(plant, mpc, **about, noise=[0.01, 0.01], limits=problem.limits), log)
+    assert km.bench.replayed(log, plant=plant, controller=mpc).differences == ()
+    slower = km.LinearMPC(plant, *problem.equilibrium, problem.cost, problem.limits, 3)
+    heavier = km.discretize(replace(problem.dynamics, m=1.01 * problem.dynamics.m), problem.dt)
+    assert [each.split()[0] for each in km.bench.replayed(log, plant=heavier).differences] == ["X"]
+    assert "U from step 0 on" in km.bench.replayed(log, controller=slower).differences
+    km.record(km.simulate(plant, mpc, **about, faults=[km.faults.DroppedSamples(0.2)]), log)
+    with pytest.raises(km.errors.LogError, match="is of a run with faults, DroppedSamples"):
+        km.bench.replayed(log, controller=mpc)
+
+
+def test_the_log_of_a_model_says_what_it_is_and_where_its_forecasts_are_worst(tmp_path, swept):
+    rng = np.random.default_rng(0)
+    data = km.Episodes([km.Episode(X=rng.normal(size=(30, 2)), U=rng.normal(size=(29, 1))) for _ in range(4)], 0.1)
+    model, log = km.edmd(data, km.State() + km.Constant()), tmp_path / "model.rrd"
+    km.recording.record_model(model, data, log, horizon=5, rollouts=2)
+    (found,) = km.bench.inspected([log])
+    errors = km.score(model, data, 5).rmse
+    said = str(found)
+    assert found.title == f"model of {', '.join(model.states)}"
+    for i, state in enumerate(model.states):
+        assert f"error of {state}" in said
+        assert f"{errors[0, i]:.3g} after 1, {errors[2, i]:.3g} after 3, {errors[4, i]:.3g} after 5 steps" in said
+        gaps = [np.abs(model.rollout(e.X[0], e.U[:5])[:, i] - e.X[:6, i]) for e in list(data)[:2]]
+        r = int(np.argmax([gap.max() for gap in gaps]))
+        k = int(np.argmax(gaps[r]))
+        assert (k, f"largest error of {state}: {gaps[r][k]:.4g}, episode {r}") in [(m.k, m.what) for m in found.moments]
+    assert [each.path for each in km.bench.inspected([tmp_path], "spectral_radius > 0")] == [log]
+    assert list(km.bench.inspected([tmp_path], "violation > 0")) == []
+    with pytest.raises(km.errors.LogError, match="koopmpc-model-1"):
+        km.load_run(log)
