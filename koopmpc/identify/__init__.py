@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.identify.fits.kic import InputPredictor as InputPredictor
+    from koopmpc.identify.fits.kic import kic as kic
     from koopmpc.identify.fits.prior import Combination as Combination
     from koopmpc.identify.fits.prior import Dissipation as Dissipation
 else:

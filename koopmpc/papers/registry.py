@@ -29,6 +29,8 @@ PAPERS = (
     "williams",
     "korda",
     "kaiser",
+    "kic",
+    "kernel",
 )
 
 _ROUNDING = 1e-10

@@ -15,8 +15,8 @@ QUICK = (
     "brunton",
     "proctor",
     "williams",
-    "kaiser",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("korda",)),
+    "kic",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("korda", "kaiser", "kernel")),
 )
 
 
