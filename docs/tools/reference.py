@@ -154,5 +154,7 @@ def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
     named = entries()
     pages = {room: page(room, [e for e in named if e.room == room]) for room in ROOMS}
     for name, text in {"index": index(named), "commands": commands(), **pages}.items():
-        files.append(File.generated(config, f"reference/{name}.md", content=text))
+        boost = 2 if name == "commands" else 0.5  # in the search: the pages that tell how come before the entries
+        content = f"---\nsearch: {{boost: {boost}}}\n---\n\n{text}"
+        files.append(File.generated(config, f"reference/{name}.md", content=content))
     return files

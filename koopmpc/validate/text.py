@@ -22,7 +22,14 @@ def written(*parts: RenderableType) -> str:
     """
     stream = StringIO()
     console = Console(
-        file=stream, width=_WIDEST, color_system=None, markup=False, emoji=False, highlight=False, legacy_windows=False
+        file=stream,
+        width=_WIDEST,
+        color_system=None,
+        markup=False,
+        emoji=False,
+        highlight=False,
+        legacy_windows=False,
+        force_jupyter=False,  # there rich would display the text instead
     )
     for part in parts:
         console.print(part, width=_WIDEST if isinstance(part, Table) and part.box is _HEADED else WIDTH)
