@@ -28,6 +28,7 @@ PAPERS = (
     "proctor",
     "williams",
     "korda",
+    "dictionary",
     "kaiser",
     "kic",
     "kernel",

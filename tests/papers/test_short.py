@@ -16,7 +16,7 @@ QUICK = (
     "proctor",
     "williams",
     "kic",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("korda", "kaiser", "kernel")),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("korda", "dictionary", "kaiser", "kernel")),
 )
 
 
