@@ -231,6 +231,17 @@ class Compiled:
         finally:
             self._token.append(held)
 
+    def rehearse(self) -> None:
+        """Run the last step once more and forget it, so that the next one finds its code and tables in the caches.
+
+        After some milliseconds of sleep any call from Python takes ten times as long and more. A loop that wakes a
+        little early calls this first, and then waits for the measurement. No answer and no plan changes by it.
+        """
+        if self._targets is None or self._aimed:
+            kept = self._memory.copy()
+            self(self._y, self._reference[: self._count])
+            self._memory[:] = kept
+
     def _tell(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
         """Write down what acted and what disturbs, or that nothing is told."""
         frame = self._frame

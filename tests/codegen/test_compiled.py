@@ -122,3 +122,16 @@ def test_an_estimator_of_ones_own_is_refused_by_name(pendulum):
     mine = km.KoopmanMPC(pendulum[1], COST, LIMITS, 5, estimator=Told([0.0] * pendulum[1].nz))
     with pytest.raises(km.errors.DataError, match="the estimator Told cannot be written in C; use"):
         km.compiled(mine)
+
+
+@pytest.mark.parametrize("kind", ["linear", "staged"])
+def test_a_rehearsal_changes_nothing(fast, pendulum, kind):
+    one = fast if kind == "linear" else km.compiled(km.BilinearMPC(pendulum[0], COST, LIMITS, 6))
+    one.reset()
+    one.rehearse()
+    first, twin = answers(one, states(5)), copy.copy(one)
+    for _ in range(2):
+        one.rehearse()
+    assert np.array_equal(one.plan().U, twin.plan().U)
+    assert np.array_equal(answers(one, states()), answers(twin, states()))
+    assert len(first) == 5

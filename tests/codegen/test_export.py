@@ -13,6 +13,7 @@ from koopmpc.cli.app import app
 from koopmpc.codegen.text import EXPRESSIONS, Language, function
 from koopmpc.plants.compiled import library
 from koopmpc.plants.graph import OPERATIONS, Graph
+from tests.faults.damage import room_for
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 LIMITS = km.Limits(u_min=-25.0, u_max=25.0, x_min=[-0.5, -1.0], x_max=[0.5, 1.0], du_max=20.0)
@@ -190,3 +191,8 @@ def test_cmake_builds_it(exported, tmp_path):
         assert done.returncode == 0, (done.stdout + done.stderr)[-2000:]
     printed = subprocess.run([str(tmp_path / "build" / "example")], capture_output=True, text=True, check=True).stdout
     assert len(table(printed)) == 80
+
+
+def test_a_full_disk_is_told_in_one_sentence(exported, tmp_path):
+    with room_for(2000), pytest.raises(km.errors.FullDiskError, match=r"cannot be written: File too large"):
+        km.export(exported[1], tmp_path / "c")

@@ -1,4 +1,4 @@
-"""`make embedded`: the float controllers of three problems on an emulated Cortex-M4F, beside the same C on this machine.
+"""`make embedded`: the float controllers of three problems, and a BilinearMPC, on an emulated Cortex-M4F, beside the same C on this machine.
 
 It needs the Debian packages gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm, and says so where one is missing.
 """
@@ -16,7 +16,7 @@ import numpy as np
 import koopmpc as km
 
 HERE = Path(__file__).parent
-PROBLEMS = ("pendulum:upright", "cart_pole", "pendulum_swing")
+PROBLEMS = ("pendulum:upright", "cart_pole", "pendulum_swing", "pendulum_swing bilinear")
 STEPS, CLOSE = 200, 1e-3
 TOOLS = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi and libnewlib-arm-none-eabi",
@@ -39,7 +39,7 @@ def main() -> int:
     if missing:
         say(f"make embedded needs the Debian packages {', '.join(missing)}; nothing was run")
         return 0
-    say(f"{'problem':<18}{'flash':>9}{'state':>9}{'stack':>8}{'instructions a step':>30}{'off host':>11}")
+    say(f"{'problem':<25}{'flash':>9}{'state':>9}{'stack':>8}{'instructions a step':>30}{'off host':>11}")
     failed = False
     for name in PROBLEMS:
         with tempfile.TemporaryDirectory() as folder:
@@ -48,12 +48,16 @@ def main() -> int:
 
 
 def exported(name: str, folder: Path) -> Path:
-    """Export the Koopman MPC of a problem in single precision, its example on the problem's own plant."""
+    """Export the Koopman MPC of a problem, or its BilinearMPC, in single precision, its example on the problem's own plant."""
+    name, _, bilinear = name.partition(" ")
     problem = km.load_problem(name)
     parts = km.bench.Prepared(problem)
     case = next(iter(problem.cases.values()))
     limits = problem.limits if case.limits is None else case.limits
-    controller = km.KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, solver="daqp")
+    if bilinear:
+        controller = km.BilinearMPC(parts.bilinear, problem.cost, limits, problem.horizon)
+    else:
+        controller = km.KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, solver="daqp")
     row = np.atleast_2d(np.asarray(case.reference))[0]
     return km.export(
         controller, folder / "c", precision="float", plant=parts.step_map, x0=case.x0, reference=row, steps=STEPS
@@ -103,7 +107,7 @@ def shown(name: str, folder: Path) -> bool:
     rows = [line.split() for line in lines if re.fullmatch(r"([0-9a-f]{8} )+[0-9a-f]{8}", line)]
     stack = next((int(line.split()[1], 16) for line in lines if line.startswith("stack ")), 0)
     if len(rows) != STEPS:
-        say(f"{name:<18} ended after {len(rows)} of {STEPS} steps: {lines[-1:]}")
+        say(f"{name:<25} ended after {len(rows)} of {STEPS} steps: {lines[-1:]}")
         return False
     width = expected.shape[1] - 4
     found = np.array([[struct.unpack(">f", bytes.fromhex(word))[0] for word in row[1 : 1 + width]] for row in rows])
@@ -111,7 +115,7 @@ def shown(name: str, folder: Path) -> bool:
     scale = np.abs(expected[:, 1 : 1 + width]).max(axis=0) + 1e-9
     off = float((np.abs(found - expected[:, 1 : 1 + width]) / scale).max())
     steps = f"{int(np.median(instructions))} median, {instructions.max()} worst"
-    say(f"{name:<18}{text + data:>9}{data + bss:>9}{stack:>8}{steps:>30}{off:>11.1e}")
+    say(f"{name:<25}{text + data:>9}{data + bss:>9}{stack:>8}{steps:>30}{off:>11.1e}")
     return off <= CLOSE
 
 

@@ -99,17 +99,24 @@ def test_c_step_with_limits_active_against_daqp(benchmark):
 
 
 def test_cold_steps(benchmark, model):
-    """A step after 4 ms of sleep over the same step at once, in C and in Python."""
+    """A step after 4 ms of sleep over the same step at once, in C and in Python, and after a rehearsal.
+
+    Beside it the floor: what a call of a function that does nothing costs cold.
+    """
     slow = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25), 40, solver="daqp")
     fast, x, reference, figures = km.compiled(slow), np.array([0.01, 0.02]), np.zeros(2), {}
-    for name, one in (("C", fast), ("Python", slow)):
-        hot, cold = [], []
-        for _ in range(300):
+    ways = {"nothing": lambda x, reference: None, "C": fast, "C, rehearsed": fast, "Python": slow}
+    spent = {name: ([], []) for name in ways}
+    for _ in range(300):
+        for name, one in ways.items():
             time.sleep(0.004)
-            cold.append(timed(one, x, reference)[0])
+            if name == "C, rehearsed":
+                fast.rehearse()
+            spent[name][0].append(timed(one, x, reference)[0])
             for _ in range(20):
                 last = timed(one, x, reference)[0]
-            hot.append(last)
+            spent[name][1].append(last)
+    for name, (cold, hot) in spent.items():
         figures[f"{name} cold to hot"] = float(np.median(cold) / np.median(hot))
         figures[f"{name} cold µs"] = float(np.median(cold)) * 1e6
     benchmark(fast, x, reference)
@@ -177,3 +184,73 @@ def test_a_thousand_runs(benchmark, model):
             "simulate's ratio": python / hooked,
         },
     )
+
+
+def test_c_bilinear_step_against_python(benchmark):
+    """The swing-up of the cart-pole from hanging: all its steps in C and in Python, in turns; the model is the plant."""
+    problem = km.load_problem("cart_pole_swing")
+    plant = km.discretize(problem.dynamics, problem.dt)
+    data = km.collect(plant, problem.training.x0, problem.training.excitation, episodes=2000, steps=10, rng=0)
+    slow = km.BilinearMPC(
+        km.bilinear_edmd(data, problem.lifting, difference=True), problem.cost, problem.limits, problem.horizon
+    )
+    spent, fast = timed(km.compiled, slow)
+    case = problem.cases["hang"]
+    run = km.simulate(plant, slow, x0=case.x0, reference=case.reference, steps=case.steps)
+    rows = {slow: [], fast: []}
+    for _ in range(5):
+        for one, found in rows.items():
+            one.reset()
+            start = time.process_time()
+            for x in run.X[:-1]:
+                one(x, case.reference)
+            found.append(time.process_time() - start)
+    theirs, ours = (float(np.median(found)) / case.steps for found in rows.values())
+    free = {one: cpu(one, run.X[-1], case.reference, count=50) for one in rows}
+    benchmark(fast, run.X[-1], case.reference)
+    report(
+        benchmark,
+        **{
+            "a step of the swing-up in C µs": ours * 1e6,
+            "in Python µs": theirs * 1e6,
+            "Python to C": theirs / ours,
+            "free step in C µs": free[fast] * 1e6,
+            "free step, Python to C": free[slow] / free[fast],
+            "built in s": spent,
+        },
+    )
+
+
+def test_c_step_of_a_linear_mpc_beside_tinympc(benchmark):
+    """TinyMPC's own cart-pole, ±0.45 N, 0.5 m off, N = 60: closed-loop cost of 400 steps and CPU time of a step in both."""
+    tinympc = pytest.importorskip("tinympc")
+    A = np.array([[1.0, 0.01, 0, 0], [0, 1.0, 0.039, 0], [0, 0, 1.002, 0.01], [0, 0, 0.458, 1.002]])
+    B, Q, R = np.array([[0.0], [0.02], [0.0], [0.067]]), np.array([10.0, 1.0, 10.0, 1.0]), np.array([1.0])
+    model = km.LinearPredictor(A, B, np.eye(4), km.State(), 0.01, tuple("abcd"), ("u",))
+    ours = km.compiled(km.KoopmanMPC(model, km.Cost(Q, R), km.Limits(-0.45, 0.45), 60, solver="daqp"))
+    theirs = tinympc.TinyMPC()
+    theirs.setup(A, B, np.diag(Q), np.diag(R), 61, rho=1.0, verbose=False, max_iter=100)
+    theirs.set_bound_constraints(
+        np.full((4, 61), -1e17), np.full((4, 61), 1e17), np.full((1, 60), -0.45), np.full((1, 60), 0.45)
+    )
+
+    def asked(x):
+        theirs.set_x0(x)
+        return np.atleast_1d(theirs.solve()["controls"])
+
+    figures, zero = {}, np.zeros(4)
+    for name, law in (("C", lambda x: ours(x, zero).u), ("TinyMPC", asked)):
+        x, cost, spent = np.array([0.5, 0.0, 0.0, 0.0]), 0.0, []
+        for _ in range(400):
+            start = time.process_time()
+            u = np.clip(law(x), -0.45, 0.45)
+            spent.append(time.process_time() - start)
+            cost += float(Q @ x**2 + R @ u**2)
+            x = A @ x + B @ u
+        figures |= {
+            f"{name} cost": cost,
+            f"{name} mean µs": 1e6 * float(np.mean(spent)),
+            f"{name} worst µs": 1e6 * max(spent),
+        }
+    benchmark(ours, zero, zero)
+    report(benchmark, **figures)
