@@ -13,7 +13,7 @@ from rich.text import Text
 from koopmpc.cli import sweeps
 from koopmpc.cli.console import bar, console, folder_of, friendly, new_file, new_folder, program, say_page, split
 from koopmpc.cli.sweeps import Logs
-from koopmpc.errors import KoopmpcError
+from koopmpc.errors import KoopmpcError, ProblemError
 
 if TYPE_CHECKING:
     pass
@@ -272,26 +272,37 @@ def explain(
 
 @app.command()
 def reproduce(
-    paper: Annotated[str, typer.Argument(help="Name of the paper, as snyder; a wrong one lists all.")],
+    paper: Annotated[str | None, typer.Argument(help="Name of the paper, as snyder; a wrong one lists all.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every paper, two at a time.")] = False,
     logs: Logs = Path("logs"),
 ) -> None:
     """Reproduce a paper: its figures, its numbers, and a verdict on each claim; 1 where a required number is missed."""
     from time import perf_counter
 
-    from koopmpc.papers.registry import find_paper, verdict_table
+    from koopmpc.papers.registry import PAPERS, find_paper, reproduce_all, summary_table, verdict_table
 
     out, err = console(), Console(stderr=True)
+    start = perf_counter()
     with friendly():
-        found = find_paper(paper)
-        folder = new_folder(logs, paper)
-        start = perf_counter()
-        with err.status("") as status:
-            outcome = found.reproduce(folder, False, status.update)
-        out.print(verdict_table(found.title, outcome.claims))
-        for path in (outcome.report, outcome.recording):
+        if (paper is None) is not every:
+            raise ProblemError(f"name one paper, or pass --all; there are {', '.join(PAPERS)}")
+        if paper is None:
+            folder = new_folder(logs, "papers")
+            with err.status("") as status:
+                found = reproduce_all(folder, False, status.update)
+            out.print(summary_table(found))
+            paths, failed = [folder / "index.md"], any(each.outcome.failed for each in found)
+        else:
+            one = find_paper(paper)
+            folder = new_folder(logs, paper)
+            with err.status("") as status:
+                outcome = one.reproduce(folder, False, status.update)
+            out.print(verdict_table(one.title, outcome.claims))
+            paths, failed = [outcome.report, outcome.recording], bool(outcome.failed)
+        for path in paths:
             out.print(Text(str(path)), soft_wrap=True)
         out.print(Text(f"done in {perf_counter() - start:.0f} s"))
-    if outcome.failed:
+    if failed:
         raise typer.Exit(1)
 
 

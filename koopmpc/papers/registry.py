@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +21,7 @@ from koopmpc.bench.table import plain_table
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
 from koopmpc.figures.plots import Plot, plots
+from koopmpc.parallel import map_tasks
 from koopmpc.recording.page import Page
 from koopmpc.recording.views.curves import record_curves
 
@@ -200,3 +203,74 @@ def find_paper(name: str) -> Paper:
     if name not in PAPERS:
         raise ProblemError(f"there is no paper {name!r}{nearest(name, PAPERS)}; there are {', '.join(PAPERS)}")
     return import_module(f"koopmpc.papers.{name}").paper
+
+
+class PaperTask(NamedTuple):
+    """A paper to reproduce in a folder, by its name, so that it can go to another process."""
+
+    name: str
+    folder: Path
+    quick: bool
+
+
+class TimedReproduction(NamedTuple):
+    """A paper done again, and how long that took [s]."""
+
+    paper: str
+    outcome: Reproduction
+    seconds: float
+
+
+def reproduced(task: PaperTask) -> TimedReproduction:
+    """Reproduce one paper."""
+    start = perf_counter()
+    outcome = find_paper(task.name).reproduce(task.folder, task.quick, lambda words: None)
+    return TimedReproduction(task.name, outcome, perf_counter() - start)
+
+
+def reproduce_all(folder: Path, quick: bool, tell: Tell, workers: int = 2) -> list[TimedReproduction]:
+    """Reproduce every paper in `folder`, some at once, and write index.md, a table of them.
+
+    Raises
+    ------
+    LogError
+        A file cannot be written.
+    """
+
+    def progress(done: int, total: int | None) -> None:
+        tell(f"{done} of {total} papers done")
+
+    tasks = [PaperTask(name, folder, quick) for name in PAPERS]
+    found = list(map_tasks(reproduced, tasks, workers=workers, progress=progress))
+    page = Page(folder)
+    page.text(
+        "# Papers, done again",
+        """Each page is written by `koopmpc reproduce NAME`, all of them by `koopmpc reproduce --all`: claims in our
+        words, the paper's figure with its spread, ours, and a verdict. *Required* are numbers that a correct library
+        must reproduce; the command exits with 1 where one is missed.""",
+    )
+    page.table(
+        SUMMARY,
+        [(f"[{find_paper(each.paper).title}]({each.paper}.md)", *counts(each.outcome)) for each in found],
+    )
+    page.write("index.md")
+    return found
+
+
+SUMMARY = ("paper", "claims", "hold", "in part", "do not hold", "required", "missed")
+
+
+def counts(outcome: Reproduction) -> tuple[int, ...]:
+    """Return the entries of a line below `SUMMARY` after the first."""
+    each = [sum(claim.verdict is verdict for claim in outcome.claims) for verdict in Verdict]
+    return len(outcome.claims), *each, sum(claim.required for claim in outcome.claims), len(outcome.failed)
+
+
+def summary_table(found: Sequence[TimedReproduction]) -> Table:
+    """Return a table with one line for each paper, and its time."""
+    lines = plain_table("Papers", padding=(0, 1, 0, 0))
+    for heading in (*SUMMARY, "time [s]"):
+        lines.add_column(heading)
+    for each in found:
+        lines.add_row(each.paper, *map(str, counts(each.outcome)), f"{each.seconds:.0f}")
+    return lines

@@ -27,9 +27,9 @@ def test_the_shortened_paper_writes_all_its_files(tmp_path):
     for picture in pictures:
         assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
     assert outcome.recording.stat().st_size > 1e6
-    assert len(outcome.claims) == 24
+    assert len(outcome.claims) == 25
     assert {claim.where.split(",")[0] for claim in outcome.claims} >= {"abstract", "results", "discussion"}
-    assert text.count("\n## ") == 10
+    assert text.count("\n## ") == 11
     assert len(told) == 5
 
 
@@ -95,6 +95,21 @@ def test_the_command_prints_verdicts_and_paths_and_fails_where_a_required_number
     assert text.startswith("# Mine and yours\n\nA paper of ours.\n\n`koopmpc reproduce mine`")
     assert f"Of 2 claims {1 - code} hold, 0 hold in part, {1 + code} do not hold" in text
     assert (page.parent / "mine" / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_all_papers_go_to_one_folder_with_a_table_of_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "PAPERS", ("proctor", "kic"))
+    found = registry.reproduce_all(tmp_path, True, lambda words: None, workers=1)
+    assert [each.paper for each in found] == ["proctor", "kic"]
+    text = (tmp_path / "index.md").read_text(encoding="utf-8")
+    for each in found:
+        claims = len(each.outcome.claims)
+        assert f"({each.paper}.md) | {claims} | {claims} | 0 | 0 | {claims} | 0 |" in text
+        assert (tmp_path / f"{each.paper}.rrd").is_file()
+    result = CliRunner().invoke(app, ["reproduce"])
+    assert result.exit_code == 2
+    assert "name one paper, or pass --all" in result.output
+    assert CliRunner().invoke(app, ["reproduce", "proctor", "--all"]).exit_code == 2
 
 
 def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits():

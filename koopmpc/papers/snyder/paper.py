@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from koopmpc.papers.reconstruction import Reconstruction, Setting
 from koopmpc.papers.registry import Claim, Paper, Tell, verdicts
-from koopmpc.papers.snyder import control, report, theory
+from koopmpc.papers.snyder import caution, control, report, theory
 from koopmpc.papers.snyder.claims import Fits, of_figures, of_text
 from koopmpc.papers.snyder.settings import OBSERVABLES, SHAKINGS, TASKS, all_settings
 from koopmpc.recording.page import Page
@@ -42,10 +42,11 @@ def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
     report.feedbacks(page)
     theory.frequencies(page, fits)
     theory.formulas(page, settings["pendulum"], fits)
+    warned = caution.caution(page, settings, fits)
     theory.failure(page, settings["cart-pole-lqr"], causes)
     control.inputs(page, predicted, exciting)
     control.loops(page, tasks, runs, length["episodes"])
-    return [*said, *shown]
+    return [*said, *shown, *warned]
 
 
 def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
