@@ -145,7 +145,9 @@ def count(value: int, name: str, least: int = 1) -> int:
 
 
 def members(value: object, name: str, needed: Sequence[str], advice: str) -> None:
-    """Raise where `value` lacks an attribute or a method that it needs."""
+    """Raise where `value` lacks an attribute or a method that it needs, or is a class that has them."""
+    if isinstance(value, type):
+        raise DataError(f"{name} is the class {value.__name__}; pass one that was made of it")
     missing = [member for member in needed if not hasattr(value, member)]
     if missing:
         raise DataError(f"{name} is a {type(value).__name__} and has no {', '.join(missing)}; {advice}")

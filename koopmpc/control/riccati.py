@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dpotrs
 
-from koopmpc.errors import DefinitenessError
+from koopmpc.errors import DataError, DefinitenessError
 
 DIGITS, LOST = 1e-9, 1e-6  # what a step may lose of P; by how much of its size P may be indefinite
 SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
@@ -118,6 +118,7 @@ def _semidefinite(P: Float[np.ndarray, "nx nx"]) -> bool:
     return bool(np.linalg.eigvalsh(P / np.outer(size, size)).min(initial=0.0) > -LOST)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def rooted(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"]) -> Law:
     """Return the law of `recursion` by orthogonal transformations of a root F of P = FᵀF, which is ⪰ 0 by construction.
 
@@ -128,6 +129,8 @@ def rooted(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[
     ------
     DefinitenessError
         R + BᵀPB is not positive definite at some stage.
+    DataError
+        The model grows so fast that its cost is no number.
 
     References
     ----------
@@ -142,6 +145,10 @@ def rooted(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[
         A, B, _, _, _, e, q, r = stages[k]
         rows = np.vstack([costs[id(stages[k])], np.hstack([F @ B, F @ A])])
         size = np.sqrt(np.einsum("ij,ij->j", rows, rows))
+        if not np.isfinite(size).all():
+            raise DataError(
+                f"the model grows beyond all numbers in {N - k} steps; fit it anew, or take a shorter horizon"
+            )
         size[size == 0] = 1.0
         T = np.asarray(np.linalg.qr(rows / size, mode="r"))
         if (np.abs(T.diagonal()[:nu]) <= nx * np.finfo(float).eps).any():

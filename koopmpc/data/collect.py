@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.dynamics import Plant, require_plant
+from koopmpc.plants.dynamics import Plant, reading, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value, freeze
 
@@ -107,12 +107,12 @@ def _drive(
     plant: Plant, e: int, x0: Float[np.ndarray, " nx"] | None, policy: Policy, rng: np.random.Generator, steps: int
 ) -> Episode:
     """Run one episode of a plant that holds its state, until the plant ends it."""
-    Y = np.empty((steps + 1, len(plant.outputs)))
-    U = np.empty((steps, len(plant.inputs)))
-    Y[0] = plant.reset(x0, rng)
+    ny = len(plant.outputs)
+    Y, U = np.empty((steps + 1, ny)), np.empty((steps, len(plant.inputs)))
+    Y[0] = reading(plant.reset(x0, rng), ny, 0)
     for k in range(steps):
         U[k] = policy(k, Y[k])
-        Y[k + 1] = plant.step(U[k])
+        Y[k + 1] = reading(plant.step(U[k]), ny, k + 1)
         _finite(Y[None, k + 1 : k + 2], e, k + 1)
         if getattr(plant, "ended", ""):
             return Episode(X=Y[: k + 2], U=U[: k + 1])

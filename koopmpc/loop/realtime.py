@@ -23,8 +23,8 @@ from koopmpc import checks
 from koopmpc.control.move import Controller, Fallback, Move, Status
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
-from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, reading, rows_ahead
-from koopmpc.plants.dynamics import Plant, require_plant
+from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, rows_ahead
+from koopmpc.plants.dynamics import Plant, reading, require_plant
 
 Late = Literal["skip", "hold"]
 _SPIN = 3e-4  # the last part of a wait keeps the processor busy, because a sleep ends up to 0.2 ms late [s]

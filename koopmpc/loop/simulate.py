@@ -17,7 +17,7 @@ from koopmpc.control.move import Controller, Fallback, Fallible, Move, Plan, Sta
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.run import Plans, Run, Step
-from koopmpc.plants.dynamics import Plant, require_plant
+from koopmpc.plants.dynamics import Plant, reading, require_plant
 from koopmpc.plants.step_map import SimulatedPlant, StepMap
 from koopmpc.predict.base import Predictor
 
@@ -285,22 +285,6 @@ def simulate(
         scene=getattr(plant, "scene", None),
         model=model,
     )
-
-
-def reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
-    """Return what a plant measured at step k as an array of its own."""
-    try:
-        y = None if value is None else np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        y = None
-    if y is None:
-        raise DataError(
-            f"the plant returned {type(value).__name__} at step {k}; reset and step return y, a number each"
-        )
-    if y.ndim != 1 or (ny is not None and len(y) != ny):
-        expected = "(ny,)" if ny is None else f"({ny},), as at reset"
-        raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
-    return y
 
 
 def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:

@@ -6,6 +6,7 @@ from typing import ClassVar, Protocol, cast, runtime_checkable
 
 import casadi as ca
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -107,6 +108,22 @@ def require_plant(plant: object) -> None:
     )
     needed = ("dt", "states", "inputs", "outputs", "state", "reset", "step")
     checks.members(plant, "the plant", needed, advice)
+
+
+def reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
+    """Return what a plant measured at step k as an array of its own."""
+    try:
+        y = None if value is None else np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        y = None
+    if y is None:
+        raise DataError(
+            f"the plant returned {type(value).__name__} at step {k}; reset and step return y, a number each"
+        )
+    if y.ndim != 1 or (ny is not None and len(y) != ny):
+        expected = "(ny,)" if ny is None else f"({ny},), as at reset"
+        raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
+    return y
 
 
 def drawn_by(dynamics: Dynamics) -> Scene | None:

@@ -93,6 +93,27 @@ def test_simulate_says_what_a_plant_returned(bad):
             loop(Returning(np.zeros(2), first=bad), move)
 
 
+@pytest.mark.parametrize("bad", [None, np.zeros(3), np.zeros((2, 2)), "x", [1.0]])
+def test_collect_says_what_a_plant_returned(bad):
+    start, noise = km.Uniform([-1, -1], [1, 1]), km.Noise(-1, 1)
+    with pytest.raises(km.errors.KoopmpcError, match=r"the plant returned .* at step 1"):
+        km.collect(Returning(bad), start, noise, episodes=1, steps=3)
+    with pytest.raises(km.errors.KoopmpcError, match=r"the plant returned .* at step 0"):
+        km.collect(Returning(np.zeros(2), first=bad), start, noise, episodes=1, steps=3)
+
+
+def test_a_class_is_no_controller_and_no_plant():
+    with pytest.raises(km.errors.DataError, match="the controller is the class LQR; pass one that was made of it"):
+        km.simulate(PLANT, km.LQR, x0=[0.1, 0], reference=[0, 0], steps=5)
+    with pytest.raises(km.errors.DataError, match="the plant is the class Returning; pass one"):
+        loop(Returning, move)
+
+
+def test_a_model_whose_cost_overflows_makes_no_controller(model):
+    with pytest.raises(km.errors.DataError, match=r"grows beyond all numbers in \d+ steps"):
+        km.KoopmanMPC(replace(model, A=np.full_like(model.A, 1e49)), km.Cost(Q=[1.0, 1.0], R=1.0), km.Limits(-1, 1), 20)
+
+
 def test_what_cannot_be_used_is_named(model, tmp_path: Path):
     huge = model.A.copy()
     huge[0, 0] = 1e308

@@ -89,8 +89,9 @@ def file_recording(path: str | Path, application: str, layout: Any) -> Generator
         The path cannot be written.
     """
     file = LogFile(path)
-    rec = _new_recording(application)
+    rec: Any = None
     try:
+        rec = _new_recording(application)
         file.attach(rec)
         _send_blueprint(rec, application, layout)
         yield rec
@@ -98,7 +99,8 @@ def file_recording(path: str | Path, application: str, layout: Any) -> Generator
         rec.disconnect()
         file.close()
     except BaseException:
-        rec.disconnect()
+        if rec is not None:
+            rec.disconnect()
         file.discard()
         raise
 
@@ -136,7 +138,6 @@ class Writer:
         self._about, self._scene, self._model = about, scene, model
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._viewer, self._steps = viewer, steps
-        self._rec: Any = _new_recording(application_of(about))
         self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
@@ -150,6 +151,12 @@ class Writer:
         self._names, self._reference = Names(), ReferenceScenes(about)
         self._plans: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # plans that look beyond what is written
         self._file = None if path is None else LogFile(path, growing=growing)
+        self._rec: Any = None
+        try:
+            self._rec = _new_recording(application_of(about))
+        except BaseException:  # a Ctrl-C
+            self.discard()
+            raise
 
     def write(self, rows: LogBlock) -> None:
         """Write the rows that follow, block by block."""

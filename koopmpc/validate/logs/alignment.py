@@ -111,7 +111,7 @@ def late(log: Log) -> Iterator[LogFault]:
             return
         scores = {shift: won(log, E, rows(log, (*found, *shift)).residuals(log)) for shift in _shifts(log, found)}
         best = max(scores, key=_weighed(scores, nx))
-        rival = max(score for shift, score in scores.items() if shift[0].column != best[0].column)
+        rival = max((score for shift, score in scores.items() if shift[0].column != best[0].column), default=0.0)
         if best[0].column < nx and rival > _CLEAR * scores[best]:
             return
         other = rows(log, (*found, *best)).residuals(log)
