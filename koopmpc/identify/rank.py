@@ -58,7 +58,8 @@ def kept(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple
         if rank != "hard-threshold":
             raise DataError(f'rank is {rank!r}; pass a whole number, a share of energy in (0, 1), or "hard-threshold"')
         short, long = sorted((samples, nz))
-        every = np.pad(s, (0, max(short - len(s), 0)))[:short]
+        every = np.zeros(short)
+        every[: len(s)] = s[:short]
         threshold = optimal_factor(short / long) * float(np.median(every))
         r = int(np.sum(s > threshold))
         if r == 0:

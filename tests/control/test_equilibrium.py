@@ -167,3 +167,14 @@ def test_the_rows_of_a_reference_that_moves_are_followed_and_ipopt_is_asked_once
         np.testing.assert_allclose(target.equilibrium.x, alone.equilibrium.x, atol=1e-4)
     targets(np.array([0.1, 0.1]))  # far from the last row
     assert len(asked) == 2
+
+
+@pytest.mark.parametrize(("share", "goes_on"), [(0.8, True), (1.3, False)])
+def test_one_step_goes_on_as_far_as_its_error_is_small_and_no_further(share: float, goes_on: bool) -> None:
+    begin = SWING.find(np.array([0.2, 0.0]))
+    s = np.concatenate([begin.x, begin.u]) / SWING.size
+    reach = CLOSE * (1 + np.abs(s).max())
+    a_little = SWING.find(np.array([0.201, 0.0]))
+    per_radian = np.abs(np.concatenate([a_little.x, a_little.u]) / SWING.size - s).max() / 0.001
+    row = np.array([0.2 + share * reach / per_radian, 0.0])
+    assert (SWING.follow(begin, row, np.zeros(2)) is not None) == goes_on

@@ -108,3 +108,9 @@ def test_metrics_count_from_the_limits_themselves():
 def test_margins_that_make_no_sense_are_refused(make, sentence):
     with pytest.raises(km.KoopmpcError, match=sentence):
         make()
+
+
+@pytest.mark.parametrize("margin", [[[0.1, -0.1]], [[0.1, 0.1], [-0.1, 0.1]], np.zeros((0, 2))])
+def test_a_margin_that_widens_a_limit_is_refused(margin):
+    with pytest.raises(km.errors.DataError, match="pass rows of numbers of 0 or above, one a step"):
+        km.Limits(x_min=[-1.0, -1.0], x_max=[1.0, 1.0], margin=margin)

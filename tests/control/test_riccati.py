@@ -6,6 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.control import riccati
 from koopmpc.control.riccati import Stage, _growth, iterate, leap, one_step, recursion, stationary
 from tests.control.models import random_pair
 
@@ -266,3 +267,17 @@ def test_units_do_not_change_how_many_digits_a_step_is_said_to_lose(powers):
     T = np.diag(2.0 ** np.array(powers))
     for A in (np.triu(np.ones((3, 3))), np.ones((3, 3))):
         assert _growth(T @ A @ np.linalg.inv(T)) < 4 * _growth(A)
+
+
+@pytest.mark.parametrize("what", ["all", "one state is not seen", "nothing is weighed"])
+def test_the_iteration_ends_once_its_gain_rests(monkeypatch, what):
+    taken, one = [], riccati.step
+    monkeypatch.setattr(riccati, "step", lambda stage, P: taken.append(P) or one(stage, P))
+    A, B, Q = np.diag([0.9, 0.5]), np.array([[1.0], [1.0]]), np.eye(2)
+    if what == "one state is not seen":
+        B, Q = np.array([[1.0], [0.0]]), np.diag([1.0, 0.0])
+    stage = one_step(A, B, Q * (what != "nothing is weighed"), np.eye(1))
+    gain, _ = iterate(stage, stage.Q, 5000)
+    assert len(taken) < 200
+    assert len(taken) >= 2
+    np.testing.assert_allclose(one(stage, gain.P)[0], gain.K, atol=1e-9)

@@ -94,8 +94,9 @@ def test_unequal_time_is_named_and_resampled(tmp_path: Path) -> None:
     file = text(tmp_path / "log.csv", "\n".join(["t,x,u", *rows]))
     with pytest.raises(
         km.errors.DataError, match=r"steps differ from dt = .* by more than 2 %, the first at row 1, where it"
-    ):
+    ) as caught:
         km.load_episodes(file)
+    assert caught.value.dt == pytest.approx(np.median(np.diff(t)), rel=1e-3)  # what to resample to
     (episode,) = read = km.load_episodes(file, resample=0.05)
     grid = t[0] + 0.05 * np.arange(len(episode.X))
     assert read.dt == 0.05

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.rank import known_factor, optimal_factor
+from koopmpc.identify.rank import kept, known_factor, optimal_factor
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs, random_episodes
 
@@ -46,6 +46,16 @@ def test_the_hard_threshold_finds_the_rank_in_white_noise(seed: int, count: int,
     assert model.nz == 2 * count
     assert "the singular values above the hard threshold" in model.report.route
     assert np.allclose(np.abs(model.eigenvalues), 1, atol=0.05)
+
+
+@pytest.mark.parametrize("given_values", [2, 3, 5, 8])
+def test_the_hard_threshold_is_that_of_all_singular_values_whether_given_or_zero(given_values: int) -> None:
+    every = np.array([20.0, 9.0, 0.3, 0.2, 0.1])
+    s = np.pad(every, (0, 3))[:given_values]
+    median = np.median(np.where(np.arange(5) < given_values, every, 0.0))
+    count, words = kept("hard-threshold", s, samples=5, nz=40)
+    assert words.endswith(f"{optimal_factor(5 / 40) * median:.3g}")
+    assert count == 2
 
 
 def test_pure_noise_has_no_rank() -> None:
