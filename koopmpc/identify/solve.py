@@ -1,7 +1,8 @@
 """Least squares min ‖T − P K‖ on a few rows that stand for all snapshots."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from koopmpc.identify.ridge import cross_validated
 
 Ridge = float | Literal["gcv"]
 
+_STILL = 1e-7  # share of a column's norm below which its deviations from its mean may be rounding of Gram sums
 _CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
 _ILL_CONDITIONED = 1e10
 _LIGHT = 1e-3  # factor of the norm of columns on which a ridge counts a millionth
@@ -46,12 +48,15 @@ class RegressionRows:
         (nt,) the energy Σt² of the part of each target outside these rows, which no K can fit.
     samples
         The number M of snapshots.
+    constant
+        The column of P that is 1 in every snapshot; None where there is none.
     """
 
     P: Float[np.ndarray, "m n"]
     T: Float[np.ndarray, "m nt"]
     rest: Float[np.ndarray, " nt"]
     samples: int
+    constant: int | None = None
 
     def residual(self, columns: Int[np.ndarray, " c"], K: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " c"]:
         """Return the root-mean-square of T − P K for these columns of T."""
@@ -61,7 +66,33 @@ class RegressionRows:
 
     def leading(self, targets: int) -> "RegressionRows":
         """Return these rows with the first targets only."""
-        return RegressionRows(self.P, self.T[:, :targets], self.rest[:targets], self.samples)
+        return replace(self, T=self.T[:, :targets], rest=self.rest[:targets])
+
+    def part(self, columns: Int[np.ndarray, " c"]) -> "RegressionRows":
+        """Return these rows with some columns of P only."""
+        place = np.flatnonzero(columns == (-1 if self.constant is None else self.constant))
+        return replace(self, P=self.P[:, columns], constant=int(place[0]) if place.size else None)
+
+    def centred(self) -> "RegressionRows":
+        """Return the rows of the deviations from the mean: what the constant column explains is taken out of P and T.
+
+        Columns that do not move become zero. Without a constant column the rows stay as they are.
+        """
+        if self.constant is None:
+            return self
+        one = self.P[:, self.constant] / np.linalg.norm(self.P[:, self.constant])
+        P, T = (full - np.outer(one, one @ full) for full in (self.P, self.T))
+        P[:, norms(P) <= _STILL * norms(self.P)] = 0.0
+        still = np.sum(T**2, axis=0) + self.rest <= _STILL**2 * (np.sum(self.T**2, axis=0) + self.rest)
+        T[:, still] = P[:, self.constant] = 0.0
+        return replace(self, P=P, T=T, rest=np.where(still, 0.0, self.rest), constant=None)
+
+    def means(self) -> Float[np.ndarray, " n"]:
+        """Return the mean of each column of P over the snapshots; zeros where no column is constant."""
+        if self.constant is None:
+            return np.zeros(self.P.shape[1])
+        one = self.P[:, self.constant]
+        return np.asarray(one @ self.P / (one @ one), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +121,11 @@ def cutoff(rows: RegressionRows) -> float:
 
 
 def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True, light: Sequence[int] = ()) -> Solution:
-    """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag of the columns' norms.
+    """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag(‖pⱼ − p̄ⱼ‖), p̄ⱼ the mean of column j, S = 0 for a constant.
 
-    With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
+    So neither the units of the data nor where their zero is change what a ridge does: the constant column takes up the
+    mean, as an intercept does, and the other coefficients are shrunk as those of deviations. Without a constant column
+    p̄ = 0. With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
     takes norm and cut on columns of unit norm, so that units of the data mean nothing. "gcv" chooses the ridge by
     generalised cross-validation. A ridge above 0 counts a millionth on the columns `light`.
     """
@@ -102,24 +135,48 @@ def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True, ligh
 def path(
     rows: RegressionRows, ridges: Sequence[Ridge], *, scaled: bool = True, light: Sequence[int] = ()
 ) -> list[Solution]:
-    """Return the solution for each ridge, from one decomposition."""
-    size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
-    size[size == 0] = 1.0
-    size[list(light)] *= _LIGHT
-    U, s, Vt = np.linalg.svd(rows.P / size, full_matrices=False)
-    cut = cutoff(rows)
-    held = s > cut * s.max(initial=0.0)
-    shares = U.T @ rows.T
+    """Return the solution for each ridge, from one decomposition, or from two where some are 0 and some are not."""
+    plain, shrunk = cache(partial(_Factors, rows, scaled)), cache(partial(_Factors, rows.centred(), scaled, light))
     found: list[Solution] = []
     for each in ridges:
-        ridge = each
-        if ridge == "gcv":
-            outside = np.sum((rows.T - U @ shares) ** 2, axis=0) + rows.rest
-            ridge = cross_validated(s, shares, outside, rows.samples, cut)
-        gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
-        K = (Vt.T * gain) @ shares / size[:, None]
-        found.append(Solution(K, int(held.sum()), ridge))
+        ridge = shrunk().cross_validated(free=rows.constant is not None) if each == "gcv" else each
+        factors = shrunk() if ridge > 0 else plain()
+        K, rank = factors.least_squares(ridge), factors.rank
+        if ridge > 0 and rows.constant is not None:
+            one, rank = rows.P[:, rows.constant], rank + 1
+            K[rows.constant] = one @ (rows.T - rows.P @ K) / (one @ one)  # the intercept, once the others are known
+        found.append(Solution(K, rank, ridge))
     return found
+
+
+class _Factors:
+    """P = U diag(s) Vᵀ diag(size) of these rows, and the shares Uᵀ T of the targets."""
+
+    def __init__(self, rows: RegressionRows, scaled: bool, light: Sequence[int] = ()) -> None:
+        self._rows, self._cut = rows, cutoff(rows)
+        size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
+        self._size = np.where(size > 0, size, 1.0)
+        self._size[list(light)] *= _LIGHT
+        self._U, self._s, self._Vt = np.linalg.svd(rows.P / self._size, full_matrices=False)
+        self._shares = self._U.T @ rows.T
+        self._held = self._s > self._cut * self._s.max(initial=0.0)
+
+    @property
+    def rank(self) -> int:
+        """Number of singular values above rounding."""
+        return int(self._held.sum())
+
+    def least_squares(self, ridge: float) -> Float[np.ndarray, "n nt"]:
+        """Return K of this ridge on unit-norm columns; of the truncated decomposition where it is 0."""
+        s, held = self._s, self._held
+        gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
+        return (self._Vt.T * gain) @ self._shares / self._size[:, None]
+
+    def cross_validated(self, *, free: bool) -> float:
+        """Return the ridge of generalised cross-validation; `free` counts the mean that was taken out."""
+        rows = self._rows
+        outside = np.sum((rows.T - self._U @ self._shares) ** 2, axis=0) + rows.rest
+        return cross_validated(self._s, self._shares, outside, rows.samples - free, self._cut)
 
 
 def scaled_rank(rows: RegressionRows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
@@ -150,13 +207,12 @@ def onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m c"]) -> 
 def rule(rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True, light: Sequence[int] = ()) -> str:
     """Return what a solve without a rank cut or added, in words."""
     columns = "unit-norm" if scaled else "unscaled"
+    columns += " columns" if rows.constant is None or ridge == 0 else " deviations"
     spared = ", a millionth of it on states, Constant and inputs" if light else ""
     how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
     if ridge > 0:
-        return f"ridge {ridge:.6g} on {columns} columns{spared}{how}"
-    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns} columns" + (
-        ", ridge 0" + how if how else ""
-    )
+        return f"ridge {ridge:.6g} on {columns}{spared}{how}"
+    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns}" + (", ridge 0" + how if how else "")
 
 
 def doubts(

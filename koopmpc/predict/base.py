@@ -96,7 +96,7 @@ class FitReport(Value):
     rank, columns
         Numerical rank of the regressors, and how many columns they have.
     ridge
-        The Tikhonov weight on unit-norm columns.
+        The Tikhonov weight, as in `edmd`.
     residual
         Root-mean-square one-step residual of each state, in the state's unit; the "gram" route resolves it to
         about 1e-8 of the state's size.

@@ -4,7 +4,7 @@ This is how `select` chooses a ridge; the ``ridge="gcv"`` of a single fit is in 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from time import perf_counter
 
@@ -14,10 +14,11 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
+from koopmpc.identify.fits.bilinear import about_means
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
 from koopmpc.identify.regression import Regression, regression_of
-from koopmpc.identify.solve import RegressionRows, path
+from koopmpc.identify.solve import path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.folds import only
@@ -29,7 +30,7 @@ _TINY = 1e-15  # of an error that is zero
 _ALIKE = 1.02  # a larger ridge with errors so little above is worth having
 _STARTS = 256  # forecasts a fold
 EXACT = 1e-6  # relative errors below are what rounding and the least ridge leave
-DELAYED = 0.5  # a model with delays must have less than this share of the error of the best without
+HALF = 0.5  # the share of the error below which a model with delays, or with fast growth, is worth its risk
 _LOST = 100.0  # a prediction that is so many spreads off is no prediction
 
 
@@ -75,7 +76,7 @@ class Tried(Value):
     candidate
         The candidate that was tried.
     ridges
-        Weights on unit-norm columns.
+        Tikhonov weights as in `edmd`.
     errors
         (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
         spread; infinite from where the forecasts of a fold run away.
@@ -84,7 +85,7 @@ class Tried(Value):
     A
         (ridges, nz, nz) matrices A, fitted to all folds.
     misfit
-        Mean over the states of (one-step residual / root-mean-square)², of all folds with the least ridge.
+        Mean over the states of (one-step residual / spread)², of all folds with the least ridge.
     seconds
         Time that the trial took.
     """
@@ -152,7 +153,7 @@ def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[f
     C = task.C
     assert C is not None, "an extended regression has its C"
     models: list[AnyPredictor] = []
-    for K in _solutions(candidate, task, ridges):
+    for K in _solutions(candidate, task, ridges, which):
         A, B = K[:nz].T, K[nz : nz + nu].T
         common = (C, candidate.lifting, like.dt, like.states, like.inputs)
         if candidate.bilinear:
@@ -170,18 +171,23 @@ def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[f
 def _misfit(candidate: Candidate, total: Moments) -> float:
     task = regression_of(total, "select")
     rows, where = task.rows, task.x_next
-    (K,) = _solutions(candidate, task, (LEAST,))
-    energy = (np.sum(rows.T[:, where] ** 2, axis=0) + rows.rest[where]) / rows.samples
+    (K,) = _solutions(candidate, task, (LEAST,), total.products)
+    energy = (np.sum(rows.centred().T[:, where] ** 2, axis=0) + rows.rest[where]) / rows.samples
     return float(np.mean(rows.residual(where, task.decoded(K)) ** 2 / np.where(energy > 0, energy, 1.0)))
 
 
-def _solutions(candidate: Candidate, task: Regression, ridges: Sequence[float]) -> list[Float[np.ndarray, "n nz"]]:
+def _solutions(
+    candidate: Candidate, task: Regression, ridges: Sequence[float], which: Int[np.ndarray, " np"]
+) -> list[Float[np.ndarray, "n nz"]]:
     """Return K of each ridge. The ridge of a bilinear model pulls it towards z⁺ = z, as in the final fit."""
     P, nz = task.rows.P, task.lifting.nz
-    start = np.eye(P.shape[1], nz) * candidate.bilinear
-    rows = RegressionRows(P, task.rows.T[:, :nz] - P @ start, task.rows.rest[:nz], task.rows.samples)
-    light = task.affine if candidate.towards == "affine" else ()
-    return [solution.K + start for solution in path(rows, ridges, light=light)]
+    if not candidate.bilinear:
+        light = task.affine if candidate.towards == "affine" else ()
+        return [solution.K for solution in path(task.rows.leading(nz), ridges, light=light)]
+    start = np.eye(P.shape[1], nz)
+    rows = replace(task.rows, T=task.rows.T[:, :nz] - P @ start, rest=task.rows.rest[:nz])
+    shifted, back = about_means(rows, len(task.inputs), which)
+    return [back @ solution.K + start for solution in path(shifted, ridges)]
 
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:

@@ -75,7 +75,7 @@ class Recipe(Value):
     candidate
         Lifting, embedding and kind of the model: a linear one gives a KoopmanMPC, a bilinear one a BilinearMPC.
     ridge
-        Weight on unit-norm columns.
+        Tikhonov weight as in `edmd`.
     estimator
         The estimator of the controller, or None.
     tail

@@ -51,7 +51,9 @@ def select(
     the winner is fitted to all data. An error is relative to the state's standard
     deviation, so neither units nor where zero is count; a forecast that runs away counts as infinite, and no such
     model is taken while there is another. The models are ranked by their worst fold, and of all within one standard
-    error of the best the smallest is taken (Breiman et al. 1984), one with delays only where that halves the error.
+    error of the best the smallest is taken (Breiman et al. 1984), one with delays only where that halves the error, and
+    a linear one that grows three times as much over the horizon as the smallest one, max(ρ(A), 1)ʰ, only where that
+    halves the error at the horizon's end.
 
     A source larger than memory is chosen on a sample of it, whole episodes from evenly spread parts; the winner is
     then fitted to all of it, part by part.
@@ -70,13 +72,12 @@ def select(
     folds
         At least 2.
     ridges
-        Weights to try, on unit-norm columns; those below 1e-9 are raised to it. Linear models without delays are
-        fitted with ``towards="affine"``, see `edmd`. By default 1e-9 to 1e-3 by decades,
-        for models with delays from ε² on, ε the share of the states' size that the best candidate misses in one
-        step: what the data hold of noise, or of what no candidate knows. Noise ε in the regressors adds
-        M ε² rms² = ε² ‖p‖² to the diagonal of PᵀP, which is a ridge ε² on columns of unit norm. With less, a state and
-        its past, which are almost functions of each other, get large weights of opposite signs, which cancel on the
-        training data alone.
+        Weights to try, as in `edmd`; those below 1e-9 are raised to it. Linear models without delays are fitted with
+        ``towards="affine"``, see `edmd`. By default 1e-9 to 1e-3 by decades, for models with delays from ε² on, ε the
+        share of the states' spread that the best candidate misses in one step: what the data hold of noise, or of what
+        no candidate knows. Noise ε in the regressors adds M ε² σ² = ε² ‖p − p̄‖² to the diagonal of PᵀP, which is a
+        ridge ε² on deviations of unit norm. With less, a state and its past, which are almost functions of each other,
+        get large weights of opposite signs, which cancel on the training data alone.
     delays
         Past steps to try in an embedding.
     bilinear

@@ -9,12 +9,13 @@ from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.synthesis.cross_validation import DELAYED, EXACT, Tried
+from koopmpc.synthesis.cross_validation import EXACT, HALF, Tried
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.validate.text import table, written
 from koopmpc.values import Value
 
 PLAIN = "linear: x, 1"  # z = [x, 1], the model that the others have to beat
+_FASTER = 3.0  # growth over the horizon, as a multiple of the smallest model's, above which a linear model is doubted
 _SHOWN = 15  # rows of the leaderboard that are printed
 
 
@@ -38,7 +39,7 @@ class LeaderboardRow(Value):
     delays
         Past steps that the model looks at.
     ridge
-        Weight on unit-norm columns.
+        Tikhonov weight as in `edmd`.
     first, middle, last
         Error 1, h/2 and h steps ahead, h the horizon; the median over the folds.
     median, worst
@@ -47,6 +48,8 @@ class LeaderboardRow(Value):
         Standard error of the mean over the folds.
     radius
         Spectral radius ρ(A).
+    growth
+        max(ρ(A), 1)ʰ, what the model's fastest mode grows by over the horizon.
     seconds
         Time of the trial, with all ridges and folds.
     lifting, embedding
@@ -66,6 +69,7 @@ class LeaderboardRow(Value):
     worst: float
     deviation: float
     radius: float
+    growth: float
     seconds: float
     lifting: Lifting
     embedding: Delay | None
@@ -164,8 +168,10 @@ def row_of(trial: Tried, floor: float) -> LeaderboardRow:
     candidate, scores, error = trial.candidate, trial.scores[best], trial.errors[best]
     horizon = error.shape[1]
     nz, nu = candidate.lifting.nz, trial.inputs
-    with np.errstate(invalid="ignore"):
+    radius = float(np.abs(eigen(trial.A[best])[0][0]))
+    with np.errstate(invalid="ignore", over="ignore"):
         middle = np.median(error, axis=0)
+        growth = float(np.float64(max(radius, 1.0)) ** horizon)
         deviation = scores.std(ddof=1) / np.sqrt(len(scores))
     return LeaderboardRow(
         name=candidate.name,
@@ -180,7 +186,8 @@ def row_of(trial: Tried, floor: float) -> LeaderboardRow:
         median=float(np.median(scores)),
         worst=float(scores.max()),
         deviation=float(deviation) if np.isfinite(deviation) else 0.0,
-        radius=float(np.abs(eigen(trial.A[best])[0][0])),
+        radius=radius,
+        growth=growth,
         seconds=trial.seconds,
         lifting=candidate.lifting,
         embedding=candidate.embedding,
@@ -193,12 +200,22 @@ def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None, alike: flo
     Errors below `alike` count as equal; by default these are errors of rounding and of the least ridge. Where every
     forecast ran away, it is the smallest model of all. Models with delays are taken only where they halve the error, as
     they do where some of the state is not measured: elsewhere the past tells a linear model which input the data
-    would have applied next, and a controller applies others.
+    would have applied next, and a controller applies others. Linear models that grow too fast are left out.
     """
-    places = [i for i, row in enumerate(rows) if kind is None or row.kind == kind]
+    places = [i for i, row in enumerate(rows) if (kind is None or row.kind == kind) and not _runaway(row, rows)]
     present = [i for i in places if not rows[i].delays]
-    if present and not min(rows[i].worst for i in places) < DELAYED * min(rows[i].worst for i in present):
+    if present and not min(rows[i].worst for i in places) < HALF * min(rows[i].worst for i in present):
         places = present
     best = min((rows[i] for i in places), key=lambda row: row.worst)
     near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, alike)]
     return min(near, key=lambda i: (rows[i].size, rows[i].worst))
+
+
+def _runaway(row: LeaderboardRow, rows: tuple[LeaderboardRow, ...]) -> bool:
+    """Return whether a linear model grows three times as much over the horizon as the smallest one, and for nothing.
+
+    Fast growth that the data bear out at least halves the error at the end of the horizon. Elsewhere it is that of
+    modes which the plant does not have. The data hardly excite them, but the moves of a controller do.
+    """
+    plain = min((other for other in rows if (other.kind, other.delays) == (row.kind, row.delays)), key=lambda r: r.size)
+    return row.kind == "linear" and row.growth > _FASTER * plain.growth and not row.last < HALF * plain.last

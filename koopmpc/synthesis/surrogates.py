@@ -14,7 +14,7 @@ from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import Asked
-from koopmpc.synthesis.cross_validation import DELAYED, Tried
+from koopmpc.synthesis.cross_validation import HALF, Tried
 from koopmpc.synthesis.recipes import Recipe
 from koopmpc.validate.scoring import AnyPredictor, score
 from koopmpc.validate.text import quantity
@@ -116,7 +116,7 @@ def stand_ins(results: Sequence[Tried], floor: float) -> list[Recipe]:
     bilinear = [i for i in ranked if results[i].candidate.bilinear] or ranked
     pool = [i for i in bilinear if not results[i].candidate.delays] or bilinear
     late = [i for i in bilinear if results[i].candidate.delays]
-    if late and error[late[0]] < DELAYED * error[pool[0]]:
+    if late and error[late[0]] < HALF * error[pool[0]]:
         pool = late
     first = pool[0]
     rest = [i for i in pool[1:] if error[i] <= SECOND * error[first]]

@@ -80,17 +80,50 @@ def test_C_is_a_least_squares_fit_where_the_lifting_lacks_a_state() -> None:
 
 
 @given(st.floats(1e-6, 10), st.integers(0, 99))
-def test_ridge_solves_the_normal_equations_on_unit_norm_columns(ridge: float, seed: int) -> None:
+def test_ridge_solves_the_normal_equations_of_deviations_from_the_mean(ridge: float, seed: int) -> None:
     data = random_episodes(seed, [50, 20], 2, 1)
     model = km.edmd(data, LIFTING, ridge=ridge)
     D = brute_force(data, model.lifting)
     P, T = D[:, : model.nz + 1], D[:, model.nz + 1 :]
-    size = np.linalg.norm(P, axis=0)
-    S = P / size
-    K = np.linalg.solve(S.T @ S + ridge * np.eye(S.shape[1]), S.T @ T) / size[:, None]
+    spread = np.linalg.norm(P - P.mean(axis=0), axis=0)  # 0 for the constant
+    K = np.linalg.solve(P.T @ P + ridge * np.diag(spread**2), P.T @ T)
     assert np.allclose(np.hstack([model.A, model.B]), K.T, rtol=0, atol=1e-9)
-    assert f"ridge {ridge:g} on unit-norm columns" in model.report.route
+    assert f"ridge {ridge:g} on unit-norm deviations" in model.report.route
     assert model.report.ridge == ridge
+    plain = km.edmd(data, km.State(), ridge=ridge)
+    P, T = np.delete(D[:, : model.nz + 1], [0, *range(3, model.nz)], axis=1), D[:, model.nz + 2 : model.nz + 4]
+    K = np.linalg.solve(P.T @ P + ridge * np.diag(np.sum(P**2, axis=0)), P.T @ T)
+    assert np.allclose(np.hstack([plain.A, plain.B]), K.T, rtol=0, atol=1e-9)
+
+
+@given(
+    st.sampled_from(["edmd", "bilinear", "stable", "constrained"]),
+    st.sampled_from([1e-6, 1e-2, "gcv"]),
+    st.integers(0, 99),
+)
+def test_where_the_data_have_their_zero_changes_no_ridge(kind: str, ridge: float | str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, shift, drive = np.array([50.0, -20.0]), np.array([50.0, -20.0]), np.array([7.0])
+    fits = {
+        "edmd": km.edmd,
+        "bilinear": km.bilinear_edmd,
+        "stable": km.stable_edmd,
+        "constrained": lambda *a, **k: km.constrained_edmd(*a, prior=km.Prior(rows={"1": {"1": 1.0}}), **k),
+    }
+
+    def fitted(at: np.ndarray, by: np.ndarray) -> np.ndarray:
+        moved = km.Episodes([km.Episode(X=e.X + at, U=e.U + by) for e in data], data.dt)
+        model = fits[kind](moved, km.State() + km.Constant(), ridge=ridge, route="qr")
+        points, inputs = x - shift + at + ahead, by + pushes
+        z = model.lift(points)
+        nonlinear = 0.0 if kind != "bilinear" else np.einsum("ku,uij,kj->ki", inputs, model.N, z)
+        return (z @ model.A.T + inputs @ model.B.T + nonlinear) @ model.C.T - at
+
+    data = one_step_pairs(lambda x, u: np.sin(2 * x) * 0.6 + 0.3 * u + 0.2 * u * x, 2, 1, 60, seed)
+    ahead, pushes = rng.uniform(-1, 1, (10, 2)), rng.uniform(-1, 1, (10, 1))
+    assert np.allclose(
+        fitted(shift, drive), fitted(0 * shift, 0 * drive), rtol=0, atol=1e-4 if ridge == "gcv" else 1e-8
+    )
 
 
 def test_units_of_the_states_mean_nothing() -> None:

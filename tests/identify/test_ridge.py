@@ -26,11 +26,13 @@ def noisy(seed: int, count: int, noise: float, nu: int = 1) -> km.Episodes:
 
 
 def score(P: np.ndarray, T: np.ndarray, ridge: float) -> float:
-    """Return GCV by its definition, with the (M, M) hat matrix."""
-    S = P / np.linalg.norm(P, axis=0)
-    H = S @ np.linalg.solve(S.T @ S + ridge * np.eye(S.shape[1]), S.T)
-    M = len(P)
-    error = np.sum((T - H @ T) ** 2, axis=0) / np.sum(T**2, axis=0)
+    """Return GCV by its definition, with the (M, M) hat matrix; a constant column is not shrunk."""
+    free = (P == 1).all(axis=0).any()
+    spread = np.linalg.norm(P - P.mean(axis=0) * free, axis=0)
+    H = P @ np.linalg.solve(P.T @ P + ridge * np.diag(spread**2), P.T)
+    M, moving = len(P), np.ptp(T, axis=0) > 0
+    energy = np.sum((T - T.mean(axis=0) * free)[:, moving] ** 2, axis=0)
+    error = np.sum((T - H @ T)[:, moving] ** 2, axis=0) / energy
     return M * float(error.sum()) / (M - np.trace(H)) ** 2
 
 
@@ -155,7 +157,7 @@ def test_towards_affine_counts_a_millionth_on_states_constant_and_inputs(ridge: 
     P, T = D[:, :n], D[:, n:]
     light = [name in ("1", *data.states) for name in model.lifting.names] + [True]
     assert sum(light) == 4
-    penalty = np.diag(np.sqrt(ridge) * np.linalg.norm(P, axis=0) * np.where(light, 1e-3, 1.0))
+    penalty = np.diag(np.sqrt(ridge) * np.linalg.norm(P - P.mean(axis=0), axis=0) * np.where(light, 1e-3, 1.0))
     K = np.linalg.lstsq(np.vstack([P, penalty]), np.vstack([T, np.zeros((n, T.shape[1]))]), rcond=None)[0]
     np.testing.assert_allclose(np.vstack([model.A.T, model.B.T]), K, atol=1e-9)
     assert "a millionth of it on states, Constant and inputs" in model.report.route

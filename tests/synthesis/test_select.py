@@ -206,6 +206,34 @@ def test_delays_are_taken_only_where_they_halve_the_error():
     assert min(row.worst for row in found.leaderboard if row.delays) > 0.5 * found.best.worst
 
 
+def test_where_the_data_have_their_zero_changes_no_choice():
+    data = noisy(episodes_of(quadratic), 0.02)
+    far = km.Episodes([km.Episode(X=e.X + 40.0, U=e.U - 7.0) for e in data], data.dt)
+    scaled = (
+        km.Standardized(km.Monomials(2), np.zeros(2), np.ones(2)),
+        km.Standardized(km.Monomials(2), np.full(2, 40.0), np.ones(2)),
+    )
+    base = km.State() + km.Constant()
+    here, there = (
+        km.select(one, candidates=[base, base + more], horizon=8) for one, more in zip((data, far), scaled, strict=True)
+    )
+    assert [row.title for row in here.leaderboard] == [row.title for row in there.leaderboard]
+    assert [row.ridge for row in here.leaderboard] == [row.ridge for row in there.leaderboard]
+    assert np.allclose([row.worst for row in here.leaderboard], [row.worst for row in there.leaderboard], rtol=1e-6)
+
+
+def test_a_linear_model_that_grows_for_nothing_is_not_chosen():
+    found = km.select(episodes_of(linear), candidates=[PLAIN, SQUARES], horizon=8, bilinear=False)
+    plain, wild = (
+        replace(found.leaderboard[0], worst=1.0, deviation=0.0, last=1.0, growth=2.0, size=2),
+        replace(found.leaderboard[0], worst=0.1, deviation=0.0, last=0.9, growth=7.0, size=50),
+    )
+    assert choice((wild, plain)) == 1
+    assert choice((replace(wild, growth=5.0), plain)) == 0  # less than three times
+    assert choice((replace(wild, last=0.4), plain)) == 0  # the data bear it out
+    assert choice((replace(wild, bilinear=True), plain)) == 0  # lifted anew at each step
+
+
 def test_the_smallest_model_within_one_standard_error_is_chosen():
     found = km.select(episodes_of(linear), candidates=[PLAIN, SQUARES], horizon=8, bilinear=False)
     rows = [

@@ -45,7 +45,8 @@ def bilinear_edmd(
     embedding
         ψ acts on the state and its past, as in `edmd`.
     ridge
-        Tikhonov weight on unit-norm columns of [ψ(x) u u⊗ψ(x)]. With 0, singular values below eps · max(M, n) of
+        Tikhonov weight on unit-norm columns of [ψ(x) u u⊗ψ(x)]; with a `Constant` on those of the deviations from
+        their means, [ψ − ψ̄, u − ū, (u − ū)⊗(ψ − ψ̄)]. With 0, singular values below eps · max(M, n) of
         the largest are cut. "gcv" chooses it by generalised cross-validation.
     rank
         As in `edmd`: z = U_rᵀ ψ(x) on unscaled columns, and u⊗z for the products.
@@ -112,12 +113,14 @@ def bilinear_edmd(
         which = np.arange(len(basis.T))
     r = len(basis.T)
     start = np.eye(P.shape[1], r) @ basis.T * difference  # K of the model z⁺ = z, or zero
-    change = RegressionRows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples)
-    solution = solve(change, ridge=ridge)
-    K = (solution.K + start) @ basis
+    one = given.constant if rank is None else None
+    change = RegressionRows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples, one)
+    shifted, back = about_means(change, nu, which)
+    solution = solve(shifted, ridge=ridge)
+    K = (back @ solution.K + start) @ basis
     N = np.zeros((nu, r, r))
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
-    regression = replace(regression, rows=RegressionRows(P, given.T, given.rest, given.samples))
+    regression = replace(regression, rows=replace(given, P=P, constant=one))
     solved = rule(regression.rows, ridge, solution.ridge)
     result = FitResult(
         A=K[:r].T,
@@ -158,12 +161,32 @@ def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
     return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
 
 
+def about_means(
+    rows: RegressionRows, nu: int, which: Int[np.ndarray, " np"]
+) -> tuple[RegressionRows, Float[np.ndarray, "n n"]]:
+    """Return the rows with products (u − ū)(ψ − ψ̄) in place of u ψ, and the matrix that turns their K into that of u ψ.
+
+    Both span the same models. A ridge on the products of deviations shrinks a model to the same one wherever the data
+    have their zero; u ψ is nearly ū ψ + ψ̄ u where the data lie far from it. Without a constant the rows stay as given.
+    """
+    back = np.eye(rows.P.shape[1])
+    if rows.constant is None:
+        return rows, back
+    mean, first = rows.means(), rows.P.shape[1] - nu * (len(which) + 1)
+    for i in range(nu):
+        products = first + nu + i * len(which) + np.arange(len(which))
+        back[which, products] = -mean[first + i]
+        back[first + i, products] = -mean[which]
+        back[rows.constant, products] = mean[first + i] * mean[which]
+    return replace(rows, P=rows.P @ back), back
+
+
 def _with_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
     """Return the rows with the products u⊗ψ(x) of the observables `which` alone."""
     first = total.nz + len(total.inputs)
     block = np.flatnonzero(np.isin(total.products, which))
     columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
-    return RegressionRows(rows.P[:, np.concatenate([np.arange(first), *columns])], rows.T, rows.rest, rows.samples)
+    return rows.part(np.concatenate([np.arange(first), *columns]))
 
 
 def _projected(

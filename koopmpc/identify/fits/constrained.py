@@ -1,5 +1,6 @@
 """EDMD under priors: known entries by plain linear algebra, bounds and couplings by a convex program."""
 
+from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -46,7 +47,8 @@ def constrained_edmd(
     prior
         The known entries, bounds and couplings of A and B, in the order of the lifting's observables and the inputs.
     ridge
-        Tikhonov weight on unit-norm columns of the free entries; "gcv" chooses it for the fit without the prior.
+        Tikhonov weight as in `edmd`, on the free entries; in a row whose constant is known the columns keep their
+        mean. "gcv" chooses it for the fit without the prior.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
@@ -97,7 +99,7 @@ def _doubts(
     """Return doubts about the columns that are free in at least one row of [A B]."""
     free, nz = np.isnan(entries.known).any(axis=0), len(names)
     which = np.flatnonzero(free)
-    part = RegressionRows(rows.P[:, which], rows.T, rows.rest, rows.samples)
+    part = rows.part(which)
     observables = [names[int(j)] for j in which if j < nz]
     forces = [inputs[int(j) - nz] for j in which if j >= nz]
     return doubts(part, observables, forces, regular=regular)[0] if which.size else []
@@ -114,7 +116,7 @@ def linear(rows: RegressionRows, entries: Entries, ridge: float) -> Float[np.nda
         free = np.isnan(known[targets[0]])
         if free.any():
             rest = rows.T[:, targets] - rows.P @ K[:, targets]
-            regression = RegressionRows(rows.P[:, free], rest, rows.rest[targets], rows.samples)
+            regression = replace(rows.part(np.flatnonzero(free)), T=rest, rest=rows.rest[targets])
             K[np.ix_(free, targets)] = solve(regression, ridge=ridge).K
     return K
 

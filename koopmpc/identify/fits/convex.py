@@ -54,7 +54,10 @@ def optimum(
             bounds.append(sign * x[held] <= sign * values[held])
     if prior is not None:
         bounds += _coupling(cp, prior, X, scale, size / np.sqrt(rows.samples))
-    problem = cp.Problem(cp.Minimize(misfit + ridge * cp.sum_squares(X)), bounds)
+    weight = np.ones((n, nz))  # where a target's intercept is free, the ridge weighs deviations from the mean
+    if rows.constant is not None:
+        weight[:, free[rows.constant]] = (norms(rows.centred().P) / size)[:, None]
+    problem = cp.Problem(cp.Minimize(misfit + ridge * cp.sum_squares(cp.multiply(weight, X))), bounds)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the report tells of an inaccurate solution
         try:

@@ -1,5 +1,6 @@
 """Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x), by least squares or by fits for noisy states."""
 
+from dataclasses import replace
 from typing import Literal, Unpack
 
 import numpy as np
@@ -65,7 +66,7 @@ def fit(
     rows, nz = regression.rows, regression.lifting.nz
     if regression.B is not None:  # a given B: subtract B u from the targets, and fit A alone
         known = rows.P[:, nz:] @ regression.B.T
-        rows = RegressionRows(rows.P[:, :nz], rows.T - known, rows.rest, rows.samples)
+        rows = replace(rows.part(np.arange(nz)), T=rows.T - known)
     free = regression.inputs if regression.B is None else ()
     sentences, condition = doubts(rows, regression.lifting.names, free, regular=ridge != 0 or rank is not None)
     if rank is not None:
@@ -274,8 +275,10 @@ def edmd(
     embedding
         Delays, e.g. ``Delay(2)``: ψ then acts on the state and its past. C still returns x alone.
     ridge
-        Tikhonov weight on unit-norm columns. With 0, singular values of the unit-norm columns below
-        eps · max(M, nz + nu) times the largest are cut; ``report.route`` gives the cut. "gcv" chooses the
+        Tikhonov weight on the coefficients of unit-norm columns. Where the lifting holds a `Constant`, it takes up the
+        means and is not shrunk: columns are then deviations from their mean, and where the data have their zero
+        changes nothing. With 0, singular values of the unit-norm columns below eps · max(M, nz + nu) times the largest
+        are cut; ``report.route`` gives the cut. "gcv" chooses the
         weight by generalised cross-validation, with each observable's error relative to its size; the report holds
         the chosen value.
     rank

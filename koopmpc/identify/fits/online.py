@@ -51,7 +51,7 @@ class OnlineEDMD:
     window
         Number of pairs that count; None for all.
     ridge
-        Tikhonov weight on unit-norm columns; "gcv" chooses it anew for each predictor.
+        Tikhonov weight as in `edmd`; "gcv" chooses it anew for each predictor.
     keep
         In (0, 1): the information along each direction is not forgotten below this share of its maximum so far, so that
         a plant at rest does not lose its model. Lower `keep` where later signals are more than 1/√keep times smaller

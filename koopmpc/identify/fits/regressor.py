@@ -37,7 +37,7 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
     lifting
         ψ, in place of degree and harmonics.
     alpha
-        Ridge weight on columns of unit norm; 0 cuts singular values below rounding.
+        Ridge weight as in `edmd`; 0 cuts singular values below rounding.
     n_inputs
         How many of the last columns of X are inputs.
     dt
@@ -140,6 +140,6 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
             lifting = lifting + Fourier(self.harmonics)
         return lifting
 
-    @staticmethod
-    def _solved(P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:
-        return solve(RegressionRows(P, T, np.zeros(T.shape[1]), len(P)), ridge=alpha).K.T
+    def _solved(self, P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:
+        rows = RegressionRows(P, T, np.zeros(T.shape[1]), len(P), self.lifting_.constant_index)
+        return solve(rows, ridge=alpha).K.T

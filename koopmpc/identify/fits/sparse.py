@@ -152,7 +152,7 @@ def sparse_edmd(
     used, missed = _closed(rows, kept, penalty, over == "entries", adaptive)
     stay = np.flatnonzero(kept)
     columns = np.concatenate([stay, np.arange(nz, len(used))])
-    few = RegressionRows(rows.P[:, columns], rows.T[:, stay], rows.rest[stay], rows.samples)
+    few = replace(rows.part(columns), T=rows.T[:, stay], rest=rows.rest[stay])
     picked = Picked(regression.lifting, tuple(map(int, stay))).bind(regression.lifting.bound_states)
     sentences = doubts(few, picked.names, regression.inputs, regular=False)[0]
     if missed > 1e-6:
@@ -193,7 +193,7 @@ def _closed(
             rated[targets] = False
         if not rated.any():
             return np.ones((P.shape[1], nz), dtype=bool), worst
-        regression = RegressionRows(P, T[:, targets], rest[targets], rows.samples)
+        regression = RegressionRows(P, T[:, targets], rest[targets], rows.samples, rows.constant)
         plain = np.abs(solve(regression, ridge="gcv").K[rated])
         if not entries:
             plain = np.sqrt(np.sum(plain**2, axis=1, keepdims=True)) * np.ones_like(plain)

@@ -1,5 +1,6 @@
 """EDMD whose A has no eigenvalue outside a circle about zero."""
 
+from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -54,7 +55,7 @@ def stable_edmd(
     radius
         ρ > 0; below 1 it asks for a rate of decay.
     ridge
-        Tikhonov weight on unit-norm columns; "gcv" chooses it for the plain fit.
+        Tikhonov weight as in `edmd`; "gcv" chooses it for the plain fit.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
@@ -123,13 +124,13 @@ def _stabilised(
 ) -> Float[np.ndarray, "n nz"]:
     """Return K with a stable block of the `moving` observables; the coefficients of all other columns are refitted."""
     n = len(K)
-    size = norms(rows.P)
+    size, spread = norms(rows.P), norms(rows.centred().P)
     size[size == 0] = 1.0
     others = np.setdiff1d(np.arange(n), moving)
     scale = size[moving] / size[moving, None]  # A in units of the observables' sizes
 
     def misfit(K: Float[np.ndarray, "n nz"], ridge: float) -> Misfit:
-        P = np.vstack([rows.P / size, np.sqrt(ridge) * np.eye(n)])
+        P = np.vstack([rows.P / size, np.sqrt(ridge) * np.diag(spread / size)])
         free = P[:, moving] - onto(P[:, others], P[:, moving])
         return Misfit(K[np.ix_(moving, moving)].T * scale, free.T @ free)
 
@@ -164,6 +165,6 @@ def _refitted(
     fitted[np.ix_(moving, moving)] = inside(A, rho).T
     if len(others):
         known = rows.P[:, moving] @ fitted[np.ix_(moving, moving)]
-        rest = RegressionRows(rows.P[:, others], rows.T[:, moving] - known, rows.rest[moving], rows.samples)
+        rest = replace(rows.part(others), T=rows.T[:, moving] - known, rest=rows.rest[moving])
         fitted[np.ix_(others, moving)] = solve(rest, ridge=ridge).K
     return fitted

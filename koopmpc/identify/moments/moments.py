@@ -217,9 +217,10 @@ class Moments(Value):
         Weights are taken with mean 1, so that a root of the mean over M rows is one over the weighted rows.
         """
         n, scale = len(regressors), self.samples / self.weight
+        one = self._constant(regressors)
         if self.route == "qr":
             R = _triangle(np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])])
-            return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples)
+            return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples, one)
         G = scale * self.sums
         size = np.sqrt(G.diagonal()[regressors])
         size[size == 0] = 1.0
@@ -231,7 +232,7 @@ class Moments(Value):
         inverse = np.where(held, 1.0, 0.0) / np.where(held, root, 1.0)
         T = inverse[:, None] * (vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None]))
         rest = np.maximum(G.diagonal()[targets] - np.sum(T**2, axis=0), 0.0)
-        return RegressionRows(P, T, rest, self.samples)
+        return RegressionRows(P, T, rest, self.samples, one)
 
     def complete(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> RegressionRows:
         """Return rows [P T] as `rows` does, with all of T inside: TᵀT is that of all M rows, too.
@@ -240,7 +241,8 @@ class Moments(Value):
         """
         n = len(regressors)
         every = self.rows(np.concatenate([regressors, targets]), targets[:0]).P
-        return RegressionRows(every[:, :n], every[:, n:], np.zeros(len(targets)), self.samples)
+        one = self._constant(regressors)
+        return RegressionRows(every[:, :n], every[:, n:], np.zeros(len(targets)), self.samples, one)
 
     def decoder(self, where: Int[np.ndarray, " nx"]) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
         """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked.
@@ -257,6 +259,10 @@ class Moments(Value):
             C[~held] = K.T
             residual[~held] = rows.residual(np.arange(len(rows.rest)), K)
         return C, residual
+
+    def _constant(self, regressors: Int[np.ndarray, " n"]) -> int | None:
+        place = np.flatnonzero(regressors == self.lifting.constant_index)
+        return int(place[0]) if self.lifting.constant_index is not None and place.size else None
 
     def _gram(self) -> Float[np.ndarray, "nd nd"]:
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
