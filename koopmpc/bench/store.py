@@ -11,6 +11,7 @@ import platform
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
+from io import FileIO
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,10 +21,11 @@ from koopmpc.errors import LogError, ProblemError
 
 MANIFEST, ROWS = "sweep.json", "rows"
 FORMAT = "koopmpc-sweep-1"
+_LINE = json.JSONEncoder()
 
 
 class Journal:
-    """The lines of one batch of runs: `begin` says that a run begins, `end` what came out of it."""
+    """The lines of one batch of runs: that a run begins, and what came out of it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -42,21 +44,27 @@ class Journal:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._file.close()
 
-    def begin(self, row: RunRow) -> int:
-        """Write that this run begins, and return how often it has begun in this batch before."""
-        self._write(json.dumps({"begins": row.name}).encode() + b"\n")
-        return self._begun.count(row.name)
+    def turn(self, done: RunRow | None, following: RunRow | None) -> int:
+        """Write what came out of a run, and that the next begins; return how often that has begun in this batch before.
 
-    def end(self, row: RunRow) -> None:
-        """Write what came out of a run."""
-        self._write(json.dumps(record_of(row)).encode() + b"\n")
+        Both are one system call.
+        """
+        told = [] if done is None else [record_of(done)]
+        told += [] if following is None else [{"begins": following.name}]
+        self._write("".join(f"{_LINE.encode(each)}\n" for each in told).encode())
+        return 0 if following is None or not self._begun else self._begun.count(following.name)
 
     def _write(self, line: bytes) -> None:
         try:
-            if self._file.write(line) != len(line):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            _whole(self._file, line)
         except OSError as error:
             raise disk.refused(self.path, error) from error
+
+
+def _whole(file: FileIO, data: bytes) -> None:
+    """Write all of the data by one system call; raise where the disk takes a part of it."""
+    if file.write(data) != len(data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
@@ -118,7 +126,7 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
     asked = json.loads(json.dumps(asked))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+b")
+        file = path.open("a+b", buffering=0)
     except OSError as error:
         raise disk.refused(path, error) from error
     with file:
@@ -135,8 +143,11 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
         if not known:
             known = {"format": FORMAT, "asked": asked, "machine": machine()}
             file.truncate(0)
-            file.write(json.dumps(known, indent=1).encode())
-            file.flush()
+            try:
+                _whole(file, json.dumps(known, indent=1).encode())
+            except OSError as error:
+                file.truncate(0)
+                raise disk.refused(path, error) from error
         yield known
 
 

@@ -30,6 +30,7 @@ from koopmpc.recording.viewer import find_viewer, why_none
 MODELS = "models"  # beside the logs: what was learned
 _BATCHES, _LARGEST = 40, 50  # batches for each worker, and runs in a batch, at most
 _EACH = 100  # up to so many runs each is a batch of its own
+_FIRST = 5.0  # time until results.parquet is written for the first time [s]
 _SHARE = 100.0  # results.parquet is written again after so many times the time that it takes
 _DEATHS = 3  # workers that a run may take with it
 
@@ -165,7 +166,7 @@ def sweep(
         where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
         told = _Told(progress, len(done), len(rows))
         told.say(left[0].name if left else "done", 0)
-        due = time.monotonic()
+        due = time.monotonic() + _FIRST
         try:
             wanted = [row for row in left if row.controller in LEARNED or row.noise]
             models = {
@@ -297,11 +298,10 @@ def _do(batch: _Batch) -> list[RunRow]:
     grid = batch.grid
     finished: list[RunRow] = []
     with Journal(grid.folder / ROWS / f"{batch.number:06d}.jsonl") as journal:
-        for row in batch.rows:
-            if row.key in journal.rows:
-                finished.append(journal.rows[row.key])
-                continue
-            died = journal.begin(row)
+        finished += [journal.rows[row.key] for row in batch.rows if row.key in journal.rows]
+        left, done = [row for row in batch.rows if row.key not in journal.rows], None
+        for row in left:
+            died = journal.turn(done, row)
             if died + 1 >= _DEATHS:
                 done = replace(row, failure=f"its worker process died {died} times")
             else:
@@ -310,8 +310,8 @@ def _do(batch: _Batch) -> list[RunRow]:
                 logged = row.start < grid.log_starts
                 how = {"live": grid.live, "paced": grid.paced, "compiled": grid.compiled}
                 done = row_of_run(parts, row, grid.folder, logged=logged, **how)
-            journal.end(done)
             finished.append(done)
+        journal.turn(done, None)
     return finished
 
 

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import koopmpc as km
+from koopmpc.bench.library import shipped
 from koopmpc.cli.app import app
 from koopmpc.recording import viewer
 from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer
@@ -142,3 +143,16 @@ def test_a_display_is_known_by_the_platform_and_its_variables(
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert has_display() is expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [path.stem for path in shipped()])
+def test_the_log_of_every_problem_is_drawn_without_an_error_in_any_view(tmp_path: Path, name: str) -> None:
+    problem = km.load_problem(name)
+    case = next(iter(problem.cases))
+    (row,) = km.sweep(
+        [problem.select(case)], [problem.controllers[0] if problem.controllers else "lqr"], folder=tmp_path
+    )
+    views = drawn(row.log, tmp_path / "run.png", at=0.5 * problem.cases[case].steps * problem.dt)
+    assert len(views) > 3
+    assert [v for v in views if v.reports] == []
