@@ -246,31 +246,32 @@ def reproduce_all(folder: Path, quick: bool, tell: Tell, workers: int = 2) -> li
     page.text(
         "# Papers, done again",
         """Each page is written by `koopmpc reproduce NAME`, all of them by `koopmpc reproduce --all`: claims in our
-        words, the paper's figure with its spread, ours, and a verdict. *Required* are numbers that a correct library
-        must reproduce; the command exits with 1 where one is missed.""",
+        words, the paper's figure with its spread, ours, and a verdict. The command exits with 1 where a number is
+        missed that a correct library must reproduce.""",
     )
     page.table(
         SUMMARY,
-        [(f"[{find_paper(each.paper).title}]({each.paper}.md)", *counts(each.outcome)) for each in found],
+        [(f"[{find_paper(each.paper).title}]({each.paper}.md)", *counts(each.outcome.claims)) for each in found],
     )
     page.write("index.md")
     return found
 
 
-SUMMARY = ("paper", "claims", "hold", "in part", "do not hold", "required", "missed")
+SUMMARY = ("paper", "claims", "hold", "in part", "do not hold")
 
 
-def counts(outcome: Reproduction) -> tuple[int, ...]:
+def counts(claims: Sequence[Claim]) -> tuple[int, ...]:
     """Return the entries of a line below `SUMMARY` after the first."""
-    each = [sum(claim.verdict is verdict for claim in outcome.claims) for verdict in Verdict]
-    return len(outcome.claims), *each, sum(claim.required for claim in outcome.claims), len(outcome.failed)
+    return len(claims), *(sum(claim.verdict is verdict for claim in claims) for verdict in Verdict)
 
 
 def summary_table(found: Sequence[TimedReproduction]) -> Table:
     """Return a table with one line for each paper, and its time."""
     lines = plain_table("Papers", padding=(0, 1, 0, 0))
-    for heading in (*SUMMARY, "time [s]"):
+    for heading in (*SUMMARY, "required", "missed", "time [s]"):
         lines.add_column(heading)
     for each in found:
-        lines.add_row(each.paper, *map(str, counts(each.outcome)), f"{each.seconds:.0f}")
+        claims, failed = each.outcome.claims, each.outcome.failed
+        required = sum(claim.required for claim in claims)
+        lines.add_row(each.paper, *map(str, (*counts(claims), required, len(failed))), f"{each.seconds:.0f}")
     return lines

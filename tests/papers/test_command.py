@@ -104,8 +104,9 @@ def test_all_papers_go_to_one_folder_with_a_table_of_them(tmp_path, monkeypatch)
     text = (tmp_path / "index.md").read_text(encoding="utf-8")
     for each in found:
         claims = len(each.outcome.claims)
-        assert f"({each.paper}.md) | {claims} | {claims} | 0 | 0 | {claims} | 0 |" in text
+        assert f"({each.paper}.md) | {claims} | {claims} | 0 | 0 |" in text
         assert (tmp_path / f"{each.paper}.rrd").is_file()
+    assert registry.summary_table(found).row_count == 2
     result = CliRunner().invoke(app, ["reproduce"])
     assert result.exit_code == 2
     assert "name one paper, or pass --all" in result.output

@@ -66,3 +66,13 @@ def test_the_local_mpc_of_the_motor_costs_what_the_paper_says():
     run = motor.loop(plant, local, [0.0, 0.6], motor.STEP)
     assert run.solved == motor.STEPS
     assert abs(run.cost - 3.318) < 0.005
+
+
+def test_the_table_of_all_papers_counts_the_claims_of_each_page():
+    text = (PAGES / "index.md").read_text(encoding="utf-8")
+    for name in PAPERS:
+        page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+        ((total, held, part, failed),) = re.findall(
+            r"Of (\d+) claims (\d+) hold, (\d+) hold in part, (\d+) do not hold", page
+        )
+        assert f"({name}.md) | {total} | {held} | {part} | {failed} |" in text

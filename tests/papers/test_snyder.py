@@ -12,6 +12,7 @@ from koopmpc.papers.contest import ORACLE, Prediction
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict, verdicts
 from koopmpc.papers.snyder import report, theory
+from koopmpc.papers.snyder.caution import by_horizon
 from koopmpc.papers.snyder.claims import of_figures, of_text
 from koopmpc.papers.snyder.paper import held_change, rebuilt
 from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains
@@ -131,6 +132,17 @@ def test_the_origin_and_truncation_explain_the_cart_pole(settings):
     assert causes["DMD with a constant"].error < 1e-4 * 4
     assert causes["DMD"].error > 1000 * causes["DMD on x − x_ref"].error
     assert causes["EDMD monomials 2"].error < 1e-6 * causes["EDMD monomials 2, rank 4"].error
+
+
+def test_over_the_whole_run_the_caution_has_the_errors_of_the_figures(settings, fits):
+    for method in ("DMD", "EDMD monomials 3", "EDMD Fourier 1"):
+        fit = fits["cart-pole"][method, True]
+        ((first, _), (own, new)) = by_horizon(settings["cart-pole"], fit, (0.1, 10.0))
+        assert own == pytest.approx(fit.error, rel=1e-12)
+        assert new == pytest.approx(fit.held_out, rel=1e-12)
+        assert first < 0.1 * own
+    text = PAGE.read_text(encoding="utf-8").split("## A caution")[1].split("\n## ")[0]
+    assert text.count("\n| ") == 2 + 20
 
 
 def test_a_held_input_changes_little(settings, fits):

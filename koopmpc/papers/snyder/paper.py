@@ -32,7 +32,9 @@ def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
     progress("figures")
     said = of_text(fits, causes["DMD on x − x_ref"].error, predicted, control.ratios(runs))
     shown = of_figures(fits)
-    report.opening(page, [*said, *shown], change, others)
+    aside = Page(page.folder, page.beside)  # its claim counts in the opening, and its part comes later
+    warned = caution.caution(aside, settings, fits)
+    report.opening(page, [*said, *shown, *warned], change, others)
     page.text("## What the paper says in words")
     verdicts(page, said)
     report.numbers(page, settings, fits, shown)
@@ -42,7 +44,7 @@ def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
     report.feedbacks(page)
     theory.frequencies(page, fits)
     theory.formulas(page, settings["pendulum"], fits)
-    warned = caution.caution(page, settings, fits)
+    page.parts += aside.parts
     theory.failure(page, settings["cart-pole-lqr"], causes)
     control.inputs(page, predicted, exciting)
     control.loops(page, tasks, runs, length["episodes"])
