@@ -89,10 +89,11 @@ class RegressionRows:
 
     def means(self) -> Float[np.ndarray, " n"]:
         """Return the mean of each column of P over the snapshots; zeros where no column is constant."""
-        if self.constant is None:
-            return np.zeros(self.P.shape[1])
-        one = self.P[:, self.constant]
-        return np.asarray(one @ self.P / (one @ one), dtype=np.float64)
+        mean = np.zeros(self.P.shape[1])
+        if self.constant is not None:
+            one = self.P[:, self.constant]
+            mean[:] = one @ self.P / (one @ one)
+        return mean
 
 
 @dataclass(frozen=True, eq=False)
