@@ -102,7 +102,7 @@ class _Targets:
         self._known: set[bytes] = set()
         self._table = np.zeros((0, 1))
 
-    def of(self, reference: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "rows size"]:
+    def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "rows size"]:
         """Return the table with the rows of this reference in it."""
         with self._lock:
             rows = np.atleast_2d(reference)
@@ -175,7 +175,7 @@ class Compiled:
         )
         self._aim(np.zeros((0, self._nr)))
 
-    def _aim(self, rows: Float[np.ndarray, "rows nr"]) -> None:
+    def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
         """Have the C know the targets of these rows; only a BilinearMPC needs that."""
         if self._targets is not None:
             self._aimed = rows.tobytes()

@@ -186,7 +186,7 @@ def _add_finish(
     }
 
 
-def target_rows(controller: BilinearMPC, rows: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "rows size"]:
+def target_rows(controller: BilinearMPC, rows: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "found size"]:
     """Return the table of targets of these reference rows, each one once; see `koopmpc_stages.h` for its columns."""
     found: list[Float[np.ndarray, " size"]] = []
     for row in dict.fromkeys(map(bytes, np.ascontiguousarray(rows))):
