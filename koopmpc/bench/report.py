@@ -278,9 +278,13 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
     """Return the paragraphs before the tables."""
     asked, machine = about["asked"], about["machine"]
     failed = [row for row in rows if row.failure is not None]
+
+    def shares(name: str) -> str:
+        return ", ".join(f"{100 * share:g} %" for share in asked[name])
+
     lines = [
-        f"{len(rows)} runs: {asked['starts']} starts, {asked['seeds']} sets of training data, noise"
-        f" {asked['noise']}, parameters wrong by {asked['wrong']}{', with faults' if asked['faults'] else ''}."
+        f"{len(rows)} runs: starts {asked['starts']}, sets of training data {asked['seeds']}, noise {shares('noise')},"
+        f" parameters wrong by {shares('wrong')}{', with faults' if asked['faults'] else ''}."
         " Costs are medians with 95 % intervals by bootstrap over starts and seeds; ratio is to nonlinear-mpc from the"
         " same start; over is the median violation, the largest in brackets; p50 and p99 are times of a step with hot"
         " caches, cold its median after 4 ms of sleep.",
