@@ -94,7 +94,7 @@ def kernel_edmd(
             "a stream is read once, and kernel_edmd needs it for its landmarks first; save it, and pass that"
         )
     frame = Standardized.of(source, PolynomialKernel(np.ones((1, source.nx)), 1))
-    centers = (_drawn(source, landmarks, np.random.default_rng(rng)) - frame.mean) / frame.scale
+    centers = (_drawn(source, landmarks, checks.generator(rng)) - frame.mean) / frame.scale
     if kernel == "polynomial":
         inner: Lifting = PolynomialKernel(centers, degree)
     else:
