@@ -3,6 +3,7 @@
 from collections import deque
 
 import numpy as np
+from jaxtyping import Float
 from scipy.linalg import solve_triangular
 
 from koopmpc.identify.moments.moments import Table, Triangle, absorb, empty
@@ -126,7 +127,7 @@ class Window:
             self._back, self._R = [], empty(self._nd)
 
 
-def _forecaster(R: Triangle, n: int) -> Table | None:
+def _forecaster(R: Triangle, n: int) -> Float[np.ndarray, "n nt"] | None:
     """Return K of R K = T, with which t is forecast as Kᵀr; None where the rows do not say what it is."""
     diagonal = np.abs(R.diagonal()[:n])
     if diagonal.min(initial=np.inf) <= 1e-12 * diagonal.max(initial=0.0):
@@ -161,7 +162,7 @@ class Gate:
     def __init__(self, nd: int, n: int, nz: int) -> None:
         self._n, self._rows, self._seen = n, 0, 0  # _seen: innovations
         self.begun, self._measured = False, (np.arange(nd) < nz) | (np.arange(nd) >= n)
-        self._K: Table | None = None
+        self._K: Float[np.ndarray, "n nt"] | None = None
         self._spread, self._size = np.zeros(nd - n), np.zeros(nd)  # mean squares
         self.fell, self._low = False, np.zeros(nd)  # _low: rows in sequence below FALLEN
 
@@ -175,7 +176,7 @@ class Gate:
         self._K, self._spread, self._size = _forecaster(R, self._n), spread, size
 
     @property
-    def K(self) -> Table | None:
+    def K(self) -> Float[np.ndarray, "n nt"] | None:
         """The forecast t = Kᵀr that innovations are taken from; None as long as there is none."""
         return self._K
 
@@ -246,7 +247,7 @@ class Rival:
         """The mean square of innovations of each column."""
         return self._errors[1]
 
-    def push(self, rows: Table, K: Table | None) -> bool:
+    def push(self, rows: Table, K: Float[np.ndarray, "n nt"] | None) -> bool:
         """Take in rows that the first factor forecasts by K; return whether the rival takes its place from now on."""
         n, own = self._n, _forecaster(self.memory.R, self._n)
         if 2 * (self.rows % self._period) >= self._period and K is not None and own is not None:
