@@ -129,7 +129,7 @@ def _costs(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]
         late = np.flatnonzero(off > 1e-3)
         arrived = DT * (late[-1] + 1) if len(late) and late[-1] + 1 < len(off) else np.nan
         if name == "pendulum" and target != -1:
-            arrivals.append(arrived)
+            arrivals.append(float(arrived))
         if name == "pendulum" and B == "[0; 1]":
             curves[f"H_r = {target:g}"] = H(run.X)[:4001]
         sampled = _sampled(law, plant, H, start, target, 2.0 if quick else seconds)
