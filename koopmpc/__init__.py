@@ -63,18 +63,18 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
     from koopmpc.identify import moments as moments
+    from koopmpc.identify.constrained.constrained import constrained_edmd as constrained_edmd
+    from koopmpc.identify.constrained.prior import Prior as Prior
+    from koopmpc.identify.constrained.stable import stable_edmd as stable_edmd
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
-    from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
     from koopmpc.identify.fits.dmd import dmd as dmd
     from koopmpc.identify.fits.dmd import dmdc as dmdc
     from koopmpc.identify.fits.edmd import edmd as edmd
     from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
     from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
-    from koopmpc.identify.fits.prior import Prior as Prior
     from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
-    from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
     from koopmpc.lifting.base import Lifting as Lifting
     from koopmpc.lifting.expressions import Expressions as Expressions
     from koopmpc.lifting.fourier import Fourier as Fourier

@@ -245,14 +245,14 @@ class Units(NamedTuple):
 
     def gain(self, K: Float[np.ndarray, "nu nx"]) -> Float[np.ndarray, "nu nx"]:
         """Return the gain of [z; u_{k−1}], or of z, of one in these units."""
-        return self.inputs[:, None] * K @ self.back(K.shape[1])
+        return self.inputs[:, None] * K @ self._back(K.shape[1])
 
     def value(self, P: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx nx"]:
         """Return the P of a value of [z; u_{k−1}], or of z, of one in these units."""
-        back = self.back(len(P))
+        back = self._back(len(P))
         return self.scale * back.T @ P @ back
 
-    def back(self, size: int) -> Float[np.ndarray, "nx nx"]:
+    def _back(self, size: int) -> Float[np.ndarray, "nx nx"]:
         """Return what takes [z; u_{k−1}], or z, into these units."""
         return self.inverse if size == len(self.inverse) else block_diag(self.inverse, np.diag(1 / self.inputs))
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.identify.constrained.prior import Combination as Combination
+    from koopmpc.identify.constrained.prior import Dissipation as Dissipation
     from koopmpc.identify.fits.kic import InputPredictor as InputPredictor
     from koopmpc.identify.fits.kic import kic as kic
-    from koopmpc.identify.fits.prior import Combination as Combination
-    from koopmpc.identify.fits.prior import Dissipation as Dissipation
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -87,14 +87,6 @@ class RegressionRows:
         T[:, still] = P[:, self.constant] = 0.0
         return replace(self, P=P, T=T, rest=np.where(still, 0.0, self.rest), constant=None)
 
-    def means(self) -> Float[np.ndarray, " n"]:
-        """Return the mean of each column of P over the snapshots; zeros where no column is constant."""
-        mean = np.zeros(self.P.shape[1])
-        if self.constant is not None:
-            one = self.P[:, self.constant]
-            mean[:] = one @ self.P / (one @ one)
-        return mean
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -178,6 +170,27 @@ class _Factors:
         rows = self._rows
         outside = np.sum((rows.T - self._U @ self._shares) ** 2, axis=0) + rows.rest
         return cross_validated(self._s, self._shares, outside, rows.samples - free, self._cut)
+
+
+def about_means(
+    rows: RegressionRows, nu: int, which: Int[np.ndarray, " np"]
+) -> tuple[RegressionRows, Float[np.ndarray, "n n"]]:
+    """Return the rows with products (u − ū)(ψ − ψ̄) in place of u ψ, and the matrix that turns their K into that of u ψ.
+
+    Both span the same models. A ridge on the products of deviations shrinks a model to the same one wherever the data
+    have their zero; u ψ is nearly ū ψ + ψ̄ u where the data lie far from it. Without a constant the rows stay as given.
+    """
+    back = np.eye(rows.P.shape[1])
+    if rows.constant is None:
+        return rows, back
+    one, first = rows.P[:, rows.constant], rows.P.shape[1] - nu * (len(which) + 1)
+    mean = np.array(one @ rows.P / (one @ one))
+    for i in range(nu):
+        products = first + nu + i * len(which) + np.arange(len(which))
+        back[which, products] = -mean[first + i]
+        back[first + i, products] = -mean[which]
+        back[rows.constant, products] = mean[first + i] * mean[which]
+    return replace(rows, P=rows.P @ back), back
 
 
 def scaled_rank(rows: RegressionRows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:

@@ -141,7 +141,7 @@ def simulate(
     if disturbed is not None and not isinstance(plant, StepMap | SimulatedPlant):
         raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
     held = _held(u_reference, cost, steps, nu)
-    metadata = {"controller": type(controller).__name__, **(metadata or {})}
+    metadata, model = {"controller": type(controller).__name__, **(metadata or {})}, predictor_of(controller)
     W = None
     if measured is not None:
         W = rows_ahead(measured, "measured", "nw", steps, N, "steps")
@@ -153,8 +153,8 @@ def simulate(
         first = plant.measure(state)
     else:
         first, state = reading(plant.reset(x0, rng), None, 0), plant.state
-    ny, model = len(first), predictor_of(controller)
-    noisy = _noise(noise, steps, ny)
+    ny = len(first)
+    noisy = None if noise is None else _noise(noise, steps, ny)
     if state is not None and np.shape(state) != (nx,):
         raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
     broken = None
@@ -363,10 +363,10 @@ def _signal(
 
 
 def _noise(
-    noise: Signal | None, steps: int, ny: int
+    noise: Signal, steps: int, ny: int
 ) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
     """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
-    if noise is None or callable(noise) or np.ndim(noise) == 2:
+    if callable(noise) or np.ndim(noise) == 2:
         return _signal(noise, "noise", steps + 1, ny)
     deviation = checks.vector(noise, "noise", ny)
     return lambda k, rng: deviation * rng.standard_normal(ny)

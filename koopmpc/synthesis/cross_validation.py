@@ -14,11 +14,10 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.bilinear import about_means
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
 from koopmpc.identify.regression import Regression, regression_of
-from koopmpc.identify.solve import path
+from koopmpc.identify.solve import about_means, path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.folds import only

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from koopmpc.control.horizon import Horizon, Units
 from koopmpc.control.riccati import Law
@@ -112,7 +113,7 @@ def _of_model(maps: Condensed, h: Horizon, units: Units) -> Condensed:
     """Return the maps of a horizon in these units, in those of the model."""
     moves = len(h.blocks) * (1 + h.bounded)
     rows = np.concatenate([np.tile(units.inputs, moves), np.tile(units.limited, h.N)])[:, None]
-    back = units.back(h.size)
+    back = units.inverse if h.size == len(units.inverse) else block_diag(units.inverse, np.diag(1 / units.inputs))
     drive, nd = maps.from_drive.copy(), h.signals.nd
     if nd:
         drive[:, -nd:] = drive[:, -nd:] @ units.inverse

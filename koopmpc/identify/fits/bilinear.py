@@ -15,7 +15,7 @@ from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.regression import FitResult, fit_report, regression_of, scale_factor
-from koopmpc.identify.solve import RegressionRows, Ridge, doubts, ridge_of, rule, solve
+from koopmpc.identify.solve import RegressionRows, Ridge, about_means, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.reduced import Projected
 from koopmpc.predict.predictors import BilinearPredictor
@@ -161,32 +161,12 @@ def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
     return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
 
 
-def about_means(
-    rows: RegressionRows, nu: int, which: Int[np.ndarray, " np"]
-) -> tuple[RegressionRows, Float[np.ndarray, "n n"]]:
-    """Return the rows with products (u − ū)(ψ − ψ̄) in place of u ψ, and the matrix that turns their K into that of u ψ.
-
-    Both span the same models. A ridge on the products of deviations shrinks a model to the same one wherever the data
-    have their zero; u ψ is nearly ū ψ + ψ̄ u where the data lie far from it. Without a constant the rows stay as given.
-    """
-    back = np.eye(rows.P.shape[1])
-    if rows.constant is None:
-        return rows, back
-    mean, first = rows.means(), rows.P.shape[1] - nu * (len(which) + 1)
-    for i in range(nu):
-        products = first + nu + i * len(which) + np.arange(len(which))
-        back[which, products] = -mean[first + i]
-        back[first + i, products] = -mean[which]
-        back[rows.constant, products] = mean[first + i] * mean[which]
-    return replace(rows, P=rows.P @ back), back
-
-
 def _with_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
     """Return the rows with the products u⊗ψ(x) of the observables `which` alone."""
     first = total.nz + len(total.inputs)
     block = np.flatnonzero(np.isin(total.products, which))
     columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
-    return rows.part(np.concatenate([np.arange(first), *columns]))
+    return replace(rows, P=rows.P[:, np.concatenate([np.arange(first), *columns])])
 
 
 def _projected(

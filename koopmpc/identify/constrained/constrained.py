@@ -9,8 +9,8 @@ from jaxtyping import Float
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.fits.convex import optimum, violation
-from koopmpc.identify.fits.prior import Entries, Prior, entries_of
+from koopmpc.identify.constrained.convex import optimum, violation
+from koopmpc.identify.constrained.prior import Entries, Prior, entries_of
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, ridge_of, rule, solve

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.prior import Combination, Dissipation, Entries, Prior
+from koopmpc.identify.constrained.prior import Combination, Dissipation, Entries, Prior
 from koopmpc.identify.solve import RegressionRows, norms
 
 _LEAST = 1e-3  # least eigenvalue of P, as a share of the mean one

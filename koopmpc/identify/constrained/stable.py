@@ -10,8 +10,8 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.fits.convex import lyapunov_fit
-from koopmpc.identify.fits.nearest_stable import Misfit, clipped, inside, nearest, radius_of
+from koopmpc.identify.constrained.convex import lyapunov_fit
+from koopmpc.identify.constrained.nearest_stable import Misfit, clipped, inside, nearest, radius_of
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import Regression, growth, linear_predictor, read, relative_misfit, unreduced
 from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, onto, ridge_of, rule, solve

@@ -1,0 +1,1 @@
+"""Fits whose matrices are bounded: by priors on their entries, or inside a circle."""
