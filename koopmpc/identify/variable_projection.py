@@ -33,13 +33,20 @@ class Windows:
 
 
 class _LeastSquares:
-    """K = argmin ‖T − P K‖² + ridge ‖D K‖², D the norms of P's columns, and the way back through it."""
+    """K = argmin ‖T − P K‖² + ridge ‖D K‖², and the way back through it.
 
-    def __init__(self, P: Float[np.ndarray, "m n"], T: Float[np.ndarray, "m k"], ridge: float) -> None:
+    D holds the norms of P's columns, less their mean where one of them is `constant`, as in `edmd`.
+    """
+
+    def __init__(
+        self, P: Float[np.ndarray, "m n"], T: Float[np.ndarray, "m k"], ridge: float, constant: bool = False
+    ) -> None:
         self.P, self.T, self.ridge = P, T, ridge
+        self.moving = P - P.mean(axis=0) if constant else P
         G = P.T @ P
         self.norms = np.sqrt(np.where(G.diagonal() > 0, G.diagonal(), 1.0))
-        self.factor = cho_factor(G / np.outer(self.norms, self.norms) + ridge * np.eye(len(G)))
+        spread = np.sum(self.moving**2, axis=0) / self.norms**2
+        self.factor = cho_factor(G / np.outer(self.norms, self.norms) + ridge * np.diag(spread))
         self.K = self._solve(P.T @ T)
 
     def _solve(self, right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
@@ -50,7 +57,7 @@ class _LeastSquares:
         right = self._solve(dK)
         dG = -right @ self.K.T
         by_norms = 2 * self.ridge * dG.diagonal()
-        return self.T @ right.T + self.P @ (dG + dG.T) + self.P * by_norms, self.P @ right
+        return self.T @ right.T + self.P @ (dG + dG.T) + self.moving * by_norms, self.P @ right
 
 
 class VariableProjection:
@@ -63,7 +70,7 @@ class VariableProjection:
     windows
         The data.
     ridge
-        Of the least squares, on columns of unit norm.
+        Of the least squares, as in `edmd`.
     """
 
     def __init__(self, tuning: Tuning, windows: Windows, ridge: float) -> None:
@@ -119,7 +126,8 @@ class VariableProjection:
         nz, X = Z.shape[2], self.windows.X
         now, ahead = Z[:, :-1].reshape(-1, nz), Z[:, 1:].reshape(-1, nz)
         V = self.windows.V.reshape(len(now), -1)
-        fit = _LeastSquares(np.hstack([now, V]), ahead, self.ridge)
+        fixed = self.tuning.lifting.constant_index is not None
+        fit = _LeastSquares(np.hstack([now, V]), ahead, self.ridge, fixed)
         if not self.missing:
             return fit, None
         return fit, _LeastSquares(now, X[:, :-1, self.missing].reshape(len(now), -1), _DECODED)

@@ -362,9 +362,7 @@ def _signal(
     return lambda k, rng: values[k]
 
 
-def _noise(
-    noise: Signal, steps: int, ny: int
-) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
+def _noise(noise: Signal, steps: int, ny: int) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
     """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
     if callable(noise) or np.ndim(noise) == 2:
         return _signal(noise, "noise", steps + 1, ny)
