@@ -185,13 +185,18 @@ def test_a_late_step_is_counted_and_its_input_is_applied_late_or_not_at_all(tmp_
             recorder=recorder,
         )
     run = km.load_run(tmp_path / "run.rrd")
-    late = {"skip": 4.0, "hold": 3.0}[policy]
-    assert plant.got == [1.0, 2.0, 3.0, late, 5.0, 6.0, 7.0, 0.0]
-    assert (paced.steps, paced.late, paced.skipped, paced.held) == (7, 1, 2, int(policy == "hold"))
-    assert run.U[:, 0].tolist() == [1.0, 2.0, 3.0, late, late, late, 5.0, 6.0, 7.0]
-    assert np.flatnonzero(np.isnan(run.Y[:, 0])).tolist() == [4, 5]
-    assert [k for k in range(9) if run.status[k] is km.Status.TIME_LIMIT] == [4, 5]
-    assert {run.fallback[k] for k in (4, 5)} == {km.control.Fallback.HOLD}
+    given, skipped = run.U[:, 0].tolist(), np.flatnonzero(np.isnan(run.Y[:-1, 0])).tolist()
+    taken = [k for k in range(run.steps) if k not in skipped]
+    at = taken[3]  # the step that takes two and a half; a busy machine may have made others late, too
+    assert {at + 1, at + 2} <= set(skipped)
+    assert given[at] == (4.0 if policy == "skip" else given[at - 1])
+    assert all(given[k] == given[k - 1] for k in skipped)
+    assert plant.got == [*(given[k] for k in taken), 0.0]
+    assert paced.steps + paced.skipped == 9
+    assert paced.late >= 1
+    assert paced.held == (paced.late if policy == "hold" else 0)
+    assert [k for k in range(run.steps) if run.status[k] is km.Status.TIME_LIMIT] == skipped
+    assert all(run.fallback[k] is km.control.Fallback.HOLD for k in skipped)
 
 
 def test_a_step_reads_when_it_begins_and_sees_the_rows_of_its_time():
@@ -267,7 +272,9 @@ def test_signals_and_switches_are_as_they_were():
 def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys):
     (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "realtime.md").read_text(), re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(source, {})
-    said = capsys.readouterr().out
-    assert said.startswith("stopped by u = [0.]\n300 steps, ") or " skipped" in said
-    assert km.load_run("rig.rrd").steps == 300
+    exec(source, names := {})
+    assert "stopped by u = [0.]\n" in capsys.readouterr().out
+    paced = names["paced"]
+    assert paced.ended == "done"
+    assert paced.steps + paced.skipped == 300
+    assert 300 - paced.skipped <= km.load_run("rig.rrd").steps <= 300  # ticks that are skipped last have no row
