@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from time import perf_counter
 from typing import Any, NamedTuple, cast
 
@@ -18,7 +19,8 @@ from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.predict.predictors import LinearPredictor
 
-_BETTER = 0.9  # of the error of the model in use that a new one may have on the memory
+_BETTER = 1 / 3  # of the error of the model in use that a new one may have on pairs that neither has seen
+_SHORTEST = 20  # pairs that the memory holds by default, where the horizon is shorter
 _WORSE = 1.25  # times the error of an earlier model from which on the model in use is given up for it
 _SUFFICES = 1.5  # times the residuals of its own fit up to which the model in use is left alone
 _PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
@@ -42,9 +44,11 @@ class Adaptive:
     those before it. Three such samples in sequence are no spike but a change of the plant, and are learned from.
 
     Where the model in use predicts a short memory of recent pairs worse than the first one did its own data, the fit
-    of all pairs so far, with the forgetting or the window of `online`, is compared with it on these pairs every few
-    steps, and takes its place where it predicts them clearly better. Where an earlier model predicts them clearly
-    better than the one in use, that one comes back.
+    of all pairs so far, with the forgetting or the window of `online`, is put on trial: once the memory holds only
+    pairs that came later, both forecast them, from each pair on as far ahead as the memory and the horizon reach, and
+    the new one takes the place of the one in use where its error is less than a third. A fit always predicts well what
+    it was fitted to, and the next step of a path that it has just seen; the plan relies on the steps after that.
+    Where an earlier model forecasts the memory clearly better than the one in use, that one comes back.
 
     Parameters
     ----------
@@ -54,9 +58,9 @@ class Adaptive:
         The fit that learns, of the same lifting. Start it with the data of the controller's model:
         ``OnlineEDMD.start(data, lifting, forgetting=0.98)``.
     every
-        Steps between two comparisons.
+        Steps between two looks at the memory.
     memory
-        Recent pairs on which models are compared.
+        Recent pairs on which models are compared; by default the controller's horizon, at least 20.
     outlier
         A sample is off where its misfit is this many times the usual one.
 
@@ -79,7 +83,7 @@ class Adaptive:
         online: OnlineEDMD,
         *,
         every: int = 5,
-        memory: int = 20,
+        memory: int | None = None,
         outlier: float = 8.0,
     ) -> None:
         checks.kind(controller, "controller", KoopmanMPC, "only its model can be learned by OnlineEDMD")
@@ -93,7 +97,8 @@ class Adaptive:
         self._every, self._outlier = checks.count(every, "every"), checks.positive(outlier, "outlier")
         self._first = model
         self._usual = None if model.report is None else model.report.residual
-        self._memory: deque[LearnedPair] = deque(maxlen=checks.count(memory, "memory"))
+        held = max(self.horizon, _SHORTEST) if memory is None else checks.count(memory, "memory")
+        self._memory: deque[LearnedPair] = deque(maxlen=held)
         self._clear()
 
     def _clear(self) -> None:
@@ -103,6 +108,7 @@ class Adaptive:
         self._off = self._steps = 0
         self.learned = self.skipped = self.renewed = self.returned = self.refused = 0
         self._good: deque[LinearPredictor] = deque(maxlen=_KEPT)
+        self._on_trial: tuple[LinearPredictor, int] | None = None  # a new model, and the pairs learned before it
 
     @property
     def predictor(self) -> LinearPredictor:
@@ -157,12 +163,23 @@ class Adaptive:
         self.online.learn(pair.x, pair.u, pair.x_next, pair.w if len(w) else None)
         self.learned += 1
 
-    def _errors(self, model: LinearPredictor, pairs: list[LearnedPair]) -> Float[np.ndarray, "m nx"]:
-        """Return the one-step errors of a model, each state in the size of its changes over the memory."""
-        Z = np.array([model.lift(pair.x) for pair in pairs])
+    def _errors(self, model: LinearPredictor, pairs: list[LearnedPair], steps: int = 1) -> Float[np.ndarray, "m nx"]:
+        """Return the errors of forecasts 1 … `steps` ahead from each pair on, as far as pairs follow one another.
+
+        Each state is in the size of its changes from step to step over the memory.
+        """
         U, W = np.array([pair.u for pair in pairs]), np.array([pair.w for pair in pairs])
-        ahead = (Z @ model.A.T + U @ model.B.T + W @ model.E.T) @ model.C.T
-        return (np.array([pair.x_next for pair in pairs]) - ahead) / self._size
+        after = np.array([pair.x_next for pair in pairs])
+        goes_on = np.array([one.x_next is then.x for one, then in pairwise(pairs)] + [False])
+        Z, at, size = np.array([model.lift(pair.x) for pair in pairs]), np.arange(len(pairs)), self._size
+        errors: list[Float[np.ndarray, "m nx"]] = []
+        for _ in range(steps):
+            Z = Z @ model.A.T + U[at] @ model.B.T + W[at] @ model.E.T
+            errors.append((after[at] - Z @ model.C.T) / size)
+            Z, at = Z[goes_on[at]], at[goes_on[at]] + 1
+            if not len(at):
+                break
+        return np.concatenate(errors)
 
     @property
     def _size(self) -> Float[np.ndarray, " nx"]:
@@ -174,20 +191,25 @@ class Adaptive:
         return np.where(size > 0, size, 1.0)
 
     def _renew(self) -> None:
-        """Compare the models on the memory, and take the one that predicts it clearly better."""
+        """Put a new model on trial where the one in use does not suffice, end a trial, or go back to an earlier one."""
         pairs, used = list(self._memory), self.predictor
         if self._suffices(used, pairs):
+            self._on_trial = None
             return
+        if self._on_trial is None:
+            try:
+                self._on_trial = self.online.predictor(), self.learned
+            except KoopmpcError:  # too little was learned for a fit
+                return
         error = self._error(used, pairs)
-        try:
-            candidate = self.online.predictor()
-        except KoopmpcError:  # too little was learned for a fit
-            candidate = None
-        if candidate is not None and self._error(candidate, pairs) < _BETTER * error and self._use(candidate):
-            self._good.append(used)
-            self.renewed += 1
-            return
-        self.refused += 1
+        candidate, before = self._on_trial
+        if self.learned - before >= cast("int", self._memory.maxlen):
+            self._on_trial = None
+            if self._error(candidate, pairs) < _BETTER * error and self._use(candidate):
+                self._good.append(used)
+                self.renewed += 1
+                return
+            self.refused += 1
         earlier = [self._first, *self._good]
         errors = [self._error(model, pairs) for model in earlier]
         best = int(np.argmin(errors))
@@ -205,7 +227,7 @@ class Adaptive:
 
     def _error(self, model: LinearPredictor, pairs: list[LearnedPair]) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            found = float(np.sqrt((self._errors(model, pairs) ** 2).mean()))
+            found = float(np.sqrt((self._errors(model, pairs, self.horizon) ** 2).mean()))
         return found if np.isfinite(found) else np.inf
 
     def _use(self, model: LinearPredictor) -> bool:

@@ -179,7 +179,9 @@ class Limits(Value):
         DataError
             A band that is negative, NaN, or infinite where nothing caps it; a share that makes limits cross.
         """
-        rows = checks.array(band, "band", (None, None), infinite=True)[:_AHEAD]
+        rows = checks.array(band, "band", infinite=True)[:_AHEAD]
+        if rows.ndim != 2:
+            raise ShapeError(f"band has shape {rows.shape}; pass (h, nx), a row for each of 1 … h steps ahead")
         share = checks.positive(most, "most")
         if share >= 0.5:
             raise DataError(f"most is {share:g}; limits cross once tightened by half of their range: pass less")

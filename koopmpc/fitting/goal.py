@@ -141,7 +141,9 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     reference = np.column_stack([np.broadcast_to(rows[i], steps) for i in tracked])
     horizon = tree.get("horizon", usual_horizon(data)[0])
     if not isinstance(horizon, int) or isinstance(horizon, bool) or horizon < 1:
-        raise DataError(f"{file}: horizon is {horizon!r}; write a whole number of steps of {data.dt:g} s, 1 or more")
+        raise DataError(
+            f"{file} gives a horizon of {horizon!r}; write a whole number of steps of {data.dt:g} s, 1 or more"
+        )
     limited = np.isfinite(change).any()
     return Goal(
         cost=Cost(
@@ -176,6 +178,8 @@ def _sections(
         if name not in names:
             own = next((known for known in names if _stem(known) == _stem(name)), None)
             if own is not None:
+                if _unit(own) == _unit(name) or "[" not in name:
+                    raise DataError(f"{where} is not written as in the logs, which have {own!r}; write that")
                 raise DataError(
                     f"{where} is in another unit than the logs, which have {own!r}; write its numbers in that"
                 )
@@ -203,7 +207,7 @@ def _one(section: Mapping[str, Any], key: str, default: float, where: str) -> fl
 
 def _pair(section: Mapping[str, Any], where: str) -> tuple[float, float]:
     value = _numbers(section.get("limits", [-math.inf, math.inf]), f"{where}: limits")
-    if not isinstance(value, list) or len(value) != 2 or any(math.isnan(end) for end in value):
+    if not isinstance(value, list) or len(value) != 2:
         raise DataError(f"{where}: limits is {value!r}; write [low, high], with -inf or inf where there is none")
     low, high = value
     if low > high:
@@ -217,7 +221,7 @@ def _numbers(value: Any, where: str) -> float | list[float]:
     """Return a number, or a list of numbers."""
     many = cast("list[Any]", value) if isinstance(value, list) else [value]
     for one in many:
-        if isinstance(one, bool) or not isinstance(one, int | float):
+        if isinstance(one, bool) or not isinstance(one, int | float) or math.isnan(one):
             raise DataError(f"{where} is {value!r}; write a number, or a list of numbers")
     return [float(one) for one in many] if isinstance(value, list) else float(value)
 

@@ -189,22 +189,35 @@ def unheld(one: Surrogate, asked: Asked) -> list[str]:
 
     def told(numbers: Float[np.ndarray, " nr"]) -> str:
         weighed = np.isfinite(tolerance)
-        return ", ".join(quantity(of.names[i], f"= {numbers[i]:.4g}") for i in np.flatnonzero(weighed))
+        shown = np.where(np.abs(numbers) > 1e-3 * tolerance, numbers, 0.0)
+        return ", ".join(quantity(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(weighed))
+
+    room = UNHELD * (asked.high - asked.low)  # of the states
+
+    def broken(at: Equilibrium) -> list[str]:
+        ways: list[str] = []
+        for names, values, box, off in (
+            (model.inputs, at.u, asked.limits.inputs(model.nu), 1e-6 * np.abs(at.u)),
+            (model.states, at.x[:nx], asked.limits.states(nx), room),
+        ):
+            for i, (name, value, low, high) in enumerate(zip(names, values, *box, strict=True)):
+                if not low - off[i] <= value <= high + off[i]:
+                    shown = quantity(name, f"= {value if abs(value) > 1e-3 * off[i] else 0:.4g}")
+                    ways.append(f"{shown}, and its limit is {low if value < low else high:.4g}")
+        return ways
 
     inside = one.holding(cost, asked.limits)(row)
-    if not missed(inside):
+    rests = not broken(inside)  # where no equilibrium is inside all limits, the search keeps those of inputs alone
+    if rests and not missed(inside):
         return []
     free = one.holding(cost, Limits())(row)
     nearest = f"the nearest that can be held is {told(values(inside))}"
+    if not rests:
+        nearest = "the plant rests nowhere inside these limits: widen them"
     if missed(free):
         return [f"no input holds {told(row)}: this is no equilibrium of the plant, as the data show it; {nearest}"]
-    ways: list[str] = []
-    for names, at, box in (
-        (model.inputs, free.u, asked.limits.inputs(model.nu)),
-        (model.states, free.x[:nx], asked.limits.states(nx)),
-    ):
-        for name, value, low, high in zip(names, at, *box, strict=True):
-            if not low <= value <= high:
-                ways.append(f"{quantity(name, f'= {value:.4g}')}, and its limit is {low if value < low else high:.4g}")
+    ways = broken(free) or broken(inside)
+    if not ways and asked.limits.of is None:
+        return []
     needs = "; ".join(ways) if ways else "what the limits of its observables forbid"
     return [f"no input inside the limits holds {told(row)}: it needs {needs}; {nearest}"]

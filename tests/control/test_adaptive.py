@@ -2,6 +2,7 @@
 
 import os
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -152,7 +153,7 @@ def test_the_controller_that_is_told_is_better_than_one_that_is_not():
 def test_a_forecast_that_turns_nan_is_the_worst_of_all(model, train, monkeypatch, value):
     """NaN is smaller than nothing: such a model would neither be refused nor left."""
     one = adaptive(model, train)
-    monkeypatch.setattr(one, "_errors", lambda model, pairs: np.full((3, 2), value))
+    monkeypatch.setattr(one, "_errors", lambda *_: np.full((3, 2), value))
     assert one._error(model, []) == np.inf
 
 
@@ -163,3 +164,37 @@ def test_it_begins_as_after_a_reset(model, train):
     for _ in range(3):
         assert np.array_equal(fresh(x, np.zeros(len(x))).u, again(x, np.zeros(len(x))).u)
     assert (fresh.learned, fresh.renewed) == (again.learned, again.renewed)
+
+
+class Joint(km.Dynamics):
+    """A light joint that swings with 12 rad/s."""
+
+    states, inputs = ("theta [rad]", "omega [rad/s]"), ("torque [N m]",)
+
+    def rhs(self, x, u):
+        return ca.vertcat(x[1], (u[0] - 0.004 * x[1] - 0.35 * ca.sin(x[0])) / 0.012)
+
+
+@pytest.mark.parametrize("remembers", [{"forgetting": 0.98}, {"window": 200}])
+def test_a_fit_of_the_last_steps_does_not_replace_a_model_that_plans_better(remembers):
+    """Data of small swings, then large and fast ones: each fit knows the steps behind it, and not the plan's."""
+    plant, torque = km.discretize(Joint(), 0.01), 0.15 * np.cos(0.02 * np.arange(500))[:, None]
+    lifting = km.State() + km.Fourier(1, states=[0]) + km.Fourier(1, states=[0]) * km.State([1])
+    X = [np.zeros(2)]
+    for u in torque:
+        X.append(np.asarray(plant(X[-1], u)).ravel())
+    little = km.Episodes([km.Episode(X=np.array(X), U=torque)], 0.01, Joint.states, Joint.inputs)
+    model = km.edmd(little, lifting, ridge=1e-9)
+    k = np.arange(301)
+    swing = np.where(k < 200, 1.6 * (1 - np.cos(0.02 * np.pi * k)) * np.sin(0.0125 * np.pi * k), 0.0)
+    cost = km.Cost(Q=[1.0, 0.0], R=0.0, R_delta=1.0, u_target="zero")
+
+    def missed(controller):
+        rows = np.column_stack([swing, 0.0 * k])
+        found = km.simulate(plant, controller, x0=X[-1], reference=rows, steps=300, cost=cost)
+        return np.sqrt(((found.X[:, 0] - swing) ** 2).mean())
+
+    fixed, mpc = (km.KoopmanMPC(model, cost, km.Limits(-6, 6), 30) for _ in range(2))
+    learning = km.Adaptive(mpc, km.OnlineEDMD.start(little, lifting, **remembers))
+    assert missed(learning) <= 1.01 * missed(fixed)
+    assert learning.refused + learning.renewed > 0  # models were on trial

@@ -102,6 +102,7 @@ def test_metrics_count_from_the_limits_themselves():
         (lambda: km.Limits(x_min=[0.0], x_max=[1.0], margin=[[0.6]]), "state 0 cross once tightened: 0 … 1"),
         (lambda: km.Limits(x_max=[1.0]).tightened([[np.inf]]), "infinite for a state with one limit"),
         (lambda: km.Limits(x_max=[1.0]).tightened([[-0.1]]), "0 or above"),
+        (lambda: km.Limits(x_max=[1.0]).tightened([0.1]), "a row for each of 1 … h steps ahead"),
         (lambda: km.Limits(x_max=[1.0]).tightened([[np.nan]]), "NaN"),
     ],
 )

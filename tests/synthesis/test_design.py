@@ -172,6 +172,14 @@ def test_a_goal_that_no_input_holds_is_told_with_the_limit_in_the_way_and_the_ne
     assert said in found.advice
 
 
+def test_limits_inside_which_nothing_rests_are_told():
+    with pytest.warns(km.FitWarning, match=r"x1 = 0, and its limit is 0\.3; the plant rests nowhere inside these"):
+        km.design(
+            data(), COST, km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, 0.3], x_max=[np.inf, 0.9]), horizon=8,
+            reference=[0.0, 0.0], candidates=[PLAIN], delays=[0], bilinear=False,
+        )  # fmt: skip
+
+
 def test_a_moving_state_is_no_equilibrium_to_rest_at():
     with pytest.warns(km.FitWarning, match="this is no equilibrium of the plant"):
         km.design(data(), COST, LIMITS, horizon=8, reference=[0.0, 0.4], candidates=[PLAIN], delays=[0], bilinear=False)
