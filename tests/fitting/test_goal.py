@@ -206,6 +206,18 @@ def test_the_commands_write_a_template_design_and_check(tmp_path, monkeypatch):
     assert "none.npz" in missing.stderr
 
 
+def test_a_check_of_what_is_no_controller_exits_with_2_and_says_what_to_pass(tmp_path, made):
+    cut, goal = tmp_path / "cut.npz", tmp_path / "goal.toml"
+    cut.write_bytes(made.controller.read_bytes()[:-300])
+    goal.write_text(GOAL)
+    for file in (cut, goal, tmp_path):
+        result = CliRunner().invoke(app, ["check", str(file)])
+        assert result.exit_code == 2
+        said = " ".join(result.stderr.split())
+        assert file.name in said
+        assert "pass the .npz of a saved SavedController or SavedDesign" in said
+
+
 def test_the_check_exits_with_1_where_the_goal_is_not_kept(tmp_path, monkeypatch, made):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("koopmpc.fitting.check.ALLOWED_OFF", -1.0)
