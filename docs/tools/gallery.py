@@ -102,7 +102,8 @@ def page(path: Path, *, pictures: bool = True) -> Page:
     if told:
         made.text("## What fails here, and why")
         made.items(told)
-    made.text("## The file", f"problems/{path.name}, {len(source.splitlines())} lines, to run and to copy:")
+    lines = len(source.splitlines())
+    made.text("## The file { data-search-exclude }", f"problems/{path.name}, {lines} lines, to run and to copy:")
     made.code(source.rstrip(), "py")
     made.write(f"{name}.md")
     return made
@@ -131,7 +132,7 @@ def draw(problem: km.Problem, controller: str, case: str) -> None:
 
 def parameters(dynamics: Any, source: str) -> list[tuple[str, str, str]]:
     """Return name, value and meaning of the plant's parameters; the meaning is the comment behind each in the file."""
-    comments = dict(re.findall(r"^    (\w+): float = [^#\n]+#\s*(.+)$", source, re.MULTILINE))
+    comments = dict(re.findall(r"^    (\w+): float = [^#\n]+#\s*(.+?)(?:  # noqa.*)?$", source, re.MULTILINE))
     fields = [field for field in dataclasses.fields(dynamics) if isinstance(getattr(dynamics, field.name), float | int)]
     return [(field.name, f"{getattr(dynamics, field.name):g}", comments.get(field.name, "")) for field in fields]
 

@@ -146,7 +146,7 @@ def terminal_cost() -> Any:
 
 
 def one_step_errors() -> Any:
-    """Two models of one pendulum: the better one after a step is useless after ten."""
+    """Two models of one pendulum, other observables, other data: the better one on its own data forecasts worse."""
     problem = km.load_problem("pendulum")
     plant = km.discretize(problem.dynamics, dt=0.05)
     swings = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=120, steps=40)
@@ -157,12 +157,12 @@ def one_step_errors() -> Any:
     bad = km.edmd(timid, km.State() + km.Monomials(5))
     made, axes = figure(1, 2, width="two columns", height=2.6)
     bars, curves = axes[0]
-    for i, (name, model) in enumerate({"sines and cosines": good, "monomials up to 5": bad}.items()):
+    for i, (name, model) in enumerate({"sines and cosines, wide data": good, "monomials, timid data": bad}.items()):
         bars.bar(i, model.report.residual[1], color=line(i)["color"], width=0.6)
         score = km.score(model, held_out, horizon=12)
         curves.semilogy(np.arange(1, 13), score.rmse[:, 1], label=name, **line(i, 12))
     bars.set(ylabel="error after one step,\nits own data [rad/s]", xticks=[0, 1])
-    bars.set_xticklabels(["sines and\ncosines", "monomials\nup to 5"])
+    bars.set_xticklabels(["sines and cosines,\nwide data", "monomials to 5,\ntimid data"])
     curves.set(xticks=range(0, 13, 3), xlabel="steps ahead", ylabel="error, held-out data [rad/s]")
     legend(made, [curves], 2)
     return made

@@ -65,6 +65,19 @@ def test_the_examples_of_a_docstring_run_and_show_what_they_say(entry, tmp_path,
     assert not said, "".join(said)
 
 
+def test_arguments_described_together_have_each_their_own_type():
+    griffe = pytest.importorskip("griffe", reason="the extra docs is not installed")
+    extensions = griffe.load_extensions(str(DOCS / "tools" / "annotations.py"))
+    package = griffe.load(
+        "koopmpc", search_paths=[DOCS.parent], docstring_parser="numpy", extensions=extensions, allow_inspection=False
+    )
+    for name, argument, kind in (("KoopmanMPC", "limits", "Limits | None"), ("KoopmanMPC", "cost", "Cost")):
+        path = next(entry.path for entry in ENTRIES if entry.name == f"km.{name}")
+        sections = package[path.removeprefix("koopmpc.")].docstring.parsed
+        types = {each.name: str(each.annotation) for s in sections if s.kind.value == "parameters" for each in s.value}
+        assert types[argument] == kind
+
+
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning_and_holds_every_entry(tmp_path):
     pytest.importorskip("material", reason="the extra docs is not installed")
