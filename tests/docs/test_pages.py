@@ -36,9 +36,9 @@ def links(text):
 
 
 def anchors(page):
-    """Return the anchors that the headings of a page give."""
-    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    """Return the anchors that the headings of a page give, by their words or by `{ #name }` behind them."""
+    titles = re.findall(r"^#+ (.*?)(?: \{ #?([\w-]+) \})?$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", (given or words).lower()).strip().replace(" ", "-") for words, given in titles}
 
 
 @pytest.mark.parametrize("page", HERE)
