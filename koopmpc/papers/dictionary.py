@@ -21,8 +21,7 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.radial import Gaussian
 from koopmpc.lifting.state import Constant, State
-from koopmpc.papers.reconstruction import percent, unwarned
-from koopmpc.papers.registry import Claim, Tell, judged, short
+from koopmpc.papers.registry import Claim, Tell, judged, percent, short, unwarned
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor
@@ -173,4 +172,4 @@ def _data(count: int, seed: int) -> Episodes:
     return Episodes([Episode(X=x) for x in X], DT, plant.states)
 
 
-paper = short("dictionary", (__doc__ or "").format(count=COUNT, widths=", ".join(map(str, WIDTHS))), work)
+paper = short("dictionary", __doc__, work, count=COUNT, widths=", ".join(map(str, WIDTHS)))

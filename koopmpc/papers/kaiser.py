@@ -33,8 +33,7 @@ from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.plants import closed_loop, trajectories
-from koopmpc.papers.reconstruction import percent, unwarned
-from koopmpc.papers.registry import Claim, Tell, compared, judged, short, show
+from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, short, show, unwarned
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize

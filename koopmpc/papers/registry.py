@@ -1,43 +1,39 @@
 """The papers that can be reproduced: what each says, how its claims are judged, and the page that is written.
 
-A paper is a module here, or a folder, that defines `paper`. docs/papers/ holds the pages and pictures that
+A paper is a `Paper` in the module, or the folder, of its name. docs/papers/ holds the pages and pictures that
 `koopmpc reproduce` writes: copy both after a change.
 """
 
+import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
+from inspect import cleandoc
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 from rich.table import Table
 
 from koopmpc.bench.table import plain_table
 from koopmpc.checks import nearest
-from koopmpc.errors import ProblemError
+from koopmpc.errors import FitWarning, ProblemError
 from koopmpc.figures.plots import Plot, plots
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.page import Page
 from koopmpc.recording.views.curves import record_curves
 
-PAPERS = (
-    "snyder",
-    "brunton",
-    "proctor",
-    "williams",
-    "korda",
-    "dictionary",
-    "kaiser",
-    "kic",
-    "kernel",
-)
+PAPERS = ("snyder", "brunton", "proctor", "williams", "korda", "dictionary", "kaiser", "kic", "kernel")
+_HOME = {"kic": "proctor", "kernel": "williams"}  # papers that stand in the file of an earlier one of their authors
 
 _ROUNDING = 1e-10
+_HUGE = 100.0  # a relative error beyond it has no digits worth reading
 Tell = Callable[[str], None]  # is called with what runs now
 
 
@@ -80,6 +76,29 @@ def written(values: ArrayLike, digits: int) -> str:
     """Return a number, a vector or a matrix as text; what is below 1e-10 is rounding, and is written as 0."""
     rows = np.atleast_2d(np.where(np.abs(values) < _ROUNDING, 0.0, values))
     return "; ".join(" ".join(f"{float(value):.{digits}g}" for value in row) for row in rows)
+
+
+def relative(X: Float[np.ndarray, "T1 nx"], truth: Float[np.ndarray, "T1 nx"]) -> float:
+    """Return ‖X − truth‖ / ‖truth‖ over all entries; inf where X left the finite numbers."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = float(np.linalg.norm(X - truth) / np.linalg.norm(truth))
+    return error if np.isfinite(error) else np.inf
+
+
+def percent(error: float) -> str:
+    """Return a relative error in %, with three digits; "diverges" where it is huge or not a number."""
+    if not error < _HUGE:
+        return "diverges"
+    value = 100 * error
+    return f"{value:.3g}" if value == 0 or value >= 1e-3 else f"{value:.1e}"
+
+
+@contextmanager
+def unwarned() -> Generator[None]:
+    """Show no FitWarning, because the tables hold the rank, the condition and the warnings of each fit."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)
+        yield
 
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
@@ -186,9 +205,10 @@ class Paper:
         return Reproduction(claims, written, recording)
 
 
-def short(name: str, text: str | None, work: Callable[[Page, bool, Tell], Sequence[Claim]]) -> Paper:
-    """Return a paper whose title and opening are the docstring of its module, `text`."""
-    title, _, about = (text or name).partition("\n\n")
+def short(name: str, text: str | None, work: Callable[[Page, bool, Tell], Sequence[Claim]], **numbers: object) -> Paper:
+    """Return a paper whose title and opening are a docstring, `text`, in which {name} stands for one of `numbers`."""
+    about = cleandoc(text or name)
+    title, _, about = (about.format(**numbers) if numbers else about).partition("\n\n")
     return Paper(name, title.rstrip("."), work, about)
 
 
@@ -202,7 +222,8 @@ def find_paper(name: str) -> Paper:
     """
     if name not in PAPERS:
         raise ProblemError(f"there is no paper {name!r}{nearest(name, PAPERS)}; there are {', '.join(PAPERS)}")
-    return import_module(f"koopmpc.papers.{name}").paper
+    module = import_module(f"koopmpc.papers.{_HOME.get(name, name)}")
+    return next(each for each in vars(module).values() if isinstance(each, Paper) and each.name == name)
 
 
 class PaperTask(NamedTuple):

@@ -10,10 +10,8 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.papers import registry
-from koopmpc.papers.contest import ORACLE, costs
-from koopmpc.papers.reconstruction import percent
-from koopmpc.papers.registry import Claim, Verdict, compared, find_paper, judged, short, show
-from koopmpc.papers.snyder.control import contest, predictions
+from koopmpc.papers.registry import Claim, Verdict, compared, find_paper, judged, percent, short, show
+from koopmpc.papers.snyder.control import ORACLE, contest, costs, predictions
 from koopmpc.papers.snyder.settings import SHAKINGS, all_settings
 
 

@@ -8,13 +8,12 @@ import pytest
 from scipy.special import ellipk
 
 import koopmpc as km
-from koopmpc.papers.contest import ORACLE, Prediction
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict, verdicts
-from koopmpc.papers.snyder import report, theory
-from koopmpc.papers.snyder.caution import by_horizon
+from koopmpc.papers.snyder import held_change, rebuilt, report, theory
 from koopmpc.papers.snyder.claims import of_figures, of_text
-from koopmpc.papers.snyder.paper import held_change, rebuilt
+from koopmpc.papers.snyder.control import ORACLE
+from koopmpc.papers.snyder.reconstruction import Prediction
 from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains
 from koopmpc.recording import page as pages
 from koopmpc.recording.page import Page
@@ -137,7 +136,7 @@ def test_the_origin_and_truncation_explain_the_cart_pole(settings):
 def test_over_the_whole_run_the_caution_has_the_errors_of_the_figures(settings, fits):
     for method in ("DMD", "EDMD monomials 3", "EDMD Fourier 1"):
         fit = fits["cart-pole"][method, True]
-        ((first, _), (own, new)) = by_horizon(settings["cart-pole"], fit, (0.1, 10.0))
+        ((first, _), (own, new)) = theory.by_horizon(settings["cart-pole"], fit, (0.1, 10.0))
         assert own == pytest.approx(fit.error, rel=1e-12)
         assert new == pytest.approx(fit.held_out, rel=1e-12)
         assert first < 0.1 * own

@@ -4,9 +4,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from koopmpc.papers.contest import Prediction
-from koopmpc.papers.reconstruction import Reconstruction, percent
-from koopmpc.papers.registry import Claim, judged
+from koopmpc.papers.registry import Claim, judged, percent
+from koopmpc.papers.snyder.reconstruction import Prediction, Reconstruction
 from koopmpc.papers.snyder.settings import FIGURES, Shown
 
 Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by setting, then by method and whether at full rank

@@ -1,13 +1,19 @@
 """Past Snyder & Song (2021): data that show what the input does, and control on models of them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.lqr import LQR
+from koopmpc.control.move import Controller
+from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.excitation import Feedback, Noise
@@ -17,14 +23,19 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.state import Constant, Monomials, State
+from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
-from koopmpc.papers.contest import ORACLE, Contest, Prediction, centred, costs, prediction
-from koopmpc.papers.reconstruction import Setting, percent, unwarned
+from koopmpc.loop.simulate import simulate
+from koopmpc.papers.registry import percent, unwarned
+from koopmpc.papers.snyder.reconstruction import Prediction, Setting, centred, prediction
 from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Shaking, gains
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import StepMap, discretize
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page
 
+ORACLE = "nonlinear MPC"
+_LOST = 1e3  # times the best cost beyond which a loop has diverged
 Runs = Mapping[str, Mapping[tuple[str, bool], Run]]  # by title of the task, then as `Contest.runs`
 DRAWN = ("LQR, linearisation", "MPC, Fourier 1", "MPC, monomials 3", ORACLE)
 DT = 0.05  # sample time of the controllers [s]
@@ -113,6 +124,79 @@ def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episod
             for p in each.values()
         ],
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Contest:
+    """Controllers that start from one state, track one reference and share one cost, with and without input limits.
+
+    Attributes
+    ----------
+    title
+        What the plant has to do.
+    plant
+        x⁺ = F(x, u).
+    x_eq
+        (nx,), the equilibrium at u = 0 where the plant is linearised.
+    models
+        Lifted or identified models by name.
+    cost, limits
+        The same for all controllers; each runs once without the limits and once within them.
+    x0, reference
+        (nx,) each.
+    steps
+        Length of each run.
+    horizon
+        Horizon of the model predictive controllers, in steps.
+    """
+
+    title: str
+    plant: StepMap
+    x_eq: Float[np.ndarray, " nx"]
+    models: Mapping[str, LinearPredictor]
+    cost: Cost
+    limits: Limits
+    x0: Float[np.ndarray, " nx"]
+    reference: Float[np.ndarray, " nx"]
+    steps: int
+    horizon: int
+
+    def runs(self) -> "dict[tuple[str, bool], Run]":
+        """Return the run of each controller by its name and by whether the inputs are limited."""
+        return {
+            (name, limited): simulate(
+                self.plant,
+                controller,
+                x0=self.x0,
+                reference=self.reference,
+                steps=self.steps,
+                cost=self.cost,
+                limits=self.limits if limited else None,
+                metadata={"problem": self.title, "controller": name},
+            )
+            for limited in (False, True)
+            for name, controller in self._controllers(limited).items()
+        }
+
+    def _controllers(self, limited: bool) -> dict[str, Controller]:
+        """Return LQR on each model, MPC on each model where inputs are limited, and nonlinear MPC on the plant."""
+        limits = self.limits if limited else Limits()
+        local = LinearPredictor.local(self.plant, self.x_eq, np.zeros(self.plant.nu))
+        models = {"linearisation": local, **self.models}
+        found: dict[str, Controller] = {}
+        for name, model in models.items():
+            found[f"LQR, {name}"] = LQR(model, self.cost, limits)
+            if limited:
+                found[f"MPC, {name}"] = KoopmanMPC(model, self.cost, limits, self.horizon)
+        found[ORACLE] = NonlinearMPC(self.plant, self.cost, limits, self.horizon)
+        return found
+
+
+def costs(runs: "Mapping[tuple[str, bool], Run]", limited: bool) -> dict[str, float]:
+    """Return dt Σ (‖x − r‖²_Q + ‖u‖²_R) of each controller; inf where the loop diverged."""
+    found = {name: run.dt * metrics(run).cost for (name, kind), run in runs.items() if kind is limited}
+    best = found[ORACLE]
+    return {name: value if value < _LOST * best else np.inf for name, value in found.items()}
 
 
 def contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:

@@ -9,9 +9,9 @@ from koopmpc.data.excitation import Noise
 from koopmpc.figures.comparisons import reconstruction
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.papers.plants import Pendulum, inputs_of, trajectories
-from koopmpc.papers.reconstruction import Reconstruction, Setting, percent, relative, unwarned
-from koopmpc.papers.registry import Claim, summary
+from koopmpc.papers.registry import Claim, percent, relative, summary, unwarned
 from koopmpc.papers.snyder.claims import Fits
+from koopmpc.papers.snyder.reconstruction import Reconstruction, Setting
 from koopmpc.papers.snyder.settings import FIGURES, VARIANTS, gains
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize

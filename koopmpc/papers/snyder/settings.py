@@ -10,7 +10,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.papers.plants import CartPole, Pendulum, gain, printed_gain
-from koopmpc.papers.reconstruction import Setting
+from koopmpc.papers.snyder.reconstruction import Setting
 from koopmpc.plants.dynamics import Dynamics
 
 PENDULUM_WEIGHTS: tuple[list[float], float] = ([0.0, 10.0], 1.0)  # Q and R of the paper

@@ -1,4 +1,4 @@
-"""The bilinear motor, controlled from its speed alone, beside MPC that is linearised anew at every step."""
+"""The bilinear motor of Korda & Mezić: control from its speed alone, beside MPC linearised anew at every step."""
 
 from time import perf_counter
 from typing import NamedTuple
@@ -17,8 +17,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import State
-from koopmpc.papers.reconstruction import unwarned
-from koopmpc.papers.registry import Claim, Tell, compared, judged, show
+from koopmpc.papers.registry import Claim, Tell, compared, judged, show, unwarned
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page
@@ -44,7 +43,7 @@ class Loop(NamedTuple):
         return sum(status in SOLVED for status in self.statuses)
 
 
-def work(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def motor(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     """Follow a step and a cosine, with lifted models of several draws and with local linearisations."""
     tell("motor: models")
     plant = discretize(load_problem("bilinear_motor").dynamics, DT)
@@ -135,21 +134,17 @@ def work(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     ]
 
 
-class Linearised(NamedTuple):
-    """MPC that is linearised at every step."""
-
-    mpc: LinearMPC
-
-
-def linearised(plant: StepMap, x: list[float], cost: Cost, limits: Limits) -> Linearised:
+def linearised(plant: StepMap, x: list[float], cost: Cost, limits: Limits) -> LinearMPC:
     """Return MPC with the horizon of the motor that `loop` linearises at every step."""
-    return Linearised(LinearMPC(plant, x, [0.0], cost, limits, HORIZON))
+    return LinearMPC(plant, x, [0.0], cost, limits, HORIZON)
 
 
-def loop(plant: StepMap, mpc: KoopmanMPC | Linearised, x0: list[float], reference: Float[np.ndarray, " T1"]) -> Loop:
-    """Run 300 steps after one with u = 0, which fills the delay; the reference is held over the horizon."""
-    controller = mpc.mpc if isinstance(mpc, Linearised) else mpc
-    local = isinstance(mpc, Linearised)
+def loop(plant: StepMap, controller: KoopmanMPC, x0: list[float], reference: Float[np.ndarray, " T1"]) -> Loop:
+    """Run 300 steps after one with u = 0, which fills the delay; the reference is held over the horizon.
+
+    A `LinearMPC` measures both states, and is linearised anew at every step.
+    """
+    local = isinstance(controller, LinearMPC)
     controller.reset(u_prev=[0.0])
     x, u = np.array(x0), np.zeros(1)
     if not local:

@@ -1,19 +1,19 @@
-"""A reconstruction: fit one trajectory, rebuild it from its first state, and predict held-out trajectories."""
+"""Errors of a fit: of the trajectory that it was fitted to, rebuilt from its first state, and of held-out ones."""
 
-import warnings
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import FitWarning
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.papers.plants import trajectories
+from koopmpc.papers.registry import relative, unwarned
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
@@ -21,7 +21,6 @@ from koopmpc.values import Value
 
 CUT = 1e-10  # "full rank" keeps the singular values above this share of the largest
 LINEAR = 0.05  # relative error over a whole run below which an eigenfunction counts as one
-_HUGE = 100.0  # a relative error beyond it has no digits worth reading
 _STEADY = 1e-4  # an eigenfunction with |λ − 1| below it is a constant
 
 
@@ -90,7 +89,7 @@ def rebuilt(trajectory: Episodes, lifting: Lifting, held_out: Episodes, rank: in
     kept = full if rank is None else min(rank, full)
     with unwarned():
         model = edmd(trajectory, bound, rank=kept)
-    X = reconstruction(model, episode)
+    X = predicted(model, episode)
     share = np.abs(amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)
     values = model.eigenvalues
     moving = (np.abs(values - 1) > _STEADY) & (np.imag(values) >= 0)
@@ -102,39 +101,16 @@ def rebuilt(trajectory: Episodes, lifting: Lifting, held_out: Episodes, rank: in
         width=bound.nz,
         condition=float(s[0] / s[kept - 1]),
         error=relative(X, episode.X),
-        held_out=float(np.median([relative(reconstruction(model, e), e.X) for e in held_out])),
+        held_out=float(np.median([relative(predicted(model, e), e.X) for e in held_out])),
         evolution=evolution_error(model, trajectory),
         leading=int(np.argmax(np.where(moving, share, -1.0))),
     )
 
 
-def reconstruction(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1 nx"]:
+def predicted(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1 nx"]:
     """Return x(t) = Re Φ exp(Ωt) b at the times of the episode, from its first state."""
     with np.errstate(over="ignore", invalid="ignore"):
         return reconstruct(model, episode.X[0], np.arange(len(episode.X)) * model.dt)
-
-
-def relative(X: Float[np.ndarray, "T1 nx"], truth: Float[np.ndarray, "T1 nx"]) -> float:
-    """Return ‖X − truth‖ / ‖truth‖ over all entries; inf where X left the finite numbers."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = float(np.linalg.norm(X - truth) / np.linalg.norm(truth))
-    return error if np.isfinite(error) else np.inf
-
-
-def percent(error: float) -> str:
-    """Return a relative error in %, with three digits; "diverges" where it is huge or not a number."""
-    if not error < _HUGE:
-        return "diverges"
-    value = 100 * error
-    return f"{value:.3g}" if value == 0 or value >= 1e-3 else f"{value:.1e}"
-
-
-@contextmanager
-def unwarned() -> Generator[None]:
-    """Show no FitWarning, because the tables hold the rank, the condition and the warnings of each fit."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FitWarning)
-        yield
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,3 +176,60 @@ class Setting:
         return trajectories(
             self.dynamics, starts, dt=self.dt, steps=self.steps, K=self.K, x_ref=self.x_ref, held=self.held
         )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Errors of one model on two kinds of held-out data: medians of ‖x̂ − x‖ / ‖x‖ over the episodes.
+
+    Attributes
+    ----------
+    name
+        The model and its data.
+    feedback
+        Error under the feedback of the paper, from other starts.
+    excited
+        Error under that feedback with noise on top.
+    b
+        The entry of B whose true value is largest, divided by that value; NaN for a model without B.
+    warned
+        The warning of the fit, in short.
+    """
+
+    name: str
+    feedback: float
+    excited: float
+    b: float
+    warned: str
+
+
+def centred(episodes: Episodes, x_ref: ArrayLike) -> Episodes:
+    """Return the same episodes in the coordinates x − x_ref."""
+    target = checks.vector(x_ref, "x_ref", episodes.nx)
+    return episodes.with_episodes([Episode(X=e.X - target, U=e.U, W=e.W) for e in episodes])
+
+
+def prediction(
+    name: str, model: LinearPredictor, feedback: Episodes, excited: Episodes, B: Float[np.ndarray, "nx nu"]
+) -> Prediction:
+    """Return the errors of `model` over whole episodes; a model without inputs predicts without them.
+
+    Parameters
+    ----------
+    name, model
+        The model and how the table calls it.
+    feedback, excited
+        Held-out episodes with inputs.
+    B
+        (nx, nu), ∂x⁺/∂u of the plant at the equilibrium.
+    """
+    i, j = np.unravel_index(int(np.abs(B).argmax()), B.shape)
+    share = float((model.C @ model.B)[i, j] / B[i, j]) if model.nu else np.nan
+    said = () if model.report is None else model.report.warnings
+    short = "A and B inseparable" if any("inseparable" in sentence for sentence in said) else "–"
+    return Prediction(name, _error(model, feedback), _error(model, excited), share, short)
+
+
+def _error(model: LinearPredictor, episodes: Episodes) -> float:
+    errors = [relative(model.rollout(e.X[0], e.U[:, : model.nu]), e.X) for e in episodes]
+    return float(np.median(errors))
