@@ -320,8 +320,9 @@ def _undisturbed() -> Generator[None]:
     if block is None:
         yield
         return
-    before = block(signal.SIG_BLOCK, {signal.SIGINT})
+    before = block(signal.SIG_BLOCK, ())
     try:
+        block(signal.SIG_BLOCK, {signal.SIGINT})  # it may raise a KeyboardInterrupt that came before
         yield
     finally:
         block(signal.SIG_SETMASK, before)

@@ -196,6 +196,9 @@ class Compiled:
             held = self._token.pop()
         except IndexError:
             raise busy(self) from None
+        except BaseException:  # a Ctrl-C that came right behind the pop
+            self._token.append(0)
+            raise
         try:
             start = perf_counter()
             frame = self._frame

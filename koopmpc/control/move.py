@@ -170,6 +170,9 @@ def alone(method: TurnTaker) -> TurnTaker:
             held = self._token.pop()
         except IndexError:
             raise busy(self) from None
+        except BaseException:  # a Ctrl-C that came right behind the pop
+            self._token.append(0)
+            raise
         self._inside = me
         try:
             return method(self, *arguments, **options)

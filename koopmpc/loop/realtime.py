@@ -339,8 +339,10 @@ def _signals(dog: _Watchdog, told: list[str], *, main: bool) -> Generator[None]:
         if not dog.reason:
             told.append(signal.Signals(number).name)
 
-    before = {number: signal.signal(number, heard) for number in (signal.SIGTERM, signal.SIGINT)} if main else {}
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)} if main else {}
     try:
+        for number in before:
+            signal.signal(number, heard)
         yield
     finally:
         for number, handler in before.items():

@@ -17,6 +17,7 @@ import rerun as rr
 import koopmpc as km
 from koopmpc.cli.ending import kept
 from tests.bench.tiny import write
+from tests.faults.test_controllers import BUILD, controllers, models  # noqa: F401  # fixtures
 
 SECONDS = 5.0  # of patience of a test on a busy machine; on a quiet one each command ends within one
 BOUND = km.Limits(u_min=-1, u_max=1, x_min=[-0.2, -1.0], x_max=[0.2, 1.0])
@@ -101,6 +102,67 @@ def _ctrl_c_is_heard():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+SENDER = """
+import os, random, signal, sys, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+while os.getppid() == int(sys.argv[1]):
+    os.kill(int(sys.argv[1]), signal.SIGINT)
+    time.sleep(random.uniform(0.0002, 0.004))
+"""
+
+
+@pytest.mark.parametrize("name", BUILD)
+@pytest.mark.parametrize("least", [20, pytest.param(2000, marks=pytest.mark.slow)])
+def test_a_rain_of_interrupts_is_raised_one_by_one_and_the_controller_goes_on(controllers, name, least):  # noqa: F811
+    (controller, _), rng = controllers[name], random.Random(name)
+    raised = caught = 0
+    listens = False
+
+    def answer(number, frame):
+        nonlocal listens, raised
+        if listens:
+            listens, raised = False, raised + 1
+            raise KeyboardInterrupt
+
+    def work():
+        nonlocal listens
+        listens = True
+        controller.reset()
+        for _ in range(3):
+            controller([rng.uniform(-2, 2), 0.0], [rng.uniform(-1, 1), 0.0])
+        listens = False
+
+    signal.signal(signal.SIGINT, answer)
+    sender = subprocess.Popen([sys.executable, "-S", "-c", SENDER, str(os.getpid())])
+    end = time.monotonic() + 60
+    try:
+        while raised < least and time.monotonic() < end:
+            try:
+                work()
+            except KeyboardInterrupt:
+                caught += 1
+    finally:
+        sender.kill()
+        sender.wait()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    assert caught == raised >= least  # and the signal is neither blocked nor of another handler
+    controller.reset()
+    assert np.isfinite(controller([0.1, 0.0], [0.0, 0.0]).u).all()
+
+
+def test_a_handler_that_raises_nothing_lets_the_solver_go_on(controllers):  # noqa: F811
+    controller, told = controllers["nonlinear-mpc"][0], []
+    signal.signal(signal.SIGINT, lambda number, frame: told.append(number))
+    sender = subprocess.Popen([sys.executable, "-S", "-c", SENDER, str(os.getpid())])
+    try:
+        while len(told) < 20:
+            controller.reset()
+            assert controller([0.5, 0.0], [0.1, 0.0]).status is km.Status.OPTIMAL
+    finally:
+        sender.kill()
+        sender.wait()
 
 
 def test_an_interrupt_in_the_last_iteration_of_a_solve_is_raised() -> None:

@@ -214,6 +214,9 @@ class KoopmanMPC(MPCBase):
             held = self._token.pop()
         except IndexError:
             raise busy(self) from None
+        except BaseException:  # a Ctrl-C that came right behind the pop
+            self._token.append(0)
+            raise
         try:
             start = perf_counter()
             target = numbers(reference, "reference")

@@ -106,7 +106,8 @@ class RealTimeIteration:
         stages = [A, B, self._c, Q, q, r, self._x0]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
-        self._cost = cost
+        parts, self._cost = [self.X, self.U, self._R, self._U_r, *self._terminal], zeros(1)
+        self._weigh = Routine(cost, parts, [self._cost], compiles=False)
         self._free = Routine(free, stages, [self._dX, self._dU, curvature])
         self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
         self._centring = zeros(1)
@@ -183,7 +184,8 @@ class RealTimeIteration:
 
     def cost(self) -> float:
         """Return what the plan costs, its breaches of soft limits included."""
-        return float(self._cost(self.X.T, self.U.T, self._R.T, self._U_r.T, *(each.T for each in self._terminal)))
+        self._weigh.call()
+        return float(self._cost[0])
 
     def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> StageStep:
         """Follow the central path from the unconstrained solution; where it ends early, an active-set method finishes.

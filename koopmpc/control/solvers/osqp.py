@@ -227,8 +227,10 @@ def _uninterrupted(solve: Callable[[], object]) -> None:
     with a status that says so, or forgets it in its last iteration. It is therefore sent once more.
     """
     mask = getattr(signal, "pthread_sigmask", None)  # Windows has none
-    before = None if mask is None else mask(signal.SIG_BLOCK, _SIGINT)
+    before = None if mask is None else mask(signal.SIG_BLOCK, ())
     try:
+        if mask is not None:  # in the block, for it may raise a KeyboardInterrupt that came before
+            mask(signal.SIG_BLOCK, _SIGINT)
         solve()
     finally:
         if mask is not None:
