@@ -18,7 +18,7 @@ from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.solve import RegressionRows, norms, scaled_rank
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import LinearPredictor

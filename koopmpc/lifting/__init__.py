@@ -3,11 +3,9 @@
 All families are imported here: a file or a task that holds a lifting names its class, which must be known by then.
 """
 
-from koopmpc.lifting import algebra as algebra
+from koopmpc.lifting import composed as composed
 from koopmpc.lifting import expressions as expressions
 from koopmpc.lifting import fourier as fourier
 from koopmpc.lifting import radial as radial
-from koopmpc.lifting import reduced as reduced
-from koopmpc.lifting import standardized as standardized
 from koopmpc.lifting import state as state
-from koopmpc.lifting.reduced import Projected as Projected
+from koopmpc.lifting.composed import Projected as Projected

@@ -134,7 +134,7 @@ class Lifting(Value, ABC):
 
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return both liftings one under the other; an observable that both name is held once."""
-        from koopmpc.lifting.algebra import Sum  # here, because that file imports this one
+        from koopmpc.lifting.composed import Sum  # here, because that file imports this one
 
         other = lifting_of(other)
         parts = [part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))]
@@ -145,7 +145,7 @@ class Lifting(Value, ABC):
 
     def __mul__(self, other: "Lifting") -> "Lifting":
         """Return all products of this lifting's observables with the other's."""
-        from koopmpc.lifting.algebra import Product  # here, because that file imports this one
+        from koopmpc.lifting.composed import Product  # here, because that file imports this one
 
         product = Product(self, lifting_of(other))
         bound = self._common(other)

@@ -16,7 +16,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.composed import Projected
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _ROUNDING = float(np.finfo(float).eps)

@@ -12,11 +12,10 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.fits.edmd import Towards
-from koopmpc.lifting.algebra import Sum
 from koopmpc.lifting.base import Lifting, lifting_of, short
+from koopmpc.lifting.composed import Standardized, Sum
 from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
-from koopmpc.lifting.standardized import Standardized
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.values import Arrays, Value, from_data, to_data
 

@@ -14,9 +14,8 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.variable_projection import VariableProjection, Windows
+from koopmpc.identify.variable_projection import Tuning, VariableProjection, Windows
 from koopmpc.lifting.base import Lifting, lifting_of
-from koopmpc.lifting.tuning import Tuning
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.scoring import score
 

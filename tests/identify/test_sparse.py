@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.identify.fits.sparse import lasso
-from koopmpc.lifting.reduced import Picked
+from koopmpc.lifting.composed import Picked
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.identify.constrained.convex import lyapunov_fit
-from koopmpc.identify.constrained.nearest_stable import Misfit, clipped, nearest, radius_of
+from koopmpc.identify.constrained.stable import Misfit, clipped, nearest, radius_of
 from tests.identify.plants import brute_force, random_episodes
 
 

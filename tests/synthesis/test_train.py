@@ -12,8 +12,7 @@ from scipy.optimize import approx_fprime
 
 import koopmpc as km
 from koopmpc.data.source import source_of
-from koopmpc.identify.variable_projection import VariableProjection, Windows
-from koopmpc.lifting.tuning import Tuning
+from koopmpc.identify.variable_projection import Tuning, VariableProjection, Windows
 from koopmpc.synthesis.train import _drawn
 
 PLANT = km.black_box(

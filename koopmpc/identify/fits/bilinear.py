@@ -17,7 +17,7 @@ from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.regression import FitResult, fit_report, regression_of, scale_factor
 from koopmpc.identify.solve import RegressionRows, Ridge, about_means, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.composed import Projected
 from koopmpc.predict.predictors import BilinearPredictor
 
 

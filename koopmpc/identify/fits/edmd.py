@@ -16,7 +16,7 @@ from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
 from koopmpc.identify.solve import RegressionRows, Ridge, Solution, doubts, orthonormal, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor

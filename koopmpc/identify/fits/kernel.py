@@ -13,9 +13,8 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.solve import Ridge
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.composed import Projected, Standardized
 from koopmpc.lifting.radial import Gaussian, PolynomialKernel
-from koopmpc.lifting.reduced import Projected
-from koopmpc.lifting.standardized import Standardized
 from koopmpc.predict.predictors import LinearPredictor
 
 _CUT = 1e-11  # eigenvalue of the kernel's matrix, relative to the largest, below which rounding decides

@@ -17,7 +17,7 @@ from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, doubts, norms, onto, solve
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.reduced import Picked
+from koopmpc.lifting.composed import Picked
 from koopmpc.predict.predictors import LinearPredictor
 
 _STEPS = 20_000  # steps of the proximal gradient method, at most

@@ -12,7 +12,7 @@ from koopmpc.figures.plane import eigenfunctions
 from koopmpc.figures.plots import Plot, plots
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.reduced import Projected
+from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Claim, judged, percent, relative

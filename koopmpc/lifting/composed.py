@@ -1,0 +1,292 @@
+"""Liftings made of others: a + b and a * b, a few directions or observables of one, and one of standardized states."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import accumulate
+from zlib import crc32
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import CONSTANT, Indices, Lifting, lifting_of, short
+from koopmpc.values import freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Sum(Lifting):
+    """ψ(x) = [ψ₁(x); ψ₂(x); …] without observables that an earlier part holds by name; written ``a + b``."""
+
+    parts: tuple[Lifting, ...]
+
+    def bind(self, states: Sequence[str]) -> "Sum":
+        """Return the sum of the bound parts."""
+        return Sum(tuple(part.bind(states) for part in self.parts), bound=tuple(states))
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of all parts, each once."""
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the new observables of each part, one under the other."""
+        columns = [part.formula(x) for part in self.parts]
+        return ca.vertcat(*(z[int(i)] for z, new in zip(columns, self._new, strict=True) for i in new))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        ends = accumulate(len(new) for new in self._new)
+        for part, new, end in zip(self.parts, self._new, ends, strict=True):
+            own = Z[:, end - len(new) : end]
+            if len(new) == part.nz:
+                part._fill(x, own)
+            elif len(new):
+                whole = np.empty((len(Z), part.nz))
+                part._fill(x, whole)
+                own[:] = whole[:, new]
+
+    @cached_property
+    def _new(self) -> tuple[Indices, ...]:
+        """For each part the indices of the observables that no earlier part names."""
+        held: set[str] = set()
+        new: list[Indices] = []
+        for part in self.parts:
+            new.append(np.array([i for i, name in enumerate(part.names) if name not in held], dtype=np.intp))
+            held.update(part.names)
+        return tuple(new)
+
+
+@dataclass(frozen=True, eq=False)
+class Product(Lifting):
+    """ψ(x) = aᵢ(x) bⱼ(x) for every i and j; written ``a * b``.
+
+    A product that comes twice, as x₁ x₂ and x₂ x₁ do, is held once. Factors of a name stand in one order,
+    states first and without their units, so ``State() * State()`` names what ``Monomials(2)`` does.
+    """
+
+    first: Lifting
+    second: Lifting
+
+    def bind(self, states: Sequence[str]) -> "Product":
+        """Return the product of the bound liftings."""
+        bound = Product(self.first.bind(states), self.second.bind(states), bound=tuple(states))
+        _ = bound.names
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"omega*sin(theta)"`` and ``"theta^2"``."""
+        return tuple(self._pairs)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the products, the first lifting's observables the slow index."""
+        a, b = self.first.formula(x), self.second.formula(x)
+        return ca.vertcat(*(a[int(i)] * b[int(j)] for i, j in self._pairs.values()))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        a, b = np.empty((len(Z), self.first.nz)), np.empty((len(Z), self.second.nz))
+        self.first._fill(x, a)
+        self.second._fill(x, b)
+        left, right = np.array(list(self._pairs.values()), dtype=np.intp).T
+        np.multiply(a[:, left], b[:, right], out=Z)
+
+    @cached_property
+    def _pairs(self) -> dict[str, tuple[int, int]]:
+        """Indices of the two factors by the name of their product; of those with one name the first."""
+        plain = [short(state) for state in self.bound_states]
+        names = plain if len(set(plain)) == len(plain) else list(self.bound_states)
+        order = {state: (i, name) for i, (state, name) in enumerate(zip(self.bound_states, names, strict=True))}
+        found: dict[str, tuple[int, int]] = {}
+        for i, left in enumerate(self.first.names):
+            for j, right in enumerate(self.second.names):
+                found.setdefault(_name(left, right, order), (i, j))
+        return found
+
+
+def _name(left: str, right: str, states: dict[str, tuple[int, str]]) -> str:
+    """Return the name of the product; `states` gives the place and the plain name of each state."""
+    if CONSTANT in (left, right):
+        return right if left == CONSTANT else left
+    pair = sorted((left, right), key=lambda name: (name not in states, states.get(name, (0, ""))[0], name))
+    a, b = (states[name][1] if name in states else name for name in pair)
+    if left == right:
+        return f"({a})^2" if "*" in a or "^" in a else f"{a}^2"
+    return f"{a}*{b}"
+
+
+@dataclass(frozen=True, eq=False)
+class Projected(Lifting):
+    """z = basisᵀ ψ(x): r coordinates of another lifting, as a rank-truncated fit uses them.
+
+    Parameters
+    ----------
+    lifting
+        ψ, of nz observables.
+    basis
+        (nz, r), a direction a column.
+
+    Raises
+    ------
+    ShapeError
+        The basis has not one row for each observable.
+    """
+
+    lifting: Lifting
+    basis: Float[np.ndarray, "nz r"]
+
+    def __post_init__(self) -> None:
+        freeze(self, basis=checks.array(self.basis, "basis", (None, None)))
+
+    def bind(self, states: Sequence[str]) -> "Projected":
+        """Return the copy on the bound lifting."""
+        bound = replace(self, lifting=self.lifting.bind(states), bound=tuple(states))
+        if bound.lifting.nz != len(self.basis):
+            raise ShapeError(
+                f"basis has {len(self.basis)} rows, the lifting returns {bound.lifting.nz} observables; "
+                "pass the lifting that the basis was made for"
+            )
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return ``"z0", "z1", …``."""
+        return tuple(f"z{j}" for j in range(self.basis.shape[1]))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the r coordinates basisᵀ ψ(x)."""
+        return ca.DM(np.ascontiguousarray(self.basis.T)) @ self.lifting.formula(x)
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M r"]) -> None:
+        whole = np.empty((len(Z), len(self.basis)))
+        self.lifting._fill(x, whole)
+        np.matmul(whole, self.basis, out=Z)
+
+
+@dataclass(frozen=True, eq=False)
+class Picked(Lifting):
+    """ψ(x) = the observables of another lifting at `which`, under their own names; the others are not computed.
+
+    Parameters
+    ----------
+    lifting
+        The lifting that holds the observables.
+    which
+        Indices of the observables to keep.
+
+    Raises
+    ------
+    DataError
+        An index is not below the number of observables.
+    """
+
+    lifting: Lifting
+    which: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        freeze(self, which=tuple(int(i) for i in self.which))
+
+    def bind(self, states: Sequence[str]) -> "Picked":
+        """Return the copy on the bound lifting."""
+        bound = replace(self, lifting=self.lifting.bind(states), bound=tuple(states))
+        bad = [i for i in self.which if not 0 <= i < bound.lifting.nz]
+        if bad:
+            raise DataError(f"which holds {bad[0]}; the lifting has observables 0 … {bound.lifting.nz - 1}")
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of the chosen observables."""
+        return tuple(self.lifting.names[i] for i in self.which)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the chosen observables."""
+        z = self.lifting.formula(x)
+        return ca.vertcat(*(z[i] for i in self.which))
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Standardized(Lifting):
+    """ψ(x) = inner((x − mean) / scale): the inner lifting sees states of mean 0 and spread 1.
+
+    A lifting with a width or a distance (Gaussian, ThinPlate, RandomFourier) then weighs every state alike, whatever
+    its unit, and its centres and widths are in standard deviations. `Standardized.of(episodes, lifting)` computes mean
+    and scale from data.
+
+    Parameters
+    ----------
+    lifting
+        The inner lifting.
+    mean, scale
+        (nx,) in the states' units; scale above zero.
+
+    Raises
+    ------
+    ShapeError
+        Mean and scale have not one entry for each state.
+    DataError
+        A scale is not above zero.
+    """
+
+    lifting: Lifting
+    mean: Float[np.ndarray, " nx"]
+    scale: Float[np.ndarray, " nx"]
+
+    def __init__(
+        self, lifting: Lifting, mean: ArrayLike, scale: ArrayLike, *, bound: tuple[str, ...] | None = None
+    ) -> None:
+        center = checks.array(mean, "mean", (None,))
+        spread = checks.array(scale, "scale", center.shape)
+        if (spread <= 0).any():
+            raise DataError(f"scale holds {spread.min():g}; it must be above zero for every state")
+        freeze(self, lifting=lifting_of(lifting), mean=center, scale=spread, bound=bound)
+
+    @classmethod
+    def of(cls, episodes: Episodes | Source, lifting: Lifting) -> "Standardized":
+        """Return the lifting standardized by the mean and the standard deviation of the states in these data.
+
+        The states are x_0 … x_{T−1} of each episode, read part by part. A state that does not move keeps its unit:
+        its scale is 1.
+
+        Raises
+        ------
+        DataError
+            The source can be read once only, and the fit needs it too.
+        """
+        source = source_of(episodes)
+        if not source.replayable:
+            raise DataError("a stream is read once, by the fit; take Standardized.of from some episodes of it")
+        rows, mean, squares = 0, np.zeros(source.nx), np.zeros(source.nx)
+        for part in source.parts():
+            for episode in part.load():  # Chan, Golub & LeVeque 1983: two means and sums of squares become one
+                X = episode.X[:-1]
+                own, rows = X.mean(axis=0), rows + len(X)
+                step = (own - mean) * len(X) / rows
+                squares += ((X - own) ** 2).sum(axis=0) + (own - mean) * step * (rows - len(X))
+                mean = mean + step
+        scale = np.sqrt(squares / max(rows, 1))
+        still = scale <= 1e-12 * np.abs(mean)
+        return cls(lifting, mean, np.where(still, 1.0, scale))
+
+    def bind(self, states: Sequence[str]) -> "Standardized":
+        """Return the copy on the bound inner lifting."""
+        if len(states) != len(self.mean):
+            raise ShapeError(
+                f"mean and scale have {len(self.mean)} entries and there are {len(states)} states "
+                f"({', '.join(states)}); standardize by data of these states"
+            )
+        bound = Standardized(self.lifting.bind(states), self.mean, self.scale, bound=tuple(states))
+        _ = bound.names
+        return bound
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the inner names with ``~`` and a checksum of mean and scale: other numbers give other observables."""
+        tag = f"~{crc32(self.mean.tobytes() + self.scale.tobytes()):08x}"
+        return tuple(name if name == CONSTANT else name + tag for name in self.lifting.bind(states).names)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the inner formula of the standardized states."""
+        return self.lifting.formula((x - ca.DM(self.mean)) / ca.DM(self.scale))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        self.lifting._fill((x - self.mean[:, None]) / self.scale[:, None], Z)
