@@ -108,6 +108,17 @@ def weight(value: ArrayLike, name: str, size: int | None = None, *, definite: bo
     return result
 
 
+def root(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return the root of a weight, F with FᵀF = P ⪰ 0, by its eigenvalues in the units of `weight`.
+
+    Eigenvalues below 0 are rounding.
+    """
+    size = np.sqrt(np.maximum(P.diagonal(), 0.0))
+    live = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(P / np.outer(live, live))
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * size
+
+
 def names(given: Sequence[str] | None, what: str, letter: str, size: int) -> tuple[str, ...]:
     """Return `size` names: those given, or ``x0, x1, …`` with this letter.
 

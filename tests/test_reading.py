@@ -54,9 +54,9 @@ followed("simulate", lambda: km.simulate(plant, mpc, x0=[0.3, 0], reference=[0, 
 MOST = {  # files, returns
     "edmd": (8, 6),
     "bilinear_edmd": (8, 6),
-    "KoopmanMPC": (15, 6),
+    "KoopmanMPC": (14, 6),
     "step": (6, 3),
-    "BilinearMPC": (14, 6),
+    "BilinearMPC": (12, 6),
     "bilinear_step": (8, 6),
     "simulate": (10, 8),
 }

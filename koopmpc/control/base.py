@@ -1,9 +1,10 @@
-"""MPCBase: what predictive controllers share: where a plan starts, its deadline, and what a failed step does."""
+"""MPCBase: what predictive controllers share: where a plan starts, move blocks, deadlines, what a failed step does."""
 
 import copy
 from collections import deque
+from collections.abc import Sequence
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -159,6 +160,32 @@ class InitialCondition:
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
 
+def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
+    """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
+
+    They are N ones, or M moves of which the last is held, or `moves` itself.
+
+    Raises
+    ------
+    DataError
+        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
+    """
+    N = checks.count(horizon, "horizon")
+    if moves is None:
+        return (1,) * N
+    if isinstance(moves, Sequence):
+        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
+        if sum(lengths) != N:
+            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
+        return lengths
+    if not isinstance(cast(object, moves), int | np.integer):
+        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
+    M = checks.count(moves, "moves")
+    if M > N:
+        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
+    return (1,) * (M - 1) + (N - M + 1,)
+
+
 class MPCBase(Savable):
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
@@ -175,16 +202,16 @@ class MPCBase(Savable):
         The model of the plan.
     tracking
         The tracked and limited outputs, with their weights and limits.
-    blocks, move_of
-        Lengths of the blocks of held inputs, and which of a plan's moves each of the N steps takes.
+    moves, horizon
+        N steps, and which of them hold their inputs, see `blocked`.
     observer, estimator
         The observer of this controller, and the rule that started it, None where y is the state.
     latency
         Steps until the first input of a plan acts.
     time_limit
         Wall-clock time of a step [s].
-    with_rates
-        Whether the last input matters, for a weight or a limit of the changes.
+    stagewise
+        Whether a plan has an input of each step, held ones being changes of 0, or one of each block.
     monitor
         What tells of each step whether the model knows it; None where that is not asked.
     """
@@ -197,27 +224,30 @@ class MPCBase(Savable):
         dt: float,
         model: LinearPredictor | StateModel,
         tracking: Tracking[Any],
-        blocks: tuple[int, ...],
+        moves: int | Sequence[int] | None,
+        horizon: int,
         observer: StateObserver,
         estimator: Estimator | None,
         latency: int,
         time_limit: float | None,
         *,
-        with_rates: bool,
-        move_of: Int[np.ndarray, " N"],
+        stagewise: bool,
         monitor: Monitor | None = None,
     ) -> None:
         self.cost, self.limits = tracking.cost, tracking.limits
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
-        self.dt, self.nu, self._N = dt, len(self._inputs.low), len(move_of)
+        self.dt, self.nu = dt, len(self._inputs.low)
+        self._blocks = blocks = blocked(moves, horizon)
+        self._N = N = sum(blocks)
         self._latency = checks.count(latency, "latency", 0)
-        self.horizon = self._N + self._latency  # steps of preview
-        self._blocks, self._move_of, self._with_rates = blocks, move_of, with_rates
+        self.horizon = N + self._latency  # steps of preview
+        self._move_of: Int[np.ndarray, " N"] = np.arange(N) if stagewise else np.repeat(np.arange(len(blocks)), blocks)
+        self._with_rates = tracking.with_rates or (stagewise and len(blocks) < N)
         self._time_limit = time_limit
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
         self._estimator = estimator
         self._initial = InitialCondition(
-            model, observer, self._N, self._latency, with_rates=with_rates, estimated=estimator is not None
+            model, observer, N, self._latency, with_rates=self._with_rates, estimated=estimator is not None
         )
         self._token: Token = [0]
         self._inside = 0

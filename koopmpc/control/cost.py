@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.limits import Interval, Limits, Softness, half_width, magnitude
-from koopmpc.control.riccati import root
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, rows
 from koopmpc.lifting.state import State
@@ -331,8 +330,8 @@ def _tracking(
         sized.rows.margin,
         R_delta is not None or sized.rates is not None,
         rows,
-        root(Q),
-        root(R),
+        checks.root(Q),
+        checks.root(R),
         sizes,
     )
 

@@ -1,28 +1,36 @@
-"""Horizon: a cost over N steps of a lifted model as stages of linear–quadratic control, one a block of held inputs.
+"""Horizon: a cost over N steps of a lifted model as stages of control, then as matrices; builds, and never solves.
 
-The stages are written in f = [w_0 … w_{N−1}; d; 1], the preview of measured disturbances and a constant disturbance of
-z: what moves the state. What is only tracked, references and the coordinates of targets, comes in when the horizon is
-condensed.
+The stages, one a block of held inputs, are written in f = [w_0 … w_{N−1}; d; 1], the preview of measured disturbances
+and a constant disturbance of z: what moves the state. What is only tracked, references and the coordinates of targets,
+comes in when the horizon is condensed.
 
-Recursions and rank decisions lose digits where entries differ by many powers of ten, and where observables are almost
-dependent. So a linear problem is solved in units in which those of a model and of its user mean nothing: z = L q,
-u = D_u ũ, r = D_r r̃, limited outputs D_g g̃, and a cost of `scale` times its own unit.
+In Riccati coordinates, u_j = −K_j ξ_j + v_j f + √unit L_j⁻ᵀ w_j with S_j = R + BᵀP_{j+1}B = L_j L_jᵀ, the cost is
+constant + unit · Σ ‖w_j‖²: w = 0 is the unconstrained optimum, and the Hessian is the identity even where the plant is
+unstable and plain condensing (u as the variable) has lost all its digits. In plain coordinates w is u less its
+unconstrained optimum, and the Hessian is what the Riccati coordinates say of it.
+
+References only add to the cost what is linear in w, −2 Σ (C z_k)ᵀQ r_k and so on, with z_k as w moves it. As the
+Hessian is unit · I, they shift the minimiser by −gradient / (2 unit).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 
-from koopmpc import checks
-from koopmpc.control.cost import Cost, LiftedTracking
-from koopmpc.control.riccati import Stage
-from koopmpc.control.target import Targets, observable_sizes
-from koopmpc.errors import DataError
+from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.riccati import Law, Stage
+from koopmpc.control.target import Targets, Units
 from koopmpc.predict.predictors import LinearPredictor
+
+Coordinates = Literal["auto", "riccati", "plain"]
+# cond(H) up to which OSQP in plain coordinates is no slower. Measured on random plants: limits on inputs alone take
+# up to half the time from 1e3 to 1e5 and 25 times as much beyond 1e6; with limited outputs 4 times as much from 3e4.
+WELL_CONDITIONED = 1e3
+INPUTS_ALONE = 1e5
 
 
 class SignalLayout(NamedTuple):
@@ -33,32 +41,6 @@ class SignalLayout(NamedTuple):
     nw: int
     nd: int
     size: int
-
-
-def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
-    """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
-
-    They are N ones, or M moves of which the last is held, or `moves` itself.
-
-    Raises
-    ------
-    DataError
-        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
-    """
-    N = checks.count(horizon, "horizon")
-    if moves is None:
-        return (1,) * N
-    if isinstance(moves, Sequence):
-        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
-        if sum(lengths) != N:
-            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
-        return lengths
-    if not isinstance(cast(object, moves), int | np.integer):
-        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
-    M = checks.count(moves, "moves")
-    if M > N:
-        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
-    return (1,) * (M - 1) + (N - M + 1,)
 
 
 @dataclass(frozen=True)
@@ -102,6 +84,25 @@ class Horizon:
         e[:, signals.w[k]] = self.E
         e[:, signals.d] = np.eye(len(self.A), signals.nd)
         return e
+
+    def in_units(self, units: Units) -> "Horizon":
+        """Return the same horizon in these units."""
+        L, inverse, inputs, C, G, scale = units
+
+        def measured(weight: Float[np.ndarray, "n n"], size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+            return weight * np.outer(size, size) / scale
+
+        return replace(
+            self,
+            A=inverse @ self.A @ L,
+            B=inverse @ self.B * inputs,
+            E=inverse @ self.E,
+            C=self.C @ L / C[:, None],
+            G=self.G @ L / G[:, None],
+            Q=measured(self.Q, C),
+            R=measured(self.R, inputs),
+            R_delta=None if self.R_delta is None else measured(self.R_delta, inputs),
+        )
 
 
 def stages(horizon: Horizon, targets: Targets) -> list[Stage]:
@@ -189,77 +190,155 @@ def horizon_of(
     )
 
 
-class Units(NamedTuple):
-    """L, its inverse, and the diagonals of D_u, D_r and D_g; see the file."""
+class Terminal(NamedTuple):
+    """V = ξ_NᵀP ξ_N + 2 ξ_Nᵀ(p f + p_r r_N + p_α α_N + p_u u_N) + const, ξ_N = z_N or [z_N; u_{N−1}].
 
-    L: Float[np.ndarray, "nz nz"]
-    inverse: Float[np.ndarray, "nz nz"]
-    inputs: Float[np.ndarray, " nu"]
-    tracked: Float[np.ndarray, " nr"]
-    limited: Float[np.ndarray, " ng"]
-    scale: float
+    f are the horizon's signals, r_N the last reference row, α_N the coordinates of its target and u_N its input target
+    where that is given as numbers.
+    """
 
-    @staticmethod
-    def of(predictor: LinearPredictor, track: LiftedTracking) -> "Units":
-        """Return the units of a predictor under a cost and limits.
-
-        L is the transposed factor of the lifted data, in which q has root-mean-square 1 in every direction; for a model
-        that was not fitted the sizes of its observables.
-        """
-        known = predictor.scale
-        L = np.diag(observable_sizes(predictor, track.sizes)) if known is None else known.T.copy()
-        inverse = np.asarray(solve_triangular(L, np.eye(len(L)), lower=True))
-        C, G = (_norms(rows @ L) for rows in (track.tracked, track.limited))
-        return Units(L, inverse, track.sizes.inputs, C, G, track.sizes.scale)
-
-    def horizon(self, h: Horizon) -> Horizon:
-        """Return a horizon in these units."""
-        A, B, E = self.inverse @ h.A @ self.L, self.inverse @ h.B * self.inputs, self.inverse @ h.E
-        C, G = h.C @ self.L / self.tracked[:, None], h.G @ self.L / self.limited[:, None]
-        R_delta = None if h.R_delta is None else self._weight(h.R_delta, self.inputs)
-        Q, R = self._weight(h.Q, self.tracked), self._weight(h.R, self.inputs)
-        return replace(h, A=A, B=B, E=E, C=C, G=G, Q=Q, R=R, R_delta=R_delta)
-
-    def targets(self, targets: Targets) -> Targets:
-        """Return targets, as far as a horizon reads them, in these units."""
-        return replace(
-            targets,
-            z0=self.inverse @ targets.z0,
-            Z=self.inverse @ targets.Z,
-            u0=targets.u0 / self.inputs,
-            W=targets.W / self.inputs[:, None],
-            z_disturbance=self.inverse @ targets.z_disturbance @ self.L,
-            u_disturbance=targets.u_disturbance @ self.L / self.inputs[:, None],
-        )
-
-    def cost(self, cost: Cost) -> Cost:
-        """Return a cost with its Q_N in these units."""
-        if cost.Q_N is None:
-            return cost
-        Q_N = np.asarray(cost.Q_N)
-        if Q_N.ndim < 2:
-            Q_N = np.diag(np.broadcast_to(Q_N, Q_N.shape or (len(self.tracked),)))
-        if len(Q_N) == len(self.L) and len(Q_N) != len(self.tracked):
-            return replace(cost, Q_N=self.L.T @ Q_N @ self.L / self.scale)
-        return replace(cost, Q_N=self._weight(Q_N, self.tracked)) if len(Q_N) == len(self.tracked) else cost
-
-    def gain(self, K: Float[np.ndarray, "nu nx"]) -> Float[np.ndarray, "nu nx"]:
-        """Return the gain of [z; u_{k−1}], or of z, of one in these units."""
-        return self.inputs[:, None] * K @ self._back(K.shape[1])
-
-    def value(self, P: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx nx"]:
-        """Return the P of a value of [z; u_{k−1}], or of z, of one in these units."""
-        back = self._back(len(P))
-        return self.scale * back.T @ P @ back
-
-    def _back(self, size: int) -> Float[np.ndarray, "nx nx"]:
-        """Return what takes [z; u_{k−1}], or z, into these units."""
-        return self.inverse if size == len(self.inverse) else block_diag(self.inverse, np.diag(1 / self.inputs))
-
-    def _weight(self, Q: Float[np.ndarray, "n n"], size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-        return Q * np.outer(size, size) / self.scale
+    P: Float[np.ndarray, "nx nx"]
+    p: Float[np.ndarray, "nx nf"]
+    reference: Float[np.ndarray, "nx nr"]
+    target: Float[np.ndarray, "nx na"]
+    given: Float[np.ndarray, "nx nu"]
 
 
-def _norms(rows: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, " n"]:
-    size = np.linalg.norm(rows, axis=1)
-    return np.where(size > 0, size, 1.0)
+@dataclass(frozen=True)
+class Condensed:
+    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N] = F_x ξ_0 + F_r r + F_α α + F_u u_r + F_g g + f + D w, a u a block.
+
+    ξ_0 is z_0, or [z_0; u_{−1}]; r holds the N + 1 reference rows one after the other, α the targets' coordinates of
+    the same rows, u_r their input targets where these are given as numbers, g the preview of disturbances. The changes
+    of u are there where they have limits.
+
+    Above the unconstrained optimum the cost is unit · wᵀH w, unit the mean diagonal of S_0: w has the size of u, and
+    a cost in other units gives the same QP.
+    """
+
+    from_state: Float[np.ndarray, "n nx"]
+    from_reference: Float[np.ndarray, "n nR"]
+    from_target: Float[np.ndarray, "n nT"]
+    from_given: Float[np.ndarray, "n nI"]
+    from_drive: Float[np.ndarray, "n ng"]
+    offset: Float[np.ndarray, " n"]
+    deviation: Float[np.ndarray, "n nw"]
+    hessian: Float[np.ndarray, "nw nw"]
+    unit: float
+    coordinates: str
+
+
+def condense(
+    horizon: Horizon, law: Law, terminal: Terminal, targets: Targets, units: Units, coordinates: Coordinates
+) -> Condensed:
+    """Return the maps of a horizon in these units whose blocks follow `law`; "auto" chooses coordinates by cond(H)."""
+    h, signals = horizon, horizon.signals
+    moves, nu, nx = law.K.shape
+    nz, ng, nf = len(h.A), len(h.G), signals.size
+    n = moves * nu
+    unit = float((law.L[0] ** 2).sum()) / nu
+    spread = np.sqrt(unit) * np.linalg.inv(law.L).transpose(0, 2, 1)
+
+    U = np.empty((moves, nu, nx + nf + n))  # u of each move as a matrix on [ξ_0; f; w], and z of each step
+    Z = np.empty((h.N, nz, nx + nf + n))
+    X = np.zeros((nx, nx + nf + n))
+    X[:, :nx] = np.eye(nx)
+    last = X[nz:].copy()
+    k = 0
+    for j, b in enumerate(h.blocks):
+        u = U[j]
+        np.dot(-law.K[j], X, out=u)
+        u[:, nx : nx + nf] += law.v[j]
+        u[:, nx + nf + j * nu : nx + nf + (j + 1) * nu] += spread[j]
+        if h.with_rates:
+            X[nz:] = u
+        Bu = h.B @ u
+        for _ in range(b):
+            z = Z[k]
+            np.dot(h.A, X[:nz], out=z)
+            z += Bu
+            moved = h.disturbance(k)
+            if moved is not None:
+                z[:, nx : nx + nf] += moved
+            X[:nz] = z
+            k += 1
+    rows = [U.reshape(n, -1)]
+    if h.bounded:
+        rows.append((U - np.concatenate([last[None], U[:-1]])).reshape(n, -1))
+    v = np.vstack([*rows, (h.G @ Z).reshape(h.N * ng, Z.shape[2])])
+    W = v[:, nx + nf :]
+    reference, target, given = _asked(h, terminal, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
+    most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
+    chosen, deviation, hessian = _coordinates(W, n, coordinates, most)
+    maps = Condensed(
+        v[:, :nx],
+        W @ (reference / unit),
+        W @ (target / unit),
+        W @ (given / unit),
+        v[:, nx : nx + nf - 1],
+        v[:, nx + nf - 1],
+        deviation,
+        hessian,
+        unit,
+        chosen,
+    )
+    return _of_model(maps, h, units)
+
+
+def _of_model(maps: Condensed, h: Horizon, units: Units) -> Condensed:
+    """Return the maps of a horizon in these units, in those of the model."""
+    moves = len(h.blocks) * (1 + h.bounded)
+    rows = np.concatenate([np.tile(units.inputs, moves), np.tile(units.limited, h.N)])[:, None]
+    back = units.inverse if h.size == len(units.inverse) else block_diag(units.inverse, np.diag(1 / units.inputs))
+    drive, nd = maps.from_drive.copy(), h.signals.nd
+    if nd:
+        drive[:, -nd:] = drive[:, -nd:] @ units.inverse
+    return replace(
+        maps,
+        from_state=rows * (maps.from_state @ back),
+        from_reference=rows * maps.from_reference / np.tile(units.tracked, h.N + 1),
+        from_target=rows * maps.from_target,
+        from_given=rows * maps.from_given / np.tile(units.inputs, h.N + 1),
+        from_drive=rows * drive,
+        offset=rows[:, 0] * maps.offset,
+        deviation=rows * maps.deviation,
+        unit=units.scale * maps.unit,
+    )
+
+
+def _asked(
+    h: Horizon,
+    terminal: Terminal,
+    targets: Targets,
+    U: Float[np.ndarray, "moves nu nw"],
+    Z: Float[np.ndarray, "N nz nw"],
+) -> tuple[Float[np.ndarray, "nw nR"], Float[np.ndarray, "nw nT"], Float[np.ndarray, "nw nI"]]:
+    """Return what the references, the coordinates of their targets and given input targets ask of w, times unit."""
+    nw, nr, na, nu = U.shape[2], len(h.C), targets.Z.shape[1], U.shape[1]
+    reference, target, given = (np.zeros((nw, h.N + 1, columns)) for columns in (nr, na, nu))
+    reference[:, 1 : h.N] = (Z[:-1].transpose(2, 0, 1) @ h.C.T) @ h.Q
+    given[:, : h.N] = np.repeat(U, h.blocks, axis=0).transpose(2, 0, 1) @ h.R
+    target[:, : h.N] = given[:, : h.N] @ targets.W
+    last = np.vstack([Z[-1], U[-1]])[: h.size].T  # ξ_N
+    for asked, linear in ((reference, terminal.reference), (target, terminal.target), (given, terminal.given)):
+        asked[:, h.N] = -last @ linear
+    return reference.reshape(nw, -1), target.reshape(nw, -1), given.reshape(nw, -1)
+
+
+def _coordinates(
+    deviation: Float[np.ndarray, "nv nw"], n: int, wanted: Coordinates, limit: float
+) -> tuple[str, Float[np.ndarray, "nv nw"], Float[np.ndarray, "nw nw"]]:
+    """Return the coordinates, the deviation of v in them, and H; the first n rows of `deviation` are the inputs'."""
+    if wanted != "riccati":
+        back = np.linalg.inv(deviation[:n])  # w of the Riccati coordinates from u less its optimum
+        H = back.T @ back
+        if wanted == "plain" or _condition(H) <= limit:
+            plain = deviation @ back
+            plain[:n] = np.eye(n)
+            return "plain", plain, H
+    return "riccati", np.ascontiguousarray(deviation), np.eye(n)
+
+
+def _condition(H: Float[np.ndarray, "n n"]) -> float:
+    least, most = np.linalg.eigvalsh(H)[[0, -1]]
+    return float(most / least) if least > 0 else np.inf

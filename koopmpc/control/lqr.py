@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
-from koopmpc.control.horizon import Units, horizon_of
+from koopmpc.control.horizon import horizon_of
 from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
 from koopmpc.control.riccati import Gain
-from koopmpc.control.target import targets_of
+from koopmpc.control.target import Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
@@ -66,7 +66,7 @@ class LQR:
         self.predictor, self.cost, self.limits = predictor, cost, limits
         track = lifted_tracking(predictor, cost, Limits() if limits is None else limits)
         units, C = Units.of(predictor, track), track.tracked
-        h = units.horizon(horizon_of(predictor, track, (1,), disturbed=False))
+        h = horizon_of(predictor, track, (1,), disturbed=False).in_units(units)
         rest = tail_of(tail_stage(h.A, h.B, h.E, h.C, h.Q, h.R, h.R_delta), None)
         self.gain = Gain(units.gain(rest.K), units.value(rest.P))
         told = np.concatenate([np.ones(predictor.nw), units.tracked, units.inputs])

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dpotrs
 
+from koopmpc.checks import root
 from koopmpc.errors import DataError, DefinitenessError
 
 DIGITS, LOST = 1e-9, 1e-6  # what a step may lose of P; by how much of its size P may be indefinite
@@ -172,14 +173,6 @@ def _joint(stage: Stage) -> Float[np.ndarray, "n n"]:
     """Return the weight of [u; x] in a stage."""
     M = np.zeros(stage.B.shape) if stage.M is None else stage.M
     return np.block([[stage.R, M.T], [M, stage.Q]])
-
-
-def root(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return F with FᵀF = P ⪰ 0, by the eigenvalues of P on a diagonal of ones; those below 0 are rounding."""
-    size = np.sqrt(np.maximum(P.diagonal(), 0.0))
-    live = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(P / np.outer(live, live))
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * size
 
 
 def step(

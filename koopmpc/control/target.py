@@ -1,13 +1,14 @@
-"""Targets: the equilibrium (z_r, u_r) that holds a reference, or comes nearest to it inside the limits."""
+"""Targets: the equilibrium (z_r, u_r) that holds a reference, or comes nearest to it inside the limits; and Units."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space, solve_triangular
 
 from koopmpc import checks
-from koopmpc.control.cost import LiftedTracking, Sizes
+from koopmpc.control.cost import Cost, LiftedTracking, Sizes
 from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolver
@@ -116,6 +117,78 @@ def observable_sizes(predictor: LinearPredictor, sizes: Sizes) -> Float[np.ndarr
     if seen.shape != (predictor.nz,):  # a reduced model
         return np.ones(predictor.nz)
     return np.where(np.isfinite(seen) & (seen > _LEAST), seen, 1.0)
+
+
+class Units(NamedTuple):
+    """The units of a linear problem: L, its inverse, and the diagonals of D_u, D_r and D_g.
+
+    Recursions and rank decisions lose digits where entries differ by many powers of ten, and where observables are
+    almost dependent. So a problem is solved in units in which those of a model and of its user mean nothing: z = L q,
+    u = D_u ũ, r = D_r r̃, limited outputs D_g g̃, and a cost of `scale` times its own unit.
+    """
+
+    L: Float[np.ndarray, "nz nz"]
+    inverse: Float[np.ndarray, "nz nz"]
+    inputs: Float[np.ndarray, " nu"]
+    tracked: Float[np.ndarray, " nr"]
+    limited: Float[np.ndarray, " ng"]
+    scale: float
+
+    @staticmethod
+    def of(predictor: LinearPredictor, track: LiftedTracking) -> "Units":
+        """Return the units of a predictor under a cost and limits.
+
+        L is the transposed factor of the lifted data, in which q has root-mean-square 1 in every direction; for a model
+        that was not fitted the sizes of its observables.
+        """
+        known = predictor.scale
+        L = np.diag(observable_sizes(predictor, track.sizes)) if known is None else known.T.copy()
+        inverse = np.asarray(solve_triangular(L, np.eye(len(L)), lower=True))
+        C, G = (_norms(rows @ L) for rows in (track.tracked, track.limited))
+        return Units(L, inverse, track.sizes.inputs, C, G, track.sizes.scale)
+
+    def targets(self, targets: Targets) -> Targets:
+        """Return targets, as far as a horizon reads them, in these units."""
+        return replace(
+            targets,
+            z0=self.inverse @ targets.z0,
+            Z=self.inverse @ targets.Z,
+            u0=targets.u0 / self.inputs,
+            W=targets.W / self.inputs[:, None],
+            z_disturbance=self.inverse @ targets.z_disturbance @ self.L,
+            u_disturbance=targets.u_disturbance @ self.L / self.inputs[:, None],
+        )
+
+    def cost(self, cost: Cost) -> Cost:
+        """Return a cost with its Q_N in these units."""
+        if cost.Q_N is None:
+            return cost
+        Q_N = np.asarray(cost.Q_N)
+        if Q_N.ndim < 2:
+            Q_N = np.diag(np.broadcast_to(Q_N, Q_N.shape or (len(self.tracked),)))
+        if len(Q_N) == len(self.L) and len(Q_N) != len(self.tracked):
+            return replace(cost, Q_N=self.L.T @ Q_N @ self.L / self.scale)
+        if len(Q_N) != len(self.tracked):
+            return cost
+        return replace(cost, Q_N=Q_N * np.outer(self.tracked, self.tracked) / self.scale)
+
+    def gain(self, K: Float[np.ndarray, "nu nx"]) -> Float[np.ndarray, "nu nx"]:
+        """Return the gain of [z; u_{k−1}], or of z, of one in these units."""
+        return self.inputs[:, None] * K @ self._back(K.shape[1])
+
+    def value(self, P: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx nx"]:
+        """Return the P of a value of [z; u_{k−1}], or of z, of one in these units."""
+        back = self._back(len(P))
+        return self.scale * back.T @ P @ back
+
+    def _back(self, size: int) -> Float[np.ndarray, "nx nx"]:
+        """Return what takes [z; u_{k−1}], or z, into these units."""
+        return self.inverse if size == len(self.inverse) else block_diag(self.inverse, np.diag(1 / self.inputs))
+
+
+def _norms(rows: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, " n"]:
+    size = np.linalg.norm(rows, axis=1)
+    return np.where(size > 0, size, 1.0)
 
 
 def targets_of(predictor: LinearPredictor, track: LiftedTracking) -> Targets:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
-from koopmpc.control.horizon import Horizon, input_target
+from koopmpc.control.horizon import Horizon, Terminal, input_target
 from koopmpc.control.riccati import (
     LARGEST,
     SETTLED,
@@ -38,20 +38,6 @@ AXES, LOOPS, FARTHEST = 8, 3, 20.0  # of trial loops: axes of starts, horizons, 
 ALIKE = 0.01  # share of a law, over the data, by which others may differ and need no trial
 WORTH = 1.05  # cost of a trial loop by the least up to which the longer tail is taken
 AHEAD = 10  # horizons within which the gain of a learned model rests, or else its tail is as long as the horizon
-
-
-class Terminal(NamedTuple):
-    """V = ξ_NᵀP ξ_N + 2 ξ_Nᵀ(p f + p_r r_N + p_α α_N + p_u u_N) + const, ξ_N = z_N or [z_N; u_{N−1}].
-
-    f are the horizon's signals, r_N the last reference row, α_N the coordinates of its target and u_N its input target
-    where that is given as numbers.
-    """
-
-    P: Float[np.ndarray, "nx nx"]
-    p: Float[np.ndarray, "nx nf"]
-    reference: Float[np.ndarray, "nx nr"]
-    target: Float[np.ndarray, "nx na"]
-    given: Float[np.ndarray, "nx nu"]
 
 
 def terminal_of(

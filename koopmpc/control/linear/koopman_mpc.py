@@ -12,8 +12,8 @@ from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, lifted_tracking
+from koopmpc.control.horizon import Coordinates
 from koopmpc.control.limits import Interval, Limits, admitted
-from koopmpc.control.linear.condense import Coordinates
 from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, alone, busy
@@ -119,23 +119,22 @@ class KoopmanMPC(MPCBase):
             checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
         track, asked, disturbed = lifted_tracking(predictor, cost, limits), SOLVERS[solver], estimator is not None
-        coordinates = self._wanted or asked.coordinates
-        self._map = plan_map(predictor, track, moves, horizon, coordinates, disturbed=disturbed)
-        blocks = self._map.blocks
         super().__init__(
             predictor.dt,
             predictor,
             track,
-            blocks,
-            started(estimator, predictor, sum(blocks)),
+            moves,
+            horizon,
+            started(estimator, predictor, checks.count(horizon, "horizon")),
             estimator,
             latency,
             time_limit,
-            with_rates=track.with_rates,
-            move_of=np.repeat(np.arange(len(blocks)), blocks),
+            stagewise=False,
             monitor=None if monitor is None else monitor_of(monitor, predictor),
         )
         self.predictor, self._disturbed = predictor, disturbed
+        coordinates = self._wanted or asked.coordinates
+        self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=disturbed)
         self._options = {"solver": solver, "settings": dict(settings or {})}
         exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
         choices = [Choice(asked, {**asked.impatient, **(settings or {})}), *exact]
@@ -181,7 +180,7 @@ class KoopmanMPC(MPCBase):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        self._map = plan_map(predictor, track, self._blocks, self._N, coordinates, disturbed=self._disturbed)
+        self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=self._disturbed)
         self.predictor, self._states = predictor, None
         self._qps.update(self._map.qp)
         self._reference_key = None

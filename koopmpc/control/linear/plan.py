@@ -1,6 +1,5 @@
 """The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -9,12 +8,11 @@ from jaxtyping import Float, Int
 
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
-from koopmpc.control.horizon import Horizon, Units, blocked, horizon_of, stages
+from koopmpc.control.horizon import Condensed, Coordinates, Horizon, condense, horizon_of, stages
 from koopmpc.control.limits import Interval, Softness, ahead
-from koopmpc.control.linear.condense import Condensed, Coordinates, condense
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.qp import StepQP
-from koopmpc.control.target import ROUNDING, Targets, targets_of
+from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -121,18 +119,17 @@ class PlanMap:
 def plan_map(
     predictor: LinearPredictor,
     track: LiftedTracking,
-    moves: int | Sequence[int] | None,
-    steps: int,
+    blocks: tuple[int, ...],
     coordinates: Coordinates,
     *,
     disturbed: bool,
 ) -> PlanMap:
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
-    targets, blocks = targets_of(predictor, track), blocked(moves, steps)
+    targets, units = targets_of(predictor, track), Units.of(predictor, track)
+    aims, cost = units.targets(targets), units.cost(track.cost)
     horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
-    units = Units.of(predictor, track)
-    own, aims = units.horizon(horizon), units.targets(targets)
-    cost, parts = units.cost(track.cost), stages(own, aims)
+    own = horizon.in_units(units)
+    parts = stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
     law = recursion(parts, end.P, end.p)
     maps = condense(own, law, end, aims, units, coordinates)

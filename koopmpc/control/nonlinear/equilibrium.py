@@ -13,7 +13,7 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.nonlinear.problem import LearnedMap, point_sizes
-from koopmpc.control.riccati import one_step, root, stationary
+from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.interrupts import listening
@@ -372,7 +372,7 @@ class TerminalTargets:
         o, (nx, nu, nr) = self._outputs, (self.equilibria.model.nx, self.equilibria.model.nu, len(row))
         n = nx + nu * (o.R_delta is not None and self._cost.Q_N is None) + nr
         M, L, V = (np.zeros((n, columns)) for columns in (nr, nx, nu))
-        M[:nr] = root(o.Q if self._cost.Q_N is None else checks.weight(self._cost.Q_N, "Q_N", nr))
+        M[:nr] = checks.root(o.Q if self._cost.Q_N is None else checks.weight(self._cost.Q_N, "Q_N", nr))
         begin = self.equilibria.guess(row)
         return TerminalTarget(begin, begin.u * self._hold, M, L, V, M @ row, np.zeros((nu, nx)))
 
@@ -400,7 +400,7 @@ class TerminalTargets:
         slope = self.equilibria.slope(at) * self._hold
         if self._cost.Q_N is not None:
             M, L, V = (np.zeros((nx + nr, columns)) for columns in (nr, nx, len(u)))
-            M[:nr] = root(checks.weight(self._cost.Q_N, "Q_N", nr))
+            M[:nr] = checks.root(checks.weight(self._cost.Q_N, "Q_N", nr))
             return TerminalTarget(found, u, M, L, V, M @ row, slope)
         (sx, su), scale, weights = np.split(self.equilibria.size, [nx]), o.sizes.scale, Q.diagonal()
         sr = np.where(weights > 0, np.sqrt(scale / np.where(weights > 0, weights, 1.0)), 1.0)
@@ -415,7 +415,7 @@ class TerminalTargets:
         P = stationary(one_step(A, B, seen, R, R_delta), self._most).P
         if self._cost.tail:
             P = tail_of(tail_stage(A, B, np.eye(nx), J, Q_s, R, R_delta), self._cost.tail).P
-        n, S = len(P), np.sqrt(scale) * root(P)
+        n, S = len(P), np.sqrt(scale) * checks.root(P)
         M, L, V = (np.zeros((n + nr, columns)) for columns in (nr, nx, len(u)))
         M[:n] = S[:, :nx] @ back / sr
         L[:n] = S[:, :nx] @ (np.eye(nx) - back @ J) / sx

@@ -13,7 +13,6 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
-from koopmpc.control.horizon import blocked
 from koopmpc.control.limits import Interval, Limits, admitted, beyond
 from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, alone
@@ -74,22 +73,20 @@ class StagedMPC(MPCBase):
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx, ranges)
-        blocks = blocked(moves, horizon)
-        self._problem = staged_problem(given, o, blocks)
-        N = sum(blocks)
         super().__init__(
             model.dt,
             given,
             o,
-            blocks,
-            started(estimator, given, N),
+            moves,
+            horizon,
+            started(estimator, given, checks.count(horizon, "horizon")),
             estimator,
             latency,
             time_limit,
-            with_rates=self._problem.with_rates,
-            move_of=np.arange(N),
+            stagewise=True,
             monitor=None if monitor is None else monitor_of(monitor, model),
         )
+        self._problem = staged_problem(given, o, self._blocks)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._disturbed = estimator is not None or given.nw > 0
 
