@@ -6,7 +6,7 @@ import signal
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sized
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
@@ -101,14 +101,28 @@ class Workers:
         self._held.close()
 
     def map(
-        self, function: Callable[[Task], Result], tasks: Iterable[Task], progress: Progress | None = None
-    ) -> Iterator[Result]:
-        """Yield function(task) for each task, in the order of the tasks; progress as in `map_tasks`."""
+        self,
+        function: Callable[[Task], Result],
+        tasks: Sequence[Task],
+        progress: Progress | None = None,
+        *,
+        size: Callable[[Task], float] | None = None,
+    ) -> list[Result]:
+        """Return function(task) of each task, in the order of the tasks; progress as in `map_tasks`.
+
+        All tasks are sent at once. Those of the largest `size`, which grows with the time that a task takes, begin
+        first: at the end no worker waits long for the others.
+        """
+        order = list(range(len(tasks)))
+        if size is not None:
+            order.sort(key=lambda i: -size(tasks[i]))
+        sent = [tasks[i] for i in order]
         if self._scheduler is not None or self._workers == 1:
-            return map_tasks(function, tasks, workers=self._workers, scheduler=self._scheduler, progress=progress)
-        total = len(tasks) if isinstance(tasks, Sized) else None
-        results = _on_processes(function, iter(tasks), self._held)
-        return results if progress is None else _told(results, progress, total)
+            results = map_tasks(function, sent, workers=self._workers, scheduler=self._scheduler, progress=progress)
+        else:
+            results = _on_processes(function, iter(sent), self._held, len(sent))
+            results = results if progress is None else _told(results, progress, len(sent))
+        return [result for _, result in sorted(zip(order, results, strict=True), key=lambda pair: pair[0])]
 
 
 def _told(results: Iterator[Result], progress: Progress, total: int | None) -> Iterator[Result]:
@@ -194,13 +208,15 @@ class _HeldPool:
 def _on_own_processes(function: Callable[[Task], Any], tasks: Iterator[Task], workers: int) -> Generator[Any]:
     held = _HeldPool(workers)
     try:
-        yield from _on_processes(function, tasks, held)
+        yield from _on_processes(function, tasks, held, AHEAD * workers)
     finally:
         held.close()
 
 
-def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], held: _HeldPool) -> Generator[Any]:
-    """Yield the results of a pool's processes in order.
+def _on_processes(
+    function: Callable[[Task], Any], tasks: Iterator[Task], held: _HeldPool, ahead: int
+) -> Generator[Any]:
+    """Yield the results of a pool's processes in order; at most `ahead` tasks are under way, or wait for their turn.
 
     A worker that dies breaks the pool, and its task is not known. The first task that is due is therefore
     done alone, where a death is its own, and the others go to a new pool.
@@ -209,7 +225,7 @@ def _on_processes(function: Callable[[Task], Any], tasks: Iterator[Task], held: 
     queue: deque[tuple[QueuedTask[Task], Future[bytes] | None]] = deque()
     try:
         while True:
-            queue.extend((job, None) for job in islice(jobs, AHEAD * held.workers - len(queue)))
+            queue.extend((job, None) for job in islice(jobs, ahead - len(queue)))
             if not queue:
                 return
             try:

@@ -10,7 +10,7 @@ from textwrap import dedent
 import pytest
 
 import koopmpc as km
-from koopmpc.parallel import map_tasks
+from koopmpc.parallel import Workers, map_tasks
 from tests import tasks
 from tests.cluster import two_workers
 
@@ -40,6 +40,29 @@ def test_results_come_in_the_order_of_the_tasks(where: dict) -> None:
     results = map_tasks(tasks.square, range(7), **where, progress=lambda *now: told.append(now))
     assert list(results) == [i * i for i in range(7)]
     assert told == [(i, 7) for i in range(8)]
+
+
+@EVERYWHERE
+def test_the_largest_tasks_begin_first_and_results_keep_the_order_of_the_tasks(where: dict) -> None:
+    sizes, asked, told = [3, 1, 4, 1, 5, 9, 2, 6], [], []
+
+    def size(task: int) -> float:
+        asked.append(task)
+        return float(task)
+
+    with Workers(**where) as pool:
+        assert pool.map(tasks.square, sizes, size=size) == [n * n for n in sizes]
+        assert pool.map(tasks.square, [], size=size) == []
+        assert pool.map(tasks.square, range(20), lambda *now: told.append(now)) == [i * i for i in range(20)]
+    assert asked == sizes
+    assert told == [(i, 20) for i in range(21)]
+
+
+def test_here_tasks_begin_by_their_size() -> None:
+    begun: list[int] = []
+    with Workers() as pool:
+        pool.map(begun.append, [3, 1, 4, 1, 5], size=float)
+    assert begun == [5, 4, 3, 1, 1]
 
 
 @EVERYWHERE
@@ -92,7 +115,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     script.write_text(
         dedent(f"""
         import os, signal
-        from koopmpc.parallel import map_tasks
+        from koopmpc.parallel import Workers, map_tasks
         from tests import tasks
         if __name__ == "__main__":
             results = map_tasks(tasks.sleep, [({str(tmp_path / "pids")!r}, 0)] * 4, workers=2)
@@ -157,7 +180,7 @@ def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         dedent("""
-        from koopmpc.parallel import map_tasks
+        from koopmpc.parallel import Workers, map_tasks
         print(list(map_tasks(abs, [1, 2], workers=2)))
         """)
     )
@@ -178,7 +201,7 @@ def test_a_program_that_ends_at_once_leaves_no_lines_of_its_workers_semaphores(t
         dedent("""
         import os
 
-        from koopmpc.parallel import map_tasks
+        from koopmpc.parallel import Workers, map_tasks
 
         if __name__ == "__main__":
             results = map_tasks(abs, range(100), workers=2)

@@ -64,6 +64,11 @@ class Candidate(Value):
         return "bilinear" if self.bilinear else "linear"
 
     @property
+    def size(self) -> float:
+        """A number that grows with the time that its fit and its loops take."""
+        return self.lifting.nz * (2.0 if self.bilinear else 1.0)
+
+    @property
     def towards(self) -> Towards:
         """What the ridge of its fit pulls to: a linear model without delays to the affine one, see `edmd`.
 

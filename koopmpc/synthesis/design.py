@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -29,7 +30,7 @@ from koopmpc.synthesis.folds import Folds, folded, only, sampled, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
 from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
 from koopmpc.synthesis.select import RIDGES
-from koopmpc.synthesis.surrogates import Holding, Surrogate, stand_ins, surrogate, unfelt, unheld
+from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
 from koopmpc.validate.text import percent
 
 FOLDS = 3
@@ -146,9 +147,9 @@ def design(
         )
     trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
     with Workers(workers, scheduler) as pool:
-        results = list(pool.map(tried, trials, _stage(progress, "models")))
+        results = pool.map(tried, trials, _stage(progress, "models"), size=lambda trial: trial.candidate.size)
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-        test, doubts, holds = _test(folds, asked, results, floor, tighten)
+        test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, pool)
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
         rows, outcomes = _rounds(test, _screened(results, floor), pool, progress)
@@ -232,7 +233,7 @@ def _models(
 
 
 def _test(
-    folds: Folds, asked: Asked, results: Sequence[Tried], floor: float, tighten: bool
+    folds: Folds, asked: Asked, pair: Sequence[Recipe], tighten: bool, pool: Workers
 ) -> tuple[LoopTest, list[str], bool]:
     """Return the conditions of all closed loops, doubts about what is asked, and whether the goal can be held.
 
@@ -240,49 +241,62 @@ def _test(
     meets surrogates of which one does not know fold k + 1, the other fold k + 2.
     """
     data, fold = folds.episodes, folds.fold
-    pair = stand_ins(results, floor)
-    parts = [(without(data, fold, i), only(data, fold, i)) for i in range(FOLDS)]
-    surrogates = [surrogate(recipe, *part) for part in parts for recipe in pair]
+    wanted: list[Condition] = []
+    for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
+        for k in range(FOLDS):
+            for family in families:
+                number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(wanted)
+                row = asked.late * (j % _STRETCHES) // (_STRETCHES - 1)
+                start = asked.starts[j % len(asked.starts)]
+                wanted.append(Condition(k, number, gain, start, row, np.zeros((0, data.nu))))
+    mine = [[j for j, one in enumerate(wanted) if one.surrogate == number] for number in range(FOLDS * len(pair))]
+    tasks = [
+        _StandIn(recipe, i, tuple((wanted[j].gain, wanted[j].first) for j in mine[i * len(pair) + family]))
+        for i in range(FOLDS)
+        for family, recipe in enumerate(pair)
+    ]
+    surrogates: list[Surrogate] = []
+    conditions = list(wanted)
+    for places, (one, inputs) in zip(mine, pool.map(partial(_stood_in, folds, asked), tasks), strict=True):
+        surrogates.append(one)
+        for j, rows in zip(places, inputs, strict=True):
+            conditions[j] = replace(wanted[j], u_reference=rows)
     X = np.concatenate([episode.X for episode in data])
     turning = [i for i in angular(data.states, X) if asked.high[i] - asked.low[i] > _TURNS]
     free = sorted({*asked.angles, *turning, *unfelt(surrogates[0], X)})
     of = asked.cost.of.bind(data.states)
     tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
     low, high = asked.hull(free, tracked)
-    inputs = _FreeInputs(asked, surrogates)
-    conditions: list[Condition] = []
-    for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
-        for k in range(FOLDS):
-            for family in families:
-                number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(conditions)
-                row = asked.late * (j % _STRETCHES) // (_STRETCHES - 1)
-                start = asked.starts[j % len(asked.starts)]
-                conditions.append(Condition(k, number, gain, start, row, inputs(number, gain, row)))
     test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, tighten)
     unreachable = unheld(surrogates[0], asked)
     holds = not asked.moves and not unreachable
     return test, [*unreachable, *outside_data(asked, data, tracked, free)], holds
 
 
-class _FreeInputs:
-    """The inputs that cost nothing in a run: those that hold the reference on its surrogate, or the cost's u_target."""
+class _StandIn(NamedTuple):
+    """A task: the surrogate of a recipe that does not know a fold, and (gain, first row) of each run on it."""
 
-    def __init__(self, asked: Asked, surrogates: Sequence[Surrogate]) -> None:
-        self._asked, self._surrogates = asked, surrogates
-        self._holding: dict[tuple[int, float], Holding] = {}
+    recipe: Recipe
+    out: int
+    runs: tuple[tuple[float, int], ...]
 
-    def __call__(self, number: int, gain: float, row: int) -> Float[np.ndarray, "T nu"]:
-        asked, one = self._asked, self._surrogates[number]
-        steps, nu, cost = asked.steps, one.model.nu, asked.cost
-        given = cost.given_inputs(nu)
+
+def _stood_in(folds: Folds, asked: Asked, task: _StandIn) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
+    """Return the surrogate, and for each run the inputs that cost nothing: those of `Condition.u_reference`."""
+    data, fold = folds.episodes, folds.fold
+    one = surrogate(task.recipe, without(data, fold, task.out), only(data, fold, task.out))
+    steps, nu, cost = asked.steps, data.nu, asked.cost
+    given = cost.given_inputs(nu)
+    inputs: list[Float[np.ndarray, "T nu"]] = []
+    for gain, row in task.runs:
         if given is not None:
-            return given[np.minimum(np.arange(steps), len(given) - 1)]
-        if cost.u_target != "equilibrium":
-            return np.zeros((steps, nu))
-        key = number, gain
-        if key not in self._holding:
-            self._holding[key] = one.holding(cost, asked.limits, gain)
-        return np.array([self._holding[key](each).u for each in asked.reference[row : row + steps]])
+            inputs.append(given[np.minimum(np.arange(steps), len(given) - 1)])
+        elif cost.u_target != "equilibrium":
+            inputs.append(np.zeros((steps, nu)))
+        else:
+            held = one.holding(cost, asked.limits, gain)
+            inputs.append(np.array([held(each).u for each in asked.reference[row : row + steps]]))
+    return one, inputs
 
 
 def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
@@ -318,30 +332,35 @@ def _rounds(
 
     First all models, in the conditions of the data. Then in all conditions the best bilinear one with every estimator,
     and the two best linear ones with every estimator and end. Last the next bilinear ones, and the best with weights,
-    with the estimator that was best.
+    with the estimator that was best. This takes longest, and so it begins as soon as that estimator is known; the
+    second linear model fills the other workers meanwhile.
     """
     run, every = partial(judged, test), tuple(range(len(test.conditions)))
-    first = list(pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops")))
+    first = pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops"), size=Job.size)
     score = scores(ratios(first))
     ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
     estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
     second = [replace(one, estimator=each) for one in bilinear[:1] for each in estimators]
-    for one in linear:
+    third: list[Recipe] = []
+    for place, one in enumerate(linear):
         ends = (None, 0) if one.tail is None else (0,)
-        second += [replace(one, estimator=each, tail=tail) for tail in ends for each in estimators]
+        some = [replace(one, estimator=each, tail=tail) for tail in ends for each in estimators]
+        if place == 0:
+            second += some
+        else:
+            third += some
     jobs = _jobs(second, screened, first, every)
-    outcomes = list(pool.map(run, jobs, _stage(progress, "closed loops of the best")))
+    outcomes = pool.map(run, jobs, _stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
         tried_ones = scores(ratios(outcomes[: len(estimators)]))
         best = estimators[int(np.argmin(tried_ones))]
-        others = [replace(bilinear[0], estimator=best, weighted=True)]
-        others += [replace(one, estimator=best) for one in bilinear[1:]]
-        jobs = _jobs(others, screened, first, every)
-        second += others
-        outcomes += list(pool.map(run, jobs, _stage(progress, "closed loops of the last")))
-    return _leaderboard((screened, first), (second, outcomes))
+        third.append(replace(bilinear[0], estimator=best, weighted=True))
+        third += [replace(one, estimator=best) for one in bilinear[1:]]
+    jobs = _jobs(third, screened, first, every)
+    outcomes += pool.map(run, jobs, _stage(progress, "closed loops of the last"), size=Job.size)
+    return _leaderboard((screened, first), ([*second, *third], outcomes))
 
 
 def _stage(progress: StageProgress | None, name: str) -> Progress | None:

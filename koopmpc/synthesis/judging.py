@@ -28,6 +28,7 @@ LOST = 20.0  # what a lost run counts, and the most that one counts: times the b
 FREE = 0.005  # violation that costs nothing, as a share of the limits' range
 PRICE = 10.0  # a violation of 1 % beyond costs a tenth of the cost
 LITTLE = 0.01  # of the usual cost: so much more is no loss, as where a run starts at its goal
+_WEIGHTED = 4  # times as long takes a recipe with weights, for its models are fitted and judged again
 _BAND = 5  # steps ahead of the errors that tighten limits
 CONFIRMED = 1.25  # times the cost of the fold's controllers that the one of all data may cost on the same surrogates
 BROKEN = 1e-3  # share of the range beyond which a step counts as one that violates
@@ -143,6 +144,10 @@ class Job:
     conditions: tuple[int, ...]
     known: Outcome | None = None
     known_runs: bool = False
+
+    def size(self) -> float:
+        """Return a number that grows with the time that the job takes."""
+        return self.recipe.candidate.size * (_WEIGHTED if self.recipe.weighted else 1)
 
     def __str__(self) -> str:
         return str(self.recipe)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
@@ -59,7 +60,8 @@ class Nearness(Value):
     def squares(self, episode: Episode) -> Float[np.ndarray, " T"]:
         """Return d² of each step."""
         X = episode.X[:-1, : len(self.scale)] / self.scale  # under an embedding the state comes first
-        return np.min([((X - point) ** 2).sum(axis=1) for point in self.visited], axis=0)
+        distance, _ = KDTree(self.visited).query(X)
+        return np.asarray(distance) ** 2
 
     def __call__(self, episode: Episode) -> Float[np.ndarray, " T"]:
         """Return the weight of each step."""
