@@ -17,9 +17,8 @@ from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.solve import RegressionRows, norms, scaled_rank
-from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.base import CONSTANT, Lifting
 from koopmpc.lifting.composed import Projected
-from koopmpc.lifting.state import Constant
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -75,12 +74,9 @@ class Regression:
     @property
     def affine(self) -> list[int]:
         """The columns of P that hold states, the Constant and inputs: those of x⁺ = A x + B u + c."""
-        one = Constant().bind(self.states).names[0]
         names = self.lifting.names
-        return [
-            *(i for i, name in enumerate(names) if name == one or name in self.states),
-            *range(len(names), self.rows.P.shape[1]),
-        ]
+        own = [i for i, name in enumerate(names) if name == CONSTANT or name in self.states]
+        return [*own, *range(len(names), self.rows.P.shape[1])]
 
     def decoded(self, K: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, "n nx"]:
         """Return K Cᵀ, the coefficients of C ψ(x⁺)."""

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from scipy.special import ellipk
 
 from koopmpc import checks
 from koopmpc.control.lqr import lqr
@@ -87,14 +88,12 @@ def printed_gain(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> Gain:
 
 
 def frequency(plant: Pendulum, amplitude: float) -> float:
-    """Return ω = √(g/L) · agm(1, cos(θ₀/2)) [rad/s] of the hanging pendulum let go at θ₀.
+    """Return ω = π √(g/L) / (2 K(sin² θ₀/2)) [rad/s] of the hanging pendulum let go at θ₀.
 
-    The period is 4 √(L/g) K(sin θ₀/2), and the elliptic integral K(k) = π / (2 agm(1, √(1 − k²))).
+    K is the complete elliptic integral of the first kind, and the period 4 √(L/g) K.
     """
-    a, b = 1.0, float(np.cos(amplitude / 2))
-    while abs(a - b) > 1e-15 * a:
-        a, b = (a + b) / 2, float(np.sqrt(a * b))
-    return float(np.sqrt(plant.g / plant.L)) * a
+    quarter: float = ellipk(float(np.sin(amplitude / 2)) ** 2)  # of a period, in units of √(L/g)
+    return float(np.pi / 2 * np.sqrt(plant.g / plant.L)) / quarter
 
 
 def trajectories(

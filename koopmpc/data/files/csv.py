@@ -94,7 +94,7 @@ def columns(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
     except (pa.ArrowException, OSError, ValueError) as error:
         raise LogError(f"{path} holds no episodes that can be read: {str(error).splitlines()[0]}") from error
     names = [name.strip() for name in table.column_names]
-    if any(_number(name) for name in names):
+    if any(map(_is_a_number, names)):
         raise LogError(f"{path} has no line of names: its first row is {', '.join(names[:4])}; write one above it")
     return names, {name: _values(table.column(i)) for i, name in enumerate(names)}
 
@@ -138,14 +138,6 @@ def _values(column) -> np.ndarray:
     if pa.types.is_null(kind):
         return np.full(len(column), np.nan)
     return column.to_numpy()
-
-
-def _number(name: str) -> bool:
-    try:
-        float(name)
-    except ValueError:
-        return False
-    return True
 
 
 def _quoted(name: str) -> str:

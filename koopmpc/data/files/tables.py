@@ -44,15 +44,7 @@ class Roles:
         return self.states + self.inputs + self.disturbances
 
 
-def roles(
-    names: Sequence[str],
-    where: str,
-    *,
-    states: Sequence[str] | None,
-    inputs: Sequence[str] | None,
-    disturbances: Sequence[str] | None,
-    numeric: Sequence[str],
-) -> Roles:
+def roles(names: Sequence[str], numeric: Sequence[str], told: "Told", where: str) -> Roles:
     """Return the role of each column.
 
     Roles that the caller does not give are read from the names: ``t``, ``time [s]`` and ``timestamp`` are time;
@@ -65,16 +57,17 @@ def roles(
     ----------
     names, numeric
         All columns, and those of numbers.
+    told
+        The names that the caller gives; None leaves the role to the names.
     where
         The file, for messages.
-    states, inputs, disturbances
-        Names that the caller gives; None leaves the role to the names.
 
     Raises
     ------
     DataError
         A given column is missing or stands twice, or no column is left for a state.
     """
+    states, inputs, disturbances = told.states, told.inputs, told.disturbances
     for what, given in (("states", states), ("inputs", inputs), ("disturbances", disturbances)):
         if isinstance(given, str):
             raise DataError(f"{what} is {given!r}; pass a tuple of names")
@@ -82,8 +75,8 @@ def roles(
             if names.count(name) != 1:
                 has = "has two columns" if name in names else "has no column"
                 raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
-    told = {name for given in (states, inputs, disturbances) for name in given or ()}
-    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in told]
+    sought = told.columns
+    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in sought]
     time = next((name for name in rest if _TIME.fullmatch(_stem(name))), None)
     episode = next((name for name in rest if _EPISODE.fullmatch(_stem(name))), None)
     step = next((name for name in rest if name == "step"), None)
@@ -94,11 +87,8 @@ def roles(
     found_inputs = [n for n in free if _INPUT.fullmatch(_stem(n))] if inputs is None else list(inputs)
     pushes = [n for n in free if _DISTURBANCE.fullmatch(_stem(n)) and n not in found_inputs]
     found_pushes = (pushes if states is None else []) if disturbances is None else list(disturbances)
-    if states is None:
-        taken = {*found_inputs, *found_pushes}
-        found_states = [name for name in free if name not in taken]
-    else:
-        found_states = list(states)
+    taken = {*found_inputs, *found_pushes}
+    found_states = [name for name in free if name not in taken] if states is None else list(states)
     if not found_states:
         raise DataError(
             f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
@@ -153,6 +143,11 @@ class Told:
         """True where the caller gives nothing."""
         return all(value is None for value in vars(self).values())
 
+    @property
+    def columns(self) -> set[str]:
+        """The columns that the caller names."""
+        return {name for given in (self.states, self.inputs, self.disturbances) for name in given or ()}
+
 
 def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], told: Told) -> Episodes:
     """Return the episodes of a plain table; `load_episodes` says what its columns mean.
@@ -178,21 +173,14 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
     rows = len(next(iter(columns.values()))) if columns else 0
     if rows == 0:
         raise DataError(f"{where} has columns and no row in them; leave the file out")
-    sought = {*(told.states or ()), *(told.inputs or ()), *(told.disturbances or ())}
+    sought = told.columns
     every = told.states is None or told.inputs is None
     columns = {
         name: numbers(column, name, where) if name in sought or (every and not label(name)) else column
         for name, column in columns.items()
     }
     numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
-    found = roles(
-        names,
-        where,
-        states=told.states,
-        inputs=told.inputs,
-        disturbances=told.disturbances,
-        numeric=numeric,
-    )
+    found = roles(names, numeric, told, where)
     table = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
     for name, column in table.items():
         _plausible(column, name, where)
@@ -205,7 +193,9 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
             FitWarning,
             stacklevel=2,
         )
-    time = None if found.time is None else _time(columns[found.time], found)
+    time = None
+    if found.time is not None:
+        time = checks.array(columns[found.time], found.time, (None,), finite=False) * found.scale
     if time is None and told.resample is not None:
         raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
     episode = np.zeros(rows, dtype=np.intp)
@@ -307,11 +297,6 @@ def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: boo
                     ColumnWarning,
                     stacklevel=3,
                 )
-
-
-def _time(column: np.ndarray, found: Roles) -> Float[np.ndarray, " M"]:
-    """Return the time of each row [s]."""
-    return checks.array(column, str(found.time), (None,), finite=False) * found.scale
 
 
 def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:

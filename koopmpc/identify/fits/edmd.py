@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Literal, Unpack
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 from scipy.linalg import sqrtm
 
 from koopmpc.data.delay import Delay
@@ -13,11 +13,10 @@ from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.rank import Rank, leading, lost
-from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
+from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, Ridge, Solution, doubts, orthonormal, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
-from koopmpc.lifting.state import Constant
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -72,25 +71,16 @@ def fit(
     if rank is not None:
         result = _reduced(regression, rows, ridge, rank, method, condition, sentences)
         return result._replace(rule=_WORDS[method] + result.rule, doubts=sentences)
-    given, C = rows.leading(nz), regression.C
+    given = rows.leading(nz)
     light = [i for i in regression.affine if i < rows.P.shape[1]] if towards == "affine" else []
     if method == "tls":
         given = _denoised(regression, given, nz)
     scaled = regression.scaled
     solution = _forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled, light=light)
     K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
-    return FitResult(
-        A=K[:nz].T,
-        B=K[nz:].T,
-        C=np.eye(nz) if C is None else C,
-        lifting=regression.lifting,
-        residual=regression.rows.residual(regression.x_next, K if C is None else K @ C.T),
-        state_residual=regression.state_residual,
-        rank=solution.rank,
-        condition=condition,
-        rule=_WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled, light=light),
-        ridge=solution.ridge,
-        doubts=sentences,
+    said = _WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled, light=light)
+    return unreduced(
+        regression, K, rule=said, rank=solution.rank, condition=condition, ridge=solution.ridge, doubts=sentences
     )
 
 
@@ -138,26 +128,22 @@ def _reduced(
     )
 
 
-def _total_least_squares(
-    rows: RegressionRows, exact: Int[np.ndarray, " e"], nz: int, directions: int, *, scaled: bool
-) -> RegressionRows:
+def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
     """Return the rows projected on the leading directions that [ψ(x) ψ(x⁺)] span together.
 
     Least squares on the result is the total least squares solution: with D = [ψ(x) ψ(x⁺)] freed of the exact
-    columns E, D ≈ L Σ Rᵀ and `directions` singular vectors L_r, the rows are multiplied by [E, L_r]ᵀ. This assumes
-    noise that is white and equally large in all columns but E: relative to each observable's size where `scaled`,
-    else in the data's own units.
+    columns E, D ≈ L Σ Rᵀ and r singular vectors L_r, the rows are multiplied by [E, L_r]ᵀ. The inputs and the Constant
+    are exact. All other columns are taken to hold white noise of one size: relative to each observable's own size where
+    the regression is `scaled`, else in the data's own units.
 
     Parameters
     ----------
+    regression
+        What the rows are made for.
     rows
-        P = [ψ(x) u]; T begins with ψ(x⁺), all of it inside the rows (`rest` is 0).
-    exact
-        The columns of P that hold no noise: inputs, a Constant.
-    nz
-        Number of observables.
+        P = [ψ(x) u]; T = ψ(x⁺), all of it inside the rows (`rest` is 0).
     directions
-        Number of directions that the signal spans, the Constant not counted.
+        Number of directions that the signal spans, the Constant counted.
 
     References
     ----------
@@ -165,7 +151,10 @@ def _total_least_squares(
     analysis of noisy datasets", Theor. Comput. Fluid Dyn. 31, 2017; exact columns: Van Huffel & Vandewalle, "The
     total least squares problem", SIAM 1991.
     """
-    most = rows.samples - len(exact)
+    nz, one = regression.lifting.nz, regression.lifting.constant_index
+    constants = [] if one is None else [one]
+    exact = np.array([*constants, *range(nz, rows.P.shape[1])], dtype=np.intp)
+    directions, most = directions - len(constants), rows.samples - len(exact)
     if directions >= most:
         raise DataError(
             f'method "tls" with {rows.samples} snapshot pairs cannot tell noise from {directions} directions of '
@@ -174,7 +163,7 @@ def _total_least_squares(
     noisy = np.setdiff1d(np.arange(nz), exact)
     E = orthonormal(rows.P[:, exact], float(np.finfo(float).eps * len(rows.P)))
     D = np.hstack([rows.P[:, noisy], rows.T[:, noisy]])
-    if scaled:
+    if regression.scaled:
         size = np.sqrt(np.sum(D.reshape(len(D), 2, -1) ** 2, axis=(0, 1)))
         D = D / np.tile(np.where(size > 0, size, 1.0), 2)
     L = np.linalg.svd(D - E @ (E.T @ D), full_matrices=False)[0][:, :directions]
@@ -237,16 +226,6 @@ def _root_next_to(forward: Float[np.ndarray, "r r"], backward: Float[np.ndarray,
             'in the noise; pass a smaller rank, or method="tls"'
         )
     return np.ascontiguousarray(real)
-
-
-def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
-    """Return the rows with the noise of ψ(x) and ψ(x⁺) projected out; the Constant and the inputs count as exact."""
-    nz, one = regression.lifting.nz, Constant().bind(regression.states).names[0]
-    exact = [*(i for i, name in enumerate(regression.lifting.names) if name == one), *range(nz, rows.P.shape[1])]
-    constants = sum(i < nz for i in exact)
-    return _total_least_squares(
-        rows, np.array(exact, dtype=np.intp), nz, directions - constants, scaled=regression.scaled
-    )
 
 
 def edmd(

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.data.episodes import Episodes
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.state import Constant, State
+from koopmpc.lifting.base import CONSTANT, Lifting
+from koopmpc.lifting.state import State
 
 ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
 
@@ -42,9 +42,8 @@ class RowColumns:
 def row_columns(lifting: Lifting, inputs: tuple[str, ...], bilinear: bool) -> RowColumns:
     """Return the columns for the bound ψ and these inputs."""
     points = lifting.bound_states
-    states, one = State().bind(points), Constant().bind(points).names[0]
-    full = lifting if set(states.names) <= set(lifting.names) else lifting + states
-    products = np.array([i for i, name in enumerate(lifting.names) if bilinear and name != one], dtype=np.intp)
+    full = lifting if set(points) <= set(lifting.names) else lifting + State().bind(points)
+    products = np.array([i for i, name in enumerate(lifting.names) if bilinear and name != CONSTANT], dtype=np.intp)
     names = full.names + inputs + tuple(f"{u} * {lifting.names[int(i)]}" for u in inputs for i in products)
     first = len(names)
     return RowColumns(

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
@@ -128,67 +127,52 @@ def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episod
 
 @dataclass(frozen=True, eq=False)
 class Contest:
-    """Controllers that start from one state, track one reference and share one cost, with and without input limits.
+    """The controllers of one of `TASKS`: one start, one reference and one cost, with and without input limits.
 
     Attributes
     ----------
     title
-        What the plant has to do.
+        The task's name in `TASKS`.
     plant
         x⁺ = F(x, u).
-    x_eq
-        (nx,), the equilibrium at u = 0 where the plant is linearised.
     models
-        Lifted or identified models by name.
-    cost, limits
-        The same for all controllers; each runs once without the limits and once within them.
-    x0, reference
-        (nx,) each.
-    steps
-        Length of each run.
-    horizon
-        Horizon of the model predictive controllers, in steps.
+        Lifted models by name.
+    steps, horizon
+        Length of each run, and of a plan, in steps.
     """
 
     title: str
     plant: StepMap
-    x_eq: Float[np.ndarray, " nx"]
     models: Mapping[str, LinearPredictor]
-    cost: Cost
-    limits: Limits
-    x0: Float[np.ndarray, " nx"]
-    reference: Float[np.ndarray, " nx"]
     steps: int
     horizon: int
 
     def runs(self) -> "dict[tuple[str, bool], Run]":
-        """Return the run of each controller by its name and by whether the inputs are limited."""
-        return {
-            (name, limited): simulate(
-                self.plant,
-                controller,
-                x0=self.x0,
-                reference=self.reference,
-                steps=self.steps,
-                cost=self.cost,
-                limits=self.limits if limited else None,
-                metadata={"problem": self.title, "controller": name},
-            )
-            for limited in (False, True)
-            for name, controller in self._controllers(limited).items()
-        }
+        """Return the run of each controller by its name and by whether the inputs are limited.
 
-    def _controllers(self, limited: bool) -> dict[str, Controller]:
-        """Return LQR on each model, MPC on each model where inputs are limited, and nonlinear MPC on the plant."""
-        limits = self.limits if limited else Limits()
-        local = LinearPredictor.local(self.plant, self.x_eq, np.zeros(self.plant.nu))
-        models = {"linearisation": local, **self.models}
-        found: dict[str, Controller] = {}
-        for name, model in models.items():
-            found[f"LQR, {name}"] = LQR(model, self.cost, limits)
-            if limited:
-                found[f"MPC, {name}"] = KoopmanMPC(model, self.cost, limits, self.horizon)
-        found[ORACLE] = NonlinearMPC(self.plant, self.cost, limits, self.horizon)
+        LQR and, where inputs are limited, MPC run on each model; nonlinear MPC runs on the plant.
+        """
+        task = TASKS[self.title]
+        local = LinearPredictor.local(self.plant, task.x_eq, np.zeros(self.plant.nu))
+        found: dict[tuple[str, bool], Run] = {}
+        for limits in (None, Limits(u_min=-task.limit, u_max=task.limit)):
+            controllers: dict[str, Controller] = {}
+            for name, model in {"linearisation": local, **self.models}.items():
+                controllers[f"LQR, {name}"] = LQR(model, task.cost, limits or Limits())
+                if limits is not None:
+                    controllers[f"MPC, {name}"] = KoopmanMPC(model, task.cost, limits, self.horizon)
+            controllers[ORACLE] = NonlinearMPC(self.plant, task.cost, limits or Limits(), self.horizon)
+            for name, controller in controllers.items():
+                found[name, limits is not None] = simulate(
+                    self.plant,
+                    controller,
+                    x0=task.x0,
+                    reference=task.reference,
+                    steps=self.steps,
+                    cost=task.cost,
+                    limits=limits,
+                    metadata={"problem": self.title, "controller": name},
+                )
         return found
 
 
@@ -207,18 +191,7 @@ def contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
     data = _excited(plant, task.x_eq, K, task.shaking, episodes=episodes, steps=round(LASTING / DT))
     with unwarned():
         models = {name: edmd(data, lifting) for name, lifting in LIFTINGS.items()}
-    return Contest(
-        title,
-        plant,
-        np.asarray(task.x_eq),
-        models,
-        task.cost,
-        Limits(u_min=-task.limit, u_max=task.limit),
-        np.asarray(task.x0),
-        np.asarray(task.reference),
-        steps,
-        horizon,
-    )
+    return Contest(title, plant, models, steps, horizon)
 
 
 def ratios(runs: Runs) -> dict[str, dict[str, float]]:
@@ -257,7 +230,7 @@ def loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -
     )
     for limited in (False, True):
         table = {title: costs(each, limited) for title, each in runs.items()}
-        limits = {title: f"|u| ≤ {float(np.max(task.limits.inputs(1)[1])):g}" for title, task in tasks.items()}
+        limits = {title: f"|u| ≤ {TASKS[title].limit:g}" for title in tasks}
         page.text("Inputs limited:" if limited else "Inputs without limits:")
         page.table(
             ("controller", *(f"{title}, {limits[title]}" if limited else title for title in table)),
