@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dtpqrt
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.moments.rows import LiftedChunk, RowColumns, row_columns
-from koopmpc.identify.solve import RegressionRows, norms, solve, unit
+from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Value
 
@@ -179,13 +179,14 @@ class Moments(Value):
     def condition(self) -> float:
         """Condition number of the regressors on unit-norm columns, those that are 0 throughout left out."""
         P = self.rows(self.columns.regressors, self.columns.targets[:0]).P
-        columns = unit(P[:, norms(P) > 0])
-        if self.samples < columns.shape[1]:
+        size = np.sqrt(np.einsum("ij,ij->j", P, P))
+        unit = P[:, size > 0] / size[size > 0]
+        if self.samples < unit.shape[1]:
             return np.inf
         if self.route == "gram":  # the rows of Gram sums are orthogonal
-            s = np.sort(norms(columns.T))[::-1][: columns.shape[1]]
+            s = np.sort(np.sqrt(np.einsum("ij,ij->i", unit, unit)))[::-1][: unit.shape[1]]
         else:
-            s = np.linalg.svd(columns, compute_uv=False)
+            s = np.linalg.svd(unit, compute_uv=False)
         return float(s[0] / s[-1]) if s.size and s[-1] > 0 else (np.inf if s.size else 1.0)
 
     def __add__(self, other: "Moments") -> "Moments":
