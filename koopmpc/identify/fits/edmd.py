@@ -13,7 +13,7 @@ from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.rank import Rank, leading, lost
-from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read, unreduced
+from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
 from koopmpc.identify.solve import RegressionRows, Ridge, Solution, doubts, orthonormal, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
@@ -71,16 +71,25 @@ def fit(
     if rank is not None:
         result = _reduced(regression, rows, ridge, rank, method, condition, sentences)
         return result._replace(rule=_WORDS[method] + result.rule, doubts=sentences)
-    given = rows.leading(nz)
+    given, C = rows.leading(nz), regression.C
     light = [i for i in regression.affine if i < rows.P.shape[1]] if towards == "affine" else []
     if method == "tls":
         given = _denoised(regression, given, nz)
     scaled = regression.scaled
     solution = _forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled, light=light)
     K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
-    said = _WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled, light=light)
-    return unreduced(
-        regression, K, rule=said, rank=solution.rank, condition=condition, ridge=solution.ridge, doubts=sentences
+    return FitResult(
+        A=K[:nz].T,
+        B=K[nz:].T,
+        C=np.eye(nz) if C is None else C,
+        lifting=regression.lifting,
+        residual=regression.rows.residual(regression.x_next, K if C is None else K @ C.T),
+        state_residual=regression.state_residual,
+        rank=solution.rank,
+        condition=condition,
+        rule=_WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled, light=light),
+        ridge=solution.ridge,
+        doubts=sentences,
     )
 
 
