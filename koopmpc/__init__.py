@@ -32,7 +32,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export
     from koopmpc.control.adaptive import Adaptive as Adaptive
-    from koopmpc.control.adaptive import Guarded as Guarded
     from koopmpc.control.cost import Cost as Cost
     from koopmpc.control.limits import Limits as Limits
     from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
@@ -40,7 +39,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.control.lqr import LQR as LQR
     from koopmpc.control.lqr import dlqr as dlqr
     from koopmpc.control.lqr import lqr as lqr
-    from koopmpc.control.monitor import Monitor as Monitor
     from koopmpc.control.move import Move as Move
     from koopmpc.control.move import Status as Status
     from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC as BilinearMPC
@@ -63,9 +61,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
     from koopmpc.identify import moments as moments
-    from koopmpc.identify.constrained.constrained import constrained_edmd as constrained_edmd
-    from koopmpc.identify.constrained.prior import Prior as Prior
-    from koopmpc.identify.constrained.stable import stable_edmd as stable_edmd
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
     from koopmpc.identify.fits.dmd import dmd as dmd
     from koopmpc.identify.fits.dmd import dmdc as dmdc
@@ -73,8 +68,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
     from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
-    from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
-    from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
     from koopmpc.lifting.base import Lifting as Lifting
     from koopmpc.lifting.composed import Standardized as Standardized
     from koopmpc.lifting.expressions import Expressions as Expressions
@@ -109,7 +102,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.recording.format.reader import load_run as load_run
     from koopmpc.recording.recorder import Recorder as Recorder
     from koopmpc.recording.recorder import record as record
-    from koopmpc.recording.viewer import view as view
     from koopmpc.synthesis.design import design as design
     from koopmpc.synthesis.designed import load_controller as load_controller
     from koopmpc.synthesis.select import select as select
@@ -152,4 +144,14 @@ else:
             "identify.fits.edmd",
             "loop.simulate",
         ),
+        moved={
+            "Guarded": "control",
+            "KoopmanRegressor": "identify",
+            "Monitor": "control",
+            "Prior": "identify",
+            "constrained_edmd": "identify",
+            "sparse_edmd": "identify",
+            "stable_edmd": "identify",
+            "view": "recording",
+        },
     )

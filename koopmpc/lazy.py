@@ -8,7 +8,11 @@ from typing import Any
 
 
 def attach(
-    package: str, modules: Mapping[str, str] | None = None, *, core: Sequence[str] = ()
+    package: str,
+    modules: Mapping[str, str] | None = None,
+    *,
+    core: Sequence[str] = (),
+    moved: Mapping[str, str] | None = None,
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package that serves the names which type checkers see.
 
@@ -22,6 +26,8 @@ def attach(
         Name → the module below ``koopmpc`` that it stands for; in `__dir__`, but not in `__all__`.
     core
         Files below the package that the first name brings along, so that no later call waits for an import.
+    moved
+        Names that stood here once → the room below the package that has them now; asking for one says so.
     """
     rooms = {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
     home = {name: file for name, file in _imported(package).items() if name not in rooms}
@@ -38,6 +44,8 @@ def attach(
             found = import_module(rooms[name])
         elif name in home:
             found = getattr(import_module(home[name]), name)
+        elif moved is not None and name in moved:
+            raise AttributeError(f"km.{name} has moved: it is km.{moved[name]}.{name} now")
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         setattr(loaded[package], name, found)

@@ -17,7 +17,7 @@ SERVING = [name for name in SERVING if hasattr(importlib.import_module(name), "_
 
 
 def test_the_daily_names_are_few() -> None:
-    assert len(km.__all__) <= 90
+    assert len(km.__all__) <= 82
     assert km.__all__ == sorted(set(km.__all__))
 
 
@@ -69,6 +69,25 @@ def test_nothing_is_imported_before_the_first_name_and_no_drawing_library_by_it(
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match=r"module 'koopmpc' has no attribute 'edmdd'"):
         km.edmdd  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("room", "name"),
+    [
+        ("control", "Guarded"),
+        ("control", "Monitor"),
+        ("identify", "KoopmanRegressor"),
+        ("identify", "Prior"),
+        ("identify", "constrained_edmd"),
+        ("identify", "sparse_edmd"),
+        ("identify", "stable_edmd"),
+        ("recording", "view"),
+    ],
+)
+def test_a_name_that_moved_one_level_down_says_where_it_is(room: str, name: str) -> None:
+    with pytest.raises(AttributeError, match=rf"km\.{name} has moved: it is km\.{room}\.{name} now"):
+        getattr(km, name)
+    assert getattr(getattr(km, room), name).__name__ == name
 
 
 def named(node: ast.stmt) -> list[str]:

@@ -114,7 +114,7 @@ def monitor_of(given: Monitor | Episodes, model: Any) -> Monitor:
     if not isinstance(model, LinearPredictor | BilinearPredictor):
         raise DataError("a monitor compares with data, and this controller's model is not learned; leave out monitor=")
     monitor = Monitor.of(model, given) if isinstance(given, Episodes) else given
-    checks.kind(monitor, "monitor", Monitor, "make one by km.Monitor.of(model, data), or pass the data")
+    checks.kind(monitor, "monitor", Monitor, "make one by km.control.Monitor.of(model, data), or pass the data")
     if monitor.lifting != model.lifting or len(monitor.leverage) != model.nz + model.nu:
         raise DataError("the monitor is of another lifting than the controller's model; make one of this model")
     return monitor

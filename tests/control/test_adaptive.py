@@ -104,7 +104,7 @@ def test_the_controller_that_stands_by_takes_over_where_the_model_does_not_know(
     plant = DriftingArm(np.ones(60))
     standby = km.LQR(km.edmd(train, km.State()), km.Cost(Q=[100.0, 1.0], R=0.01), LIMITS)
     first = km.KoopmanMPC(model, COST, LIMITS, HORIZON, monitor=train)
-    mpc = km.Guarded(first, standby, patience=2)
+    mpc = km.control.Guarded(first, standby, patience=2)
     found = km.simulate(plant, mpc, x0=[1.0, 40.0], reference=[0.0, 0.0], steps=60, cost=COST, limits=LIMITS)
     other = [k for k, f in enumerate(found.fallback) if f is km.control.Fallback.OTHER_CONTROLLER]
     assert other[0] == 1  # the second unknown step
@@ -117,19 +117,19 @@ def test_the_controller_that_stands_by_takes_over_where_the_model_does_not_know(
 def test_guarded_controllers_must_agree_and_the_first_must_say_what_it_knows(model, train):
     first, other = km.KoopmanMPC(model, COST, LIMITS, HORIZON), km.LQR(model, COST, LIMITS)
     with pytest.raises(km.errors.DataError, match="does not say whether it knows; give it monitor=data"):
-        km.Guarded(first, other)([0, 0], [0, 0])
+        km.control.Guarded(first, other)([0, 0], [0, 0])
     slower = km.LQR(km.LinearPredictor(model.A, model.B, model.C, model.lifting, 0.1, model.states, model.inputs), COST)
     with pytest.raises(km.errors.DataError, match=r"the controller has dt = 0\.05, the one that stands by 0\.1"):
-        km.Guarded(first, slower)
+        km.control.Guarded(first, slower)
 
 
 @pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 def test_what_is_no_controller_is_not_guarded(model):
     first, other = km.KoopmanMPC(model, COST, LIMITS, HORIZON), km.LQR(model, COST, LIMITS)
     with pytest.raises(km.errors.DataError, match="the one that stands by is a LinearPredictor"):
-        km.Guarded(first, model)
+        km.control.Guarded(first, model)
     with pytest.raises(km.errors.DataError, match="the controller is a NoneType"):
-        km.Guarded(None, other)
+        km.control.Guarded(None, other)
 
 
 @pytest.mark.slow

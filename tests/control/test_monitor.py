@@ -33,7 +33,7 @@ def model(data):
 
 def test_the_monitor_is_the_leverage_and_the_conformal_quantile_of_the_data(model, data):
     """‖L v‖² is vᵀ(VᵀV)⁻¹v over its 0.99 quantile; of the squared errors ‖W e‖² 99 % are at most 1."""
-    monitor = km.Monitor.of(model, data)
+    monitor = km.control.Monitor.of(model, data)
     V = np.vstack([np.hstack([model.lifting(e.X[:-1]), e.U]) for e in data])
     leverage = np.einsum("ki,ij,kj->k", V, np.linalg.inv(V.T @ V), V)
     own = ((V @ monitor.leverage.T) ** 2).sum(axis=1)
@@ -175,13 +175,13 @@ def test_a_log_keeps_what_was_known(model, data, tmp_path):
 def test_what_cannot_be_monitored_is_refused_in_words(model, data):
     with pytest.raises(km.errors.DataError, match="this controller's model is not learned"):
         km.BilinearMPC(km.discretize(Pendulum(), DT), COST, LIMITS, 10, monitor=data)
-    other = km.Monitor.of(km.edmd(data, km.State()), data)
+    other = km.control.Monitor.of(km.edmd(data, km.State()), data)
     with pytest.raises(km.errors.DataError, match="the monitor is of another lifting"):
         km.KoopmanMPC(model, COST, LIMITS, 15, monitor=other)
     with pytest.raises(km.errors.DataError, match=r"at least 99 are needed for a level of 0\.99"):
-        km.Monitor.of(model, data[:1])
+        km.control.Monitor.of(model, data[:1])
     with pytest.raises(km.errors.DataError, match="level is 1"):
-        km.Monitor.of(model, data, level=1.0)
+        km.control.Monitor.of(model, data, level=1.0)
     said = shown(
         "model = km.edmd(km.Episodes([km.Episode(X=np.random.rand(9, 1), U=np.random.rand(8, 1))], 0.1), km.State())\n"
         "show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), None, 5, monitor=3))"
@@ -196,9 +196,9 @@ def test_a_level_needs_as_many_rows_as_its_quantile_has(model):
     def head(rows):
         return km.Episodes([km.Episode(X=whole.X[: rows + 1], U=whole.U[:rows])], DT, model.states, model.inputs)
 
-    assert km.Monitor.of(model, head(9), level=0.9).level == 0.9
+    assert km.control.Monitor.of(model, head(9), level=0.9).level == 0.9
     with pytest.raises(km.errors.DataError, match=r"8 rows, at least 9 are needed for a level of 0\.9"):
-        km.Monitor.of(model, head(8), level=0.9)
+        km.control.Monitor.of(model, head(8), level=0.9)
 
 
 def test_a_bilinear_mpc_does_not_know_where_no_data_were(data):

@@ -49,28 +49,28 @@ def found(model) -> np.ndarray:
 STORE = np.diag([2.0, 1.0, 0.0])
 CASES = {
     "known entries": (
-        km.Prior(A=[[NAN, 0.1, NAN], [NAN] * 3, [0, 0, 1]], B=[[0.0], [NAN], [0.0]]),
+        km.identify.Prior(A=[[NAN, 0.1, NAN], [NAN] * 3, [0, 0, 1]], B=[[0.0], [NAN], [0.0]]),
         lambda A, B: [A[0, 1] == 0.1, B[0, 0] == 0, A[2] == [0, 0, 1], B[2, 0] == 0],
     ),
     "known rows": (
-        km.Prior(rows={"x0": {"x0": 1.0, "x1": 0.1}, "1": {"1": 1.0}}),
+        km.identify.Prior(rows={"x0": {"x0": 1.0, "x1": 0.1}, "1": {"1": 1.0}}),
         lambda A, B: [A[0] == [1, 0.1, 0], A[2] == [0, 0, 1], B[0] == 0, B[2] == 0],
     ),
     "masks": (
-        km.Prior(mask_A=[[1, 1, 0], [0, 1, 1], [0, 0, 1]], mask_B=[[0], [1], [0]]),
+        km.identify.Prior(mask_A=[[1, 1, 0], [0, 1, 1], [0, 0, 1]], mask_B=[[0], [1], [0]]),
         lambda A, B: [A[0, 2] == 0, A[1, 0] == 0, A[2, :2] == 0, B[0] == 0, B[2] == 0],
     ),
     "bounds": (
-        km.Prior(lower_A=0.0, upper_A=[[0.02] * 3, [np.inf] * 3, [1.0] * 3], upper_B=0.01),
+        km.identify.Prior(lower_A=0.0, upper_A=[[0.02] * 3, [np.inf] * 3, [1.0] * 3], upper_B=0.01),
         lambda A, B: [A >= 0, A[0] <= 0.02, A[2] <= 1, B <= 0.01],
     ),
-    "symmetric": (km.Prior(symmetric=True), lambda A, B: [A == A.T]),
+    "symmetric": (km.identify.Prior(symmetric=True), lambda A, B: [A == A.T]),
     "combinations": (
-        km.Prior(combinations=[km.identify.Combination(1, 1, A=np.ones((3, 3))), km.identify.Combination(0.2, np.inf, B=np.ones((3, 1)))]),
+        km.identify.Prior(combinations=[km.identify.Combination(1, 1, A=np.ones((3, 3))), km.identify.Combination(0.2, np.inf, B=np.ones((3, 1)))]),
         lambda A, B: [cp.sum(A) == 1, cp.sum(B) >= 0.2],
     ),
     "contraction": (
-        km.Prior(dissipation=km.identify.Dissipation(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
+        km.identify.Prior(dissipation=km.identify.Dissipation(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
         lambda A, B: [
             A[:2, 2] == 0,
             cp.bmat([[0.25 * STORE[:2, :2], (np.sqrt(STORE[:2]) @ A[:, :2]).T],
@@ -85,7 +85,7 @@ CASES = {
 def test_equals_brute_force_on_all_rows(name: str, ridge: float) -> None:
     prior, constrain = CASES[name]
     data = random_episodes(3, [40, 30], 2, 1)
-    model = km.constrained_edmd(data, LIFTING, prior=prior, ridge=ridge)
+    model = km.identify.constrained_edmd(data, LIFTING, prior=prior, ridge=ridge)
     assert np.allclose(found(model), oracle(data, LIFTING, ridge, constrain, PINNED.get(name, ())), rtol=0, atol=2e-6)
     assert model.report.changes
     assert returned(prior) == prior
@@ -94,7 +94,9 @@ def test_equals_brute_force_on_all_rows(name: str, ridge: float) -> None:
 def test_passivity_holds_and_equals_the_program_in_raw_units() -> None:
     data = random_episodes(5, [60], 2, 1)
     P, C, D = np.diag([1.0, 2.0]), np.array([[0.3, 0.1]]), np.array([[0.2]])
-    model = km.constrained_edmd(data, km.State(), prior=km.Prior(dissipation=km.identify.Dissipation(P, C=C, D=D)))
+    model = km.identify.constrained_edmd(
+        data, km.State(), prior=km.identify.Prior(dissipation=km.identify.Dissipation(P, C=C, D=D))
+    )
 
     def passive(A, B):  # in z, u directly: P⁻¹ instead of a factor
         return [cp.bmat([[P, C.T, A.T], [C, D + D.T, B.T], [A, B, np.linalg.inv(P)]]) >> 0]
@@ -111,7 +113,7 @@ def test_passivity_holds_and_equals_the_program_in_raw_units() -> None:
 def test_bounds_meet_the_KKT_conditions(seed: int) -> None:
     data = random_episodes(seed, [50], 3, 1)
     lower = np.where(np.random.default_rng(seed).uniform(size=(3, 3)) < 0.5, 0.02, -np.inf)
-    model = km.constrained_edmd(data, km.State(), prior=km.Prior(lower_A=lower, upper_B=0.0))
+    model = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(lower_A=lower, upper_B=0.0))
     D = brute_force(data, km.State().bind(data.states))
     P, T = D[:, :4], D[:, 4:]
     slope = (found(model) @ P.T - T.T) @ P / len(P)  # of ½ the mean squared residual
@@ -129,20 +131,20 @@ def test_bounds_meet_the_KKT_conditions(seed: int) -> None:
 A_TRUE = np.array([[0.9, 0.1, 0.0], [0.1, 0.7, 0.0], [0.0, 0.0, 0.5]])
 B_TRUE = np.array([[0.0], [0.5], [0.0]])
 TRUTHS = [
-    km.Prior(rows={"x2": {"x2": 0.5}}),
-    km.Prior(B=B_TRUE),
-    km.Prior(mask_A=A_TRUE != 0, mask_B=B_TRUE != 0),
-    km.Prior(lower_A=-1e-9, lower_B=-1e-9, upper_A=1.0),
-    km.Prior(symmetric=True),
-    km.Prior(combinations=[km.identify.Combination(2.1, 2.1, A=np.eye(3))]),
-    km.Prior(dissipation=km.identify.Dissipation([1, 1, 1])),
+    km.identify.Prior(rows={"x2": {"x2": 0.5}}),
+    km.identify.Prior(B=B_TRUE),
+    km.identify.Prior(mask_A=A_TRUE != 0, mask_B=B_TRUE != 0),
+    km.identify.Prior(lower_A=-1e-9, lower_B=-1e-9, upper_A=1.0),
+    km.identify.Prior(symmetric=True),
+    km.identify.Prior(combinations=[km.identify.Combination(2.1, 2.1, A=np.eye(3))]),
+    km.identify.Prior(dissipation=km.identify.Dissipation([1, 1, 1])),
 ]
 
 
 @pytest.mark.parametrize("prior", TRUTHS)
-def test_a_true_prior_does_not_move_the_fit_of_exact_data(prior: km.Prior) -> None:
+def test_a_true_prior_does_not_move_the_fit_of_exact_data(prior: km.identify.Prior) -> None:
     data = linear(A_TRUE, B_TRUE)
-    model, plain = km.constrained_edmd(data, km.State(), prior=prior), km.edmd(data, km.State())
+    model, plain = km.identify.constrained_edmd(data, km.State(), prior=prior), km.edmd(data, km.State())
     assert np.allclose(found(model), found(plain), rtol=0, atol=1e-11)
     assert np.allclose(found(model), np.hstack([A_TRUE, B_TRUE]), rtol=0, atol=1e-11)
 
@@ -151,7 +153,9 @@ def test_a_known_B_separates_what_feedback_made_inseparable() -> None:
     A, B = np.array([[1.5, 0], [0, 0.1]]), np.array([[1.0], [0.0]])
     data = one_step_pairs(lambda x, u: A @ x + B @ u, 2, 1, 50)
     closed = km.Episodes([type(e)(X=[e.X[0], A @ e.X[0] - B @ e.X[0, :1]], U=[-e.X[0, :1]]) for e in data], data.dt)
-    model = km.constrained_edmd(closed, km.State(), prior=km.Prior(B=B))  # no FitWarning: nothing doubtful is left
+    model = km.identify.constrained_edmd(
+        closed, km.State(), prior=km.identify.Prior(B=B)
+    )  # no FitWarning: nothing doubtful is left
     assert np.allclose(model.A, A, atol=1e-12)
 
 
@@ -159,8 +163,8 @@ def test_units_mean_nothing_under_bounds() -> None:
     data = random_episodes(2, [80], 2, 1)
     units = np.array([1e-4, 1e4])
     scaled = km.Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
-    a = km.constrained_edmd(data, km.State(), prior=km.Prior(lower_A=0.0, lower_B=0.0))
-    b = km.constrained_edmd(scaled, km.State(), prior=km.Prior(lower_A=0.0, lower_B=0.0))
+    a = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(lower_A=0.0, lower_B=0.0))
+    b = km.identify.constrained_edmd(scaled, km.State(), prior=km.identify.Prior(lower_A=0.0, lower_B=0.0))
     assert np.allclose(b.A * units / units[:, None], a.A, atol=1e-7)
     assert np.allclose(b.B * 1e3 / units[:, None], a.B, atol=1e-7)
 
@@ -169,7 +173,7 @@ def test_measured_disturbances_are_the_last_columns_of_B() -> None:
     rng = np.random.default_rng(0)
     X, U, W = rng.standard_normal((40, 2)), rng.standard_normal((39, 1)), rng.standard_normal((39, 1))
     data = km.Episodes([type(random_episodes(0, [2], 1, 0)[0])(X=X, U=U, W=W)], 0.1)
-    model = km.constrained_edmd(data, km.State(), prior=km.Prior(B=[[NAN, 0.5], [NAN, 0.0]]))
+    model = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(B=[[NAN, 0.5], [NAN, 0.0]]))
     assert np.array_equal(model.E, [[0.5], [0.0]])
     assert model.B.shape == (2, 1)
 
@@ -196,7 +200,7 @@ REFUSED = [
 def test_what_cannot_be_is_refused(parts: dict, kind: type[Exception], text: str) -> None:
     data = random_episodes(0, [40], 2, 1)
     with pytest.raises(kind, match=text):
-        km.constrained_edmd(data, LIFTING, prior=km.Prior(**parts))
+        km.identify.constrained_edmd(data, LIFTING, prior=km.identify.Prior(**parts))
 
 
 def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
@@ -209,4 +213,4 @@ def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
     with pytest.raises(km.errors.DataError, match="decay is 0"):
         km.identify.Dissipation([1.0], decay=0)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
-        km.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.Prior(), ridge=-1)
+        km.identify.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.identify.Prior(), ridge=-1)

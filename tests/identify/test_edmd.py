@@ -107,8 +107,10 @@ def test_where_the_data_have_their_zero_changes_no_ridge(kind: str, ridge: float
     fits = {
         "edmd": km.edmd,
         "bilinear": km.bilinear_edmd,
-        "stable": km.stable_edmd,
-        "constrained": lambda *a, **k: km.constrained_edmd(*a, prior=km.Prior(rows={"1": {"1": 1.0}}), **k),
+        "stable": km.identify.stable_edmd,
+        "constrained": lambda *a, **k: km.identify.constrained_edmd(
+            *a, prior=km.identify.Prior(rows={"1": {"1": 1.0}}), **k
+        ),
     }
 
     def fitted(at: np.ndarray, by: np.ndarray) -> np.ndarray:

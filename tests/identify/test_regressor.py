@@ -27,7 +27,9 @@ def rows_of(data: km.Episodes):
     return np.hstack([parts.X, parts.U]), parts.X_next
 
 
-@pytest.mark.parametrize("estimator", [km.KoopmanRegressor(), km.KoopmanRegressor(degree=1, harmonics=1, alpha=1e-6)])
+@pytest.mark.parametrize(
+    "estimator", [km.identify.KoopmanRegressor(), km.identify.KoopmanRegressor(degree=1, harmonics=1, alpha=1e-6)]
+)
 def test_all_checks_of_scikit_learn_pass(estimator):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SkipTestWarning)  # of pandas and of array API, which are not here
@@ -40,7 +42,7 @@ def test_all_checks_of_scikit_learn_pass(estimator):
 def test_the_predictor_is_that_of_edmd_and_predicts_what_predict_does(alpha):
     data = one_step_pairs(step, 2, 1, 200)
     X, y = rows_of(data)
-    found = km.KoopmanRegressor(degree=3, alpha=alpha, n_inputs=1, dt=data.dt).fit(X, y)
+    found = km.identify.KoopmanRegressor(degree=3, alpha=alpha, n_inputs=1, dt=data.dt).fit(X, y)
     other = km.edmd(data, km.State() + km.Constant() + km.Monomials(3), ridge=alpha)
     model = found.predictor_
     assert pytest.approx(other.A, abs=1e-8) == model.A
@@ -53,7 +55,7 @@ def test_the_predictor_is_that_of_edmd_and_predicts_what_predict_does(alpha):
 
 def test_a_target_that_is_no_next_state_gives_no_predictor():
     X, y = rows_of(one_step_pairs(step, 2, 1, 60))
-    found = km.KoopmanRegressor(n_inputs=1).fit(X, y)
+    found = km.identify.KoopmanRegressor(n_inputs=1).fit(X, y)
     assert found.predict(X[:3]).shape == (3, 2)
     found.fit(X, y[:, 0])
     assert found.predict(X[:3]).shape == (3,)
@@ -62,7 +64,7 @@ def test_a_target_that_is_no_next_state_gives_no_predictor():
 
 def test_a_lifting_without_the_state_gets_a_fitted_C():
     X, y = rows_of(one_step_pairs(step, 2, 1, 200))
-    found = km.KoopmanRegressor(lifting=km.Constant() + km.Fourier(3), n_inputs=1).fit(X, y)
+    found = km.identify.KoopmanRegressor(lifting=km.Constant() + km.Fourier(3), n_inputs=1).fit(X, y)
     Z = found.lifting_(X[:, :2])
     expected = np.linalg.lstsq(Z, X[:, :2], rcond=None)[0].T
     assert pytest.approx(expected, abs=1e-8) == found.predictor_.C
@@ -81,7 +83,7 @@ def test_a_grid_search_over_episodes_finds_the_dictionary_that_is_true():
             groups.append(episode)
             x = x_next
     search = GridSearchCV(
-        km.KoopmanRegressor(n_inputs=1),
+        km.identify.KoopmanRegressor(n_inputs=1),
         {"degree": [1, 2], "harmonics": [0, 2], "alpha": [0.0, 1e-6, 1e-1]},
         cv=GroupKFold(4),
         error_score="raise",
@@ -94,9 +96,9 @@ def test_a_grid_search_over_episodes_finds_the_dictionary_that_is_true():
 
 def test_it_stands_at_the_end_of_a_pipeline_and_clones():
     X, y = rows_of(one_step_pairs(step, 2, 1, 100))
-    pipeline = make_pipeline(StandardScaler(), km.KoopmanRegressor(degree=3, n_inputs=1))
+    pipeline = make_pipeline(StandardScaler(), km.identify.KoopmanRegressor(degree=3, n_inputs=1))
     assert clone(pipeline).fit(X, y).score(X, y) > 0.999
-    own = km.KoopmanRegressor(lifting=km.State() + km.Constant())
+    own = km.identify.KoopmanRegressor(lifting=km.State() + km.Constant())
     assert clone(own).get_params()["lifting"] == own.lifting
 
 
@@ -112,7 +114,7 @@ def test_it_stands_at_the_end_of_a_pipeline_and_clones():
 )
 def test_a_mistake_is_told_at_fit(parameters, words):
     with pytest.raises(km.errors.DataError, match=words):
-        km.KoopmanRegressor(**parameters).fit(np.eye(3), np.eye(3))
+        km.identify.KoopmanRegressor(**parameters).fit(np.eye(3), np.eye(3))
 
 
 def run(code):
@@ -120,10 +122,10 @@ def run(code):
 
 
 def test_importing_koopmpc_does_not_import_scikit_learn_but_the_name_is_there():
-    done = run("import sys, koopmpc as km; print('sklearn' in sys.modules, km.KoopmanRegressor().alpha)")
+    done = run("import sys, koopmpc as km; print('sklearn' in sys.modules, km.identify.KoopmanRegressor().alpha)")
     assert done.stdout.split() == ["False", "0.0"], done.stderr
 
 
 def test_without_scikit_learn_the_name_says_what_to_install():
-    done = run("import sys; sys.modules['sklearn'] = None\nimport koopmpc as km\nkm.KoopmanRegressor")
+    done = run("import sys; sys.modules['sklearn'] = None\nimport koopmpc as km\nkm.identify.KoopmanRegressor")
     assert re.search(r"pip install '.+\[sklearn\]'", done.stderr)

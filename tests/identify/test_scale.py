@@ -30,8 +30,8 @@ FITS = {
     "dmdc reduced": lambda data: km.dmdc(data, rank=1),
     "bilinear": lambda data: km.bilinear_edmd(data, SQUARES, difference=True),
     "bilinear reduced": lambda data: km.bilinear_edmd(data, SQUARES, rank=4),
-    "stable": lambda data: km.stable_edmd(data, SQUARES),
-    "sparse": lambda data: km.sparse_edmd(data, SQUARES, penalty=1e-4),
+    "stable": lambda data: km.identify.stable_edmd(data, SQUARES),
+    "sparse": lambda data: km.identify.sparse_edmd(data, SQUARES, penalty=1e-4),
     "online": online,
 }
 

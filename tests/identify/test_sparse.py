@@ -16,7 +16,7 @@ SMALL = km.Constant() + km.State() + km.Monomials(4)
 DICTIONARY = SMALL + km.Fourier(2)  # collinear to 1e-13
 
 
-CODE = "show(lambda: km.sparse_edmd(km.Episodes([km.Episode(X=np.eye(4))], 0.1), km.State(), over='rows'))"
+CODE = "show(lambda: km.identify.sparse_edmd(km.Episodes([km.Episode(X=np.eye(4))], 0.1), km.State(), over='rows'))"
 
 
 def slow_manifold(noise: float = 0.0, seed: int = 0, count: int = 600) -> km.Episodes:
@@ -66,7 +66,7 @@ def test_the_lasso_solver_agrees_with_cvxpy(seed: int, grouped: bool, penalty: f
 @pytest.mark.parametrize("over", ["observables", "entries"])
 def test_the_right_observables_are_found(noise: float, penalty: float, over: str) -> None:
     dictionary = SMALL if noise else DICTIONARY
-    model = km.sparse_edmd(slow_manifold(noise, seed=1), dictionary, penalty=penalty, over=over)
+    model = km.identify.sparse_edmd(slow_manifold(noise, seed=1), dictionary, penalty=penalty, over=over)
     assert model.lifting.names == ("1", "x0", "x1", "x0^2")
     true = np.array([[1, 0, 0, 0], [0, 0.9, 0, 0], [0, 0, 0.5, 0.3], [noise**2, 0, 0, 0.81]])
     assert np.allclose(model.A, true, rtol=0, atol=1e-9 + noise / 2)
@@ -84,14 +84,14 @@ def test_the_right_observables_are_found(noise: float, penalty: float, over: str
 
 
 def test_entries_that_are_zero_are_exactly_zero() -> None:
-    model = km.sparse_edmd(slow_manifold(0.02, seed=1), SMALL, over="entries")
+    model = km.identify.sparse_edmd(slow_manifold(0.02, seed=1), SMALL, over="entries")
     assert np.array_equal(model.A[1:] != 0, np.array([[0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]], bool))
     assert np.array_equal(model.B[:, 0] != 0, [False, False, True, False])
 
 
 def test_least_squares_on_what_is_kept() -> None:
     data = slow_manifold(0.02, seed=2)
-    model = km.sparse_edmd(data, SMALL)
+    model = km.identify.sparse_edmd(data, SMALL)
     refit = km.edmd(data, model.lifting)
     assert np.allclose(model.A, refit.A, rtol=0, atol=1e-9)
     assert np.allclose(model.B, refit.B, rtol=0, atol=1e-9)
@@ -100,9 +100,9 @@ def test_least_squares_on_what_is_kept() -> None:
 
 def test_a_large_penalty_leaves_the_states_and_a_small_one_everything() -> None:
     data = slow_manifold(0.02)
-    assert km.sparse_edmd(data, DICTIONARY, penalty=1e3).lifting.names == ("1", "x0", "x1")
+    assert km.identify.sparse_edmd(data, DICTIONARY, penalty=1e3).lifting.names == ("1", "x0", "x1")
     every = km.State() + km.Monomials(2)
-    whole = km.sparse_edmd(data, every, penalty=1e-12, adaptive=False)
+    whole = km.identify.sparse_edmd(data, every, penalty=1e-12, adaptive=False)
     assert whole.lifting.names == every.bind(data.states).names
     assert np.allclose(whole.A, km.edmd(data, every).A, rtol=0, atol=1e-9)
 
@@ -111,12 +111,12 @@ def test_the_kept_observables_do_not_depend_on_units() -> None:
     data = slow_manifold(0.02, seed=3)
     units = np.array([1e-4, 1e4])
     scaled = km.Episodes([type(e)(X=e.X * units, U=1e3 * e.U) for e in data], data.dt)
-    a, b = (km.sparse_edmd(d, SMALL).lifting.names for d in (data, scaled))
+    a, b = (km.identify.sparse_edmd(d, SMALL).lifting.names for d in (data, scaled))
     assert a == b
 
 
 def test_the_chosen_lifting_is_data_and_the_same_function_twice(tmp_path) -> None:
-    model = km.sparse_edmd(slow_manifold(), DICTIONARY, penalty=1e-6)
+    model = km.identify.sparse_edmd(slow_manifold(), DICTIONARY, penalty=1e-6)
     model.save(tmp_path / "model.npz")
     again = km.load_model(tmp_path / "model.npz")
     assert again == model
@@ -131,8 +131,8 @@ def test_a_wrong_penalty_or_lifting_is_refused() -> None:
     assert shown(CODE) == ['DataError over is \'rows\'; pass "observables" or "entries"']
     data = slow_manifold(count=30)
     with pytest.raises(km.errors.DataError, match="penalty is 0"):
-        km.sparse_edmd(data, DICTIONARY, penalty=0)
+        km.identify.sparse_edmd(data, DICTIONARY, penalty=0)
     with pytest.raises(km.errors.DataError, match="the lifting lacks the state 'x0'"):
-        km.sparse_edmd(data, km.Monomials(2), penalty=1)
+        km.identify.sparse_edmd(data, km.Monomials(2), penalty=1)
     with pytest.raises(km.errors.DataError, match="which holds 9"):
         Picked(km.State(), (9,)).bind(("a", "b"))

@@ -50,7 +50,7 @@ def refitted(data: km.Episodes, model, A: np.ndarray) -> float:
 @settings(max_examples=10)
 def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radius: float) -> None:
     data = runs(seed, nx, nu, radius=1.0, noise=0.3)
-    plain, model = km.edmd(data, km.State()), km.stable_edmd(data, km.State(), radius=radius)
+    plain, model = km.edmd(data, km.State()), km.identify.stable_edmd(data, km.State(), radius=radius)
     assert radius_of(model.A) <= radius + 1e-9
     if radius_of(plain.A) <= radius:
         assert np.allclose(model.A, plain.A, rtol=0, atol=1e-12)
@@ -69,7 +69,7 @@ def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radi
 
 def test_one_observable_moves_to_the_circle() -> None:
     x = 1.2 ** np.arange(10)[:, None]
-    model = km.stable_edmd(km.Episodes([km.Episode(X=x)], 0.1), km.State(), radius=0.9)
+    model = km.identify.stable_edmd(km.Episodes([km.Episode(X=x)], 0.1), km.State(), radius=0.9)
     assert np.allclose(model.A, 0.9, rtol=0, atol=1e-9)
 
 
@@ -116,7 +116,7 @@ def test_the_matrix_inequality_is_solved_to_its_optimum() -> None:
 def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
     data = runs(4, 3, 1, radius=1.0, noise=0.3, offset=0.5)
     lifting = km.State() + km.Constant() + km.Monomials(2)
-    model = km.stable_edmd(data, lifting, radius=0.8)
+    model = km.identify.stable_edmd(data, lifting, radius=0.8)
     row = model.lifting.names.index("1")
     assert np.array_equal(model.A[row], np.eye(model.nz)[row])
     assert np.array_equal(model.B[row], [0.0])
@@ -127,9 +127,9 @@ def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
 
 def test_a_ridge_counts_in_the_plain_and_in_the_stable_fit() -> None:
     data = runs(4, 3, 1, radius=1.0, noise=0.3)
-    plain = km.stable_edmd(data, km.State(), ridge=0.1, radius=5.0)
+    plain = km.identify.stable_edmd(data, km.State(), ridge=0.1, radius=5.0)
     assert np.allclose(plain.A, km.edmd(data, km.State(), ridge=0.1).A, atol=1e-12)
-    model = km.stable_edmd(data, km.State(), ridge=0.1, radius=0.5)
+    model = km.identify.stable_edmd(data, km.State(), ridge=0.1, radius=0.5)
     assert radius_of(model.A) <= 0.5 + 1e-9
     assert model.report.ridge == 0.1
 
@@ -138,24 +138,35 @@ def test_the_ridge_of_cross_validation_is_that_of_the_plain_fit() -> None:
     data = runs(1, 3, 1, radius=1.05, noise=0.3)
     plain = km.edmd(data, km.State(), ridge="gcv")
     assert plain.report.ridge > 0
-    free = km.Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]])
+    free = km.identify.Prior(mask_A=[[1, 1, 0], [1, 1, 1], [1, 1, 1]])
     for model, same in (
-        (km.stable_edmd(data, km.State(), ridge="gcv", radius=5.0), km.stable_edmd(data, km.State(), radius=5.0)),
-        (km.stable_edmd(data, km.State(), ridge="gcv", radius=0.5), km.stable_edmd(data, km.State(), radius=0.5)),
-        (km.constrained_edmd(data, km.State(), prior=km.Prior(), ridge="gcv"), km.edmd(data, km.State())),
-        (km.constrained_edmd(data, km.State(), prior=free, ridge="gcv"), km.edmd(data, km.State())),
+        (
+            km.identify.stable_edmd(data, km.State(), ridge="gcv", radius=5.0),
+            km.identify.stable_edmd(data, km.State(), radius=5.0),
+        ),
+        (
+            km.identify.stable_edmd(data, km.State(), ridge="gcv", radius=0.5),
+            km.identify.stable_edmd(data, km.State(), radius=0.5),
+        ),
+        (
+            km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(), ridge="gcv"),
+            km.edmd(data, km.State()),
+        ),
+        (km.identify.constrained_edmd(data, km.State(), prior=free, ridge="gcv"), km.edmd(data, km.State())),
     ):
         assert model.report.ridge == plain.report.ridge
         assert "chosen by generalised cross-validation" in model.report.route
         assert not np.array_equal(model.A, same.A)
-    fixed = km.constrained_edmd(data, km.State(), prior=free, ridge=plain.report.ridge)
-    assert np.array_equal(fixed.A, km.constrained_edmd(data, km.State(), prior=free, ridge="gcv").A)
-    assert np.allclose(km.constrained_edmd(data, km.State(), prior=km.Prior(), ridge="gcv").A, plain.A, atol=1e-12)
+    fixed = km.identify.constrained_edmd(data, km.State(), prior=free, ridge=plain.report.ridge)
+    assert np.array_equal(fixed.A, km.identify.constrained_edmd(data, km.State(), prior=free, ridge="gcv").A)
+    assert np.allclose(
+        km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(), ridge="gcv").A, plain.A, atol=1e-12
+    )
 
 
 def test_more_observables_than_the_inequality_takes() -> None:
     data = runs(0, 24, 2, radius=1.02, noise=0.3)
-    model = km.stable_edmd(data, km.State(), radius=0.9)
+    model = km.identify.stable_edmd(data, km.State(), radius=0.9)
     assert radius_of(model.A) <= 0.9 + 1e-9
     plain = km.edmd(data, km.State())
     assert objective(data, model) <= refitted(data, model, clipped(plain.A, 0.9))
@@ -174,8 +185,8 @@ def test_nearly_dependent_observables_stay_as_close_as_a_ridge_would_have_them()
     lifting = km.State() + km.ThinPlate(generator.uniform(-2, 2, (30, 2)))
     plain, model, ridged = (
         km.edmd(data, lifting),
-        km.stable_edmd(data, lifting),
-        km.stable_edmd(data, lifting, ridge=1e-10),
+        km.identify.stable_edmd(data, lifting),
+        km.identify.stable_edmd(data, lifting, ridge=1e-10),
     )
     assert radius_of(plain.A) > 1 >= radius_of(model.A) - 1e-9
     least, with_ridge = objective(data, plain), objective(data, ridged)
@@ -186,7 +197,7 @@ def test_a_stable_model_that_keeps_little_of_the_plant_says_so() -> None:
     X = np.array([[1.5**k, 0.5**k] for k in range(9)])
     data = km.Episodes([km.Episode(X=X, U=np.zeros((8, 0)))], 0.1)
     with pytest.warns(km.FitWarning, match=r"stability costs much: the stable model misses \d+% .* larger radius"):
-        km.stable_edmd(data, km.State(), radius=0.5)
+        km.identify.stable_edmd(data, km.State(), radius=0.5)
 
 
 @pytest.mark.slow
@@ -197,7 +208,7 @@ def test_two_hundred_observables_take_a_few_seconds() -> None:
     total = km.moments.second_moments(data, km.State())
     plain = km.edmd(data, km.State())
     start = time.perf_counter()
-    model = km.stable_edmd(data, km.State(), radius=0.95)
+    model = km.identify.stable_edmd(data, km.State(), radius=0.95)
     seconds = time.perf_counter() - start
     assert radius_of(model.A) <= 0.95 + 1e-9
     clip = refitted(data, model, clipped(plain.A, 0.95))
@@ -212,9 +223,9 @@ def test_delays_weights_and_the_past_in_all_three_fits() -> None:
     how = {"embedding": km.Delay(1), "weights": lambda episode: len(episode) / 50}
     plain = km.edmd(data, lifting, **how)
     for model in (
-        km.stable_edmd(data, lifting, radius=5.0, **how),
-        km.constrained_edmd(data, lifting, prior=km.Prior(), **how),
-        km.sparse_edmd(data, lifting, penalty=1e-12, adaptive=False, **how),
+        km.identify.stable_edmd(data, lifting, radius=5.0, **how),
+        km.identify.constrained_edmd(data, lifting, prior=km.identify.Prior(), **how),
+        km.identify.sparse_edmd(data, lifting, penalty=1e-12, adaptive=False, **how),
     ):
         assert np.allclose(model.A, plain.A, rtol=0, atol=1e-9)
         assert np.allclose(model.B, plain.B, rtol=0, atol=1e-9)
@@ -227,8 +238,8 @@ def test_a_wrong_radius_or_ridge_is_refused() -> None:
     data = random_episodes(0, [30], 2, 1)
     for radius in (0.0, -1.0):
         with pytest.raises(km.errors.DataError, match="radius is"):
-            km.stable_edmd(data, km.State(), radius=radius)
+            km.identify.stable_edmd(data, km.State(), radius=radius)
     with pytest.raises(km.errors.DataError, match="radius holds 1 NaN"):
-        km.stable_edmd(data, km.State(), radius=np.nan)
+        km.identify.stable_edmd(data, km.State(), radius=np.nan)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
-        km.stable_edmd(data, km.State(), ridge=-1)
+        km.identify.stable_edmd(data, km.State(), ridge=-1)

@@ -40,8 +40,8 @@ def test_several_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPa
     opened = []
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: opened.append(logs) or True)
-    km.view([log, str(log)])
-    km.view(log)
+    km.recording.view([log, str(log)])
+    km.recording.view(log)
     assert opened == [[str(log), str(log)], [str(log)]]
 
 
@@ -49,7 +49,7 @@ def test_without_a_display_the_command_for_another_machine_is_told(log: Path, mo
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     told = r"there is no display to open .*run\.rrd on; `koopmpc view --web .*`.*, or copy it to a machine with .* run `koopmpc view run\.rrd`"
     with pytest.raises(km.errors.LogError, match=told):
-        km.view(log)
+        km.recording.view(log)
 
 
 def test_without_a_display_a_comparison_is_told_by_the_logs_that_it_compares(
@@ -67,7 +67,7 @@ def test_a_viewer_that_does_not_start_is_told(log: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "open_viewer", lambda logs, port: False)
     with pytest.raises(km.errors.LogError, match=r"the viewer did not start; run `/.*rerun.* .*run\.rrd` to see"):
-        km.view(log)
+        km.recording.view(log)
 
 
 @pytest.mark.slow
