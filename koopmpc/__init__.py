@@ -70,12 +70,12 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
     from koopmpc.lifting.base import Lifting as Lifting
     from koopmpc.lifting.composed import Standardized as Standardized
-    from koopmpc.lifting.expressions import Expressions as Expressions
     from koopmpc.lifting.fourier import Fourier as Fourier
     from koopmpc.lifting.fourier import RandomFourier as RandomFourier
     from koopmpc.lifting.radial import Gaussian as Gaussian
     from koopmpc.lifting.radial import ThinPlate as ThinPlate
     from koopmpc.lifting.state import Constant as Constant
+    from koopmpc.lifting.state import Expressions as Expressions
     from koopmpc.lifting.state import Monomials as Monomials
     from koopmpc.lifting.state import State as State
     from koopmpc.loop import faults as faults

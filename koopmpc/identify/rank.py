@@ -81,10 +81,7 @@ def kept(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple
 
 
 def lost(
-    Z: Float[np.ndarray, "m nz"],
-    basis: Float[np.ndarray, "nz r"],
-    C: Float[np.ndarray, "nx nz"] | None,
-    samples: int,
+    Z: Float[np.ndarray, "m nz"], basis: Float[np.ndarray, "nz r"], C: Float[np.ndarray, "nx nz"] | None, samples: int
 ) -> Float[np.ndarray, " nx"]:
     """Return the root-mean-square of C (I − U_r U_rᵀ) ψ(x), the part of each state that the truncation loses."""
     gap = (Z @ basis) @ basis.T

@@ -274,10 +274,7 @@ def doubts(
             )
         return sentences, condition if rank == nz + nu else np.inf
     rank_z, rank_u = scaled_rank(rows, Z)[0], scaled_rank(rows, U)[0]
-    for P, own, part, what in (
-        (Z, rank_z, live[live < nz], "observables"),
-        (U, rank_u, live[live >= nz], "inputs"),
-    ):
+    for P, own, part, what in ((Z, rank_z, live[live < nz], "observables"), (U, rank_u, live[live >= nz], "inputs")):
         if own < P.shape[1] and not (regular and what == "observables"):
             sentences.append(
                 f"rank-deficient: {P.shape[1] - own} of {P.shape[1]} {what} are linear functions of others "

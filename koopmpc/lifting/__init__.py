@@ -4,7 +4,6 @@ All families are imported here: a file or a task that holds a lifting names its 
 """
 
 from koopmpc.lifting import composed as composed
-from koopmpc.lifting import expressions as expressions
 from koopmpc.lifting import fourier as fourier
 from koopmpc.lifting import radial as radial
 from koopmpc.lifting import state as state

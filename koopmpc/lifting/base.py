@@ -155,8 +155,6 @@ class Lifting(Value, ABC):
         """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
         if Value._kinds.get(type(self).__name__) is type(self):
             return self
-        from koopmpc.lifting.expressions import Traced  # here, because that file imports this one
-
         return Traced(self._graph, self.names, bound=self.bound_states)
 
     def lift_into(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
@@ -192,6 +190,26 @@ class Lifting(Value, ABC):
     def _misfit(self, got: object) -> str:
         what = f"has {got} states" if isinstance(got, int) else f"has shape {got}"
         return f"x {what}, the lifting was bound to {len(self.bound_states)} ({', '.join(self.bound_states)})"
+
+
+@dataclass(frozen=True, eq=False)
+class Traced(Lifting):
+    """ψ as a list of plain operations: a file holds a user's own function in this form."""
+
+    graph: Graph
+    labels: tuple[str, ...]
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names given when it was traced."""
+        return self.labels
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the operations, done on symbols."""
+        return self.graph.symbolic(x)
+
+    @cached_property
+    def _graph(self) -> Graph:
+        return self.graph
 
 
 def lifting_of(given: object) -> Lifting:

@@ -1,6 +1,7 @@
-"""The state and its powers: State of degree 1, Constant of degree 0, Monomials of all degrees from 2 on."""
+"""Formulas of the state: State (degree 1), Constant (degree 0), Monomials (degrees from 2 on), a user's Expressions."""
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
@@ -10,8 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, frozen, indices, short
-from koopmpc.values import freeze
+from koopmpc.errors import DataError
+from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, Traced, frozen, indices, short
+from koopmpc.plants.graph import Graph
+from koopmpc.values import Value, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +129,56 @@ class Monomials(Lifting):
 def _factors(nx: int, degree: int) -> list[tuple[int, ...]]:
     """Return the monomials of degree 2 … `degree` as ascending lists of state indices."""
     return [c for d in range(2, degree + 1) for c in combinations_with_replacement(range(nx), d)]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Expressions(Lifting):
+    """ψ(x) = fn(x), traced once when it is bound.
+
+    Parameters
+    ----------
+    fn
+        Takes the column x and returns a list of expressions: ``lambda x: [x[1] * ca.sin(x[0])]``.
+    names
+        The name of each expression, by which limits and costs find it.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import casadi as ca
+    >>> drag = km.Expressions(lambda x: [x[1] * ca.fabs(x[1])], ["v|v|"])
+    >>> (km.State() + drag).bind(("x", "v"))([1.0, -2.0])
+    array([ 1., -2., -4.])
+    """
+
+    fn: Callable[[ca.SX], Sequence[ca.SX]]
+    labels: tuple[str, ...]
+
+    def __init__(self, fn: Callable[[ca.SX], Sequence[ca.SX]], names: Sequence[str]) -> None:
+        freeze(self, fn=fn, labels=(names,) if isinstance(names, str) else tuple(names), bound=None)
+
+    def bind(self, states: Sequence[str]) -> Traced:
+        """Return the traced list of operations, which needs `fn` no more."""
+        x = ca.SX.sym("x", len(states))
+        z = self.formula(x)
+        if z.shape != (len(self.labels), 1):
+            raise DataError(
+                f"Expressions: fn returns shape {z.shape} and names has {len(self.labels)}; "
+                "return one expression for each name"
+            )
+        graph = Graph.trace(ca.Function("expressions", [x], [z]))
+        traced = Traced(graph, self.observables(tuple(states)), bound=tuple(states))
+        _ = traced.names
+        return traced
+
+    def as_saved(self) -> Value:
+        """Refuse: a file holds the traced operations, never `fn`."""
+        raise DataError("Expressions holds a Python function; call .bind(states), which traces it, and save that")
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names given."""
+        return self.labels
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the expressions of `fn` as a column."""
+        return ca.SX(ca.vertcat(*self.fn(x)))

@@ -19,8 +19,7 @@ from koopmpc.control.lqr import lqr
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.excitation import Noise
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.state import State
+from koopmpc.lifting.state import Expressions, State
 from koopmpc.papers.plants import closed_loop
 from koopmpc.papers.registry import Claim, Tell, compared, short, show
 from koopmpc.plants.integrators import RK4

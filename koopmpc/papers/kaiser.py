@@ -29,8 +29,7 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.eigenfunctions import eigenfunctions
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.eigenfunction import Eigenfunction
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.state import Constant, Monomials, State
+from koopmpc.lifting.state import Constant, Expressions, Monomials, State
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.plants import closed_loop, trajectories
 from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, short, show, unwarned

@@ -33,9 +33,8 @@ from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.move import Status
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.expressions import Expressions
 from koopmpc.lifting.radial import ThinPlate
-from koopmpc.lifting.state import State
+from koopmpc.lifting.state import Expressions, State
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.korda_motor import motor
@@ -213,10 +212,7 @@ def kdv(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     )
     held = np.vstack([run.U, run.U[-1:]])
     none = np.full((steps + 1, 4), np.nan)
-    curves = {
-        "reference": np.column_stack([asked, none]),
-        "Koopman MPC": np.column_stack([mean, bend, held]),
-    }
+    curves = {"reference": np.column_stack([asked, none]), "Koopman MPC": np.column_stack([mean, bend, held])}
     columns = ("mean of y", "standard deviation of y", *(f"u, {name.split(' [')[0]}" for name in plant.inputs))
     show(page, "kdv", "Korteweg–de Vries: three levels of the mean", DT, columns, curves)
     limited = np.array([status is not Status.UNCONSTRAINED for status in run.status])

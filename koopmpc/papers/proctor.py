@@ -15,8 +15,7 @@ from koopmpc.errors import FitWarning
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kic import InputPredictor, kic
-from koopmpc.lifting.expressions import Expressions
-from koopmpc.lifting.state import State
+from koopmpc.lifting.state import Expressions, State
 from koopmpc.papers.registry import Claim, Tell, compared, judged, short, show, unwarned, written
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize

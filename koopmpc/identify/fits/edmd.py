@@ -28,12 +28,7 @@ _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward,
 
 
 def fit(
-    regression: Regression,
-    *,
-    ridge: Ridge = 0.0,
-    rank: Rank = None,
-    method: Method = "ls",
-    towards: Towards = "zero",
+    regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls", towards: Towards = "zero"
 ) -> FitResult:
     """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
 

@@ -12,8 +12,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.solve import Ridge
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.expressions import Traced
+from koopmpc.lifting.base import Lifting, Traced
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
