@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.mutation.__main__ import drawn_of
 from tests.mutation.changes import mutants
 
 SOURCE = '''"""Words with 1 < 2."""
@@ -51,3 +52,16 @@ def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> Non
     whole, made = ast.dump(ast.parse(source)), list(mutants(name, source))
     assert len(made) > 20
     assert all(ast.dump(ast.parse(mutant.of(source))) != whole for mutant in made)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_change_stays_drawn_when_its_line_moves_and_when_others_come_and_go(seed: int) -> None:
+    path, moved = Path(__file__).parents[2] / "koopmpc/control/lqr.py", b"def more(a):\n    return a + 2\n\n\n"
+
+    def drawn(name: str, source: bytes, count: int) -> list[tuple[str, str]]:
+        everything = [(mutant, "\n".join(mutant.lines(source))) for mutant in mutants(name, source)]
+        return [mutant.lines(source) for mutant in drawn_of(everything, seed, count)]
+
+    before, after = drawn("a.py", path.read_bytes(), 30), drawn("b.py", moved + path.read_bytes(), 33)
+    assert len(set(before)) == 30
+    assert set(before) <= set(after)

@@ -30,7 +30,7 @@ def outcome(tests: list[str], seconds: int) -> int:
             os.dup2(os.open(os.devnull, os.O_RDWR), stream)
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        signal.alarm(30 * seconds)  # where it waits instead
+        signal.alarm(4 * seconds)  # where it waits instead
         os._exit(pytest.main([*OPTIONS, *tests]))
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
