@@ -2,6 +2,7 @@
 
 import copy
 from time import perf_counter
+from typing import Self
 
 import numpy as np
 import scipy.linalg
@@ -12,7 +13,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.horizon import horizon_of
-from koopmpc.control.limits import Limits, admitted
+from koopmpc.control.limits import Interval, Limits, admitted
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
 from koopmpc.control.riccati import Gain
 from koopmpc.control.target import Units, targets_of
@@ -24,7 +25,57 @@ from koopmpc.predict.predictors import LinearPredictor
 _NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here
 
 
-class LQR:
+class FeedbackLaw:
+    """What laws u(x) without a plan share: the limits of the inputs and of their changes, the last input, one thread.
+
+    Parameters
+    ----------
+    dt
+        Sampling time [s].
+    inputs, rates
+        The limits that u is clipped to; `rates` is None where changes have none.
+    """
+
+    horizon = 0  # no preview
+
+    def __init__(self, dt: float, inputs: Interval, rates: Interval | None) -> None:
+        self.dt, self.nu, self._inputs, self._rates = dt, len(inputs.low), inputs, rates
+        self._token: Token = [0]
+        self._inside = 0
+        FeedbackLaw.reset(self)
+
+    def __copy__(self) -> Self:
+        """Return a copy that shares nothing with this one that moves in a step."""
+        return copy.deepcopy(self)
+
+    @alone
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Set the last input, from which rates count, and which is held if the first measurement is bad.
+
+        By default it is zero inside the limits.
+        """
+        zero = np.clip(np.zeros(self.nu), *self._inputs)
+        self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+
+    def _got(self, applied: ArrayLike | None) -> None:
+        """Take the input that the plant really got for the last one, where it can be used."""
+        if applied is not None:
+            got = checks.array(applied, "applied", (self.nu,), finite=False)
+            if (np.abs(got) < HUGE).all():
+                self._last = got
+
+    def _limited(self, free: Float[np.ndarray, " nu"] | None, start: float) -> Move:
+        """Return the input inside its limits; None, where nothing is known, is answered by the last one."""
+        if free is None:
+            self._last = admitted(self._last, self._inputs, self._rates, self._last)
+            return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
+        u = admitted(free, self._inputs, self._rates, self._last)
+        status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED
+        self._last = u
+        return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
+
+
+class LQR(FeedbackLaw):
     """u = −K ψ(x) + v_r r + v_u u_r + v_w w on a lifted predictor, or on a linearisation of `LinearPredictor.local`.
 
     It minimises Σ ‖of(x_k) − r‖²_Q + ‖u_k − u_r‖²_R over an endless horizon, the reference r, its input target u_r and
@@ -72,47 +123,20 @@ class LQR:
         told = np.concatenate([np.ones(predictor.nw), units.tracked, units.inputs])
         self._v = units.inputs[:, None] * rest.v / told  # the feedforward of [w; r; u_r]
         self._K, self._K_rate = np.split(self.gain.K, [predictor.nz], axis=1)  # the second is of u_{k−1}
-        self._targets, self._inputs, self._nr = targets_of(predictor, track), track.inputs, len(C)
+        self._targets, self._nr = targets_of(predictor, track), len(C)
         self._given_rows = track.given
-        self._rates = track.rates
         self._observer = Measured(predictor)
         self._reference_key: tuple[bytes, int] | None = None
-        self._feedforward = np.zeros(self.nu)
+        self._feedforward = np.zeros(predictor.nu)
         self._row = 0  # of a given u_target, for the next call
-        self._last = np.zeros(self.nu)
-        self._token: Token = [0]
-        self._inside = 0
-        self.reset()
-
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]."""
-        return self.predictor.dt
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self.predictor.nu
-
-    @property
-    def horizon(self) -> int:
-        """No preview."""
-        return 0
-
-    def __copy__(self) -> "LQR":
-        """Return a copy that shares nothing with this one that moves in a step."""
-        return copy.deepcopy(self)
+        super().__init__(predictor.dt, track.inputs, track.rates)
 
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Set the last input, from which rates count, and which is held if the first measurement is bad.
-
-        By default it is zero inside the limits. Rows of a given u_target start anew.
-        """
+        """Set the last input, zero inside the limits by default; rows of a given u_target start anew."""
         self._observer.reset()
         self._row = 0
-        zero = np.clip(np.zeros(self.nu), *self._inputs)
-        self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+        super().reset(x0, u_prev)
 
     @alone
     def __call__(
@@ -136,21 +160,12 @@ class LQR:
             self._reference_key = key
         if self._given_rows is not None and self._row + 1 < len(self._given_rows):
             self._row += 1
-        if applied is not None:
-            got = checks.array(applied, "applied", (self.nu,), finite=False)
-            if (np.abs(got) < HUGE).all():
-                self._last = got
+        self._got(applied)
         self._observer.observe(x, self._last, _NOTHING)
         free = self._feedforward - self._K @ self._observer.z
         if self._K_rate.size:
             free -= self._K_rate @ self._last
-        if not (np.abs(free) < HUGE).all():
-            self._last = admitted(self._last, self._inputs, self._rates, self._last)
-            return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
-        u = admitted(free, self._inputs, self._rates, self._last)
-        status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED
-        self._last = u
-        return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
+        return self._limited(free if (np.abs(free) < HUGE).all() else None, start)
 
     def _disturbance(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nw"]:
         """Return w of this step, NaN where it cannot be."""

@@ -1,6 +1,5 @@
 """EigenfunctionLQR: control of one Koopman eigenfunction, energy for example, by a gain that is a formula."""
 
-import copy
 from collections.abc import Callable
 from time import perf_counter
 
@@ -11,8 +10,9 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits, admitted
-from koopmpc.control.move import Fallback, Move, Status, Token, alone
+from koopmpc.control.limits import Limits
+from koopmpc.control.lqr import FeedbackLaw
+from koopmpc.control.move import Move, alone
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.eigenfunction import Eigenfunction
@@ -21,7 +21,7 @@ from koopmpc.plants.compiled import Buffered
 _FLAT = 1e-24  # b R⁻¹ bᵀ below which no input moves φ
 
 
-class EigenfunctionLQR:
+class EigenfunctionLQR(FeedbackLaw):
     """u = u_r − R⁻¹ bᵀ k e with e = φ(x) − φ_r, b = β(x) and k = (λ + √(λ² + Q g)) / g, g = b R⁻¹ bᵀ.
 
     An eigenfunction obeys φ̇ = λ φ + β(x) u. With b held at its present value this is a scalar linear system, and k is
@@ -82,7 +82,7 @@ class EigenfunctionLQR:
                 f"the eigenfunction has {eigenfunction.nz} observables ({', '.join(eigenfunction.names)}); pass a real"
                 " one: of a complex φ, |φ|² is a real eigenfunction of 2 Re λ, to be found with eigenvalue=2 Re λ"
             )
-        self.eigenfunction, self.cost, self.limits, self._dt = eigenfunction, cost, limits, checks.positive(dt, "dt")
+        self.eigenfunction, self.cost, self.limits = eigenfunction, cost, limits
         if eigenvalue is None:
             if not isinstance(eigenfunction, Eigenfunction):
                 raise DataError("eigenvalue is missing; pass that of the observable, 0 for a conserved quantity")
@@ -98,19 +98,15 @@ class EigenfunctionLQR:
             raise DataError('the cost has an R_delta or a u_target in numbers; this formula takes Q, R and "zero"')
         x, aim = ca.SX.sym("x", len(eigenfunction.bound_states)), ca.SX.sym("phi_r")
         self._beta = ca.Function("beta", [x], [ca.densify(self._effect(x, B))])
-        self._nu = int(self._beta.size2_out(0))
-        weights = cost.matrices(1, self._nu)
+        nu = int(self._beta.size2_out(0))
+        weights = cost.matrices(1, nu)
         self._Q = float(weights[0][0, 0])
-        self._R_inverse = np.linalg.inv(checks.weight(weights[1], "R", self._nu, definite=True))
+        self._R_inverse = np.linalg.inv(checks.weight(weights[1], "R", nu, definite=True))
         kept = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
         both = ca.densify(ca.vertcat(eigenfunction.symbolic(kept), self.law(kept, aim)))
         self._read = Buffered(ca.Function("u", [x, aim], [both], {"cse": True}))
         sized = Limits() if limits is None else limits
-        self._inputs, self._rates = sized.inputs(self._nu), sized.rates(self._nu)
-        self._last = np.zeros(self._nu)
-        self._token: Token = [0]
-        self._inside = 0
-        self.reset()
+        super().__init__(checks.positive(dt, "dt", "s"), sized.inputs(nu), sized.rates(nu))
 
     def _effect(self, x: ca.SX, B: ArrayLike | Callable[[ca.SX], ca.SX] | None) -> ca.SX:
         """Return β(x), (1, nu)."""
@@ -138,31 +134,6 @@ class EigenfunctionLQR:
         hold = rate * phi_r / size if self.cost.u_target == "equilibrium" else 0.0
         return ca.SX(ca.if_else(moved, 1.0, 0.0) * -along * (k * (self.eigenfunction.symbolic(x) - phi_r) + hold))
 
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]."""
-        return self._dt
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return self._nu
-
-    @property
-    def horizon(self) -> int:
-        """No preview."""
-        return 0
-
-    def __copy__(self) -> "EigenfunctionLQR":
-        """Return a copy that shares nothing with this one that moves in a step."""
-        return copy.deepcopy(self)
-
-    @alone
-    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Set the last input, from which rates count, and which is held if the first measurement is bad."""
-        zero = np.clip(np.zeros(self._nu), *self._inputs)
-        self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self._nu,))
-
     @alone
     def __call__(
         self,
@@ -175,16 +146,6 @@ class EigenfunctionLQR:
         start = perf_counter()
         x = checks.array(y, "y", (len(self.eigenfunction.bound_states),), finite=False)
         aim = float(checks.reference_rows(checks.numbers(reference, "reference"), 0, 1)[0, 0])
-        if applied is not None:
-            got = checks.array(applied, "applied", (self._nu,), finite=False)
-            if (np.abs(got) < HUGE).all():
-                self._last = got
+        self._got(applied)
         both = self._read(x, np.array([aim]))[0]
-        free = both[1:]
-        if not (np.abs(both) < HUGE).all() or not abs(aim) < HUGE:
-            self._last = admitted(self._last, self._inputs, self._rates, self._last)
-            return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
-        u = admitted(free, self._inputs, self._rates, self._last)
-        self._last = u
-        status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED
-        return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
+        return self._limited(both[1:] if (np.abs(both) < HUGE).all() and abs(aim) < HUGE else None, start)
