@@ -133,10 +133,11 @@ class Cost(Value):
 class Sizes(NamedTuple):
     """The sizes of states, inputs and limited rows [x; of(x)], and the scale of the cost, by which units mean nothing.
 
-    The size of a limited row is half the width between two finite limits; else half the range of the model's data; else
-    the value that costs, by Q, the mean of what the sizes of other rows cost; else |limit|; else 1. The same goes for
-    states without a limit, and for inputs by R. The scale of the cost is the largest cost of a tracked output or an
-    input of known size in a step.
+    The size of a row is the first of these that is known: half the width between two finite limits; half the range of
+    the model's data; the value whose cost by Q is the mean cost of the tracked rows of known size; |limit|; 1. States
+    without a limit have a size by the same rule. That of an input is half the width of its limits, or else the value
+    whose cost by R is the scale of the cost. This scale is the largest cost in a step of a tracked output or an input
+    at its known size.
     """
 
     states: Float[np.ndarray, " nx"]

@@ -130,7 +130,7 @@ def _stage(
     k: int,
     r: Float[np.ndarray, "nu nf"],
 ) -> Stage:
-    """Return the stage of a block from step k on, r what is known of its linear term in u."""
+    """Return the stage of the block that starts at step k; `r` is the linear term in u that input targets make."""
     nz, nu = h.B.shape
     (A, B), q, e = powers[-1], None, h.disturbance(k)
     for i, (Ai, Bi) in enumerate(powers[1:-1], 1):
@@ -148,7 +148,7 @@ def _stage(
 
 
 def input_target(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
-    """Return the part of u_r that f decides, the rest being that of α: the last disturbance of the preview is held."""
+    """Return u_r as a matrix on f, without the part W α; the last disturbance of the preview is held."""
     u_r = np.zeros((len(targets.u0), h.signals.size))
     u_r[:, -1] = targets.u0
     moved = h.disturbance(h.N - 1)
@@ -286,7 +286,7 @@ def condense(
 
 
 def _of_model(maps: Condensed, h: Horizon, units: Units) -> Condensed:
-    """Return the maps of a horizon in these units, in those of the model."""
+    """Return maps that were made in these units in the units of the model."""
     moves = len(h.blocks) * (1 + h.bounded)
     rows = np.concatenate([np.tile(units.inputs, moves), np.tile(units.limited, h.N)])[:, None]
     back = units.inverse if h.size == len(units.inverse) else block_diag(units.inverse, np.diag(1 / units.inputs))
@@ -313,7 +313,7 @@ def _asked(
     U: Float[np.ndarray, "moves nu nw"],
     Z: Float[np.ndarray, "N nz nw"],
 ) -> tuple[Float[np.ndarray, "nw nR"], Float[np.ndarray, "nw nT"], Float[np.ndarray, "nw nI"]]:
-    """Return what the references, the coordinates of their targets and given input targets ask of w, times unit."""
+    """Return −½ times the gradient in w that references, coordinates of targets and given input targets make."""
     nw, nr, na, nu = U.shape[2], len(h.C), targets.Z.shape[1], U.shape[1]
     reference, target, given = (np.zeros((nw, h.N + 1, columns)) for columns in (nr, na, nu))
     reference[:, 1 : h.N] = (Z[:-1].transpose(2, 0, 1) @ h.C.T) @ h.Q

@@ -28,8 +28,8 @@ class Targets:
     """All equilibria z = A z + B u + e as z = z₀ + z_e e + Z α, u = u₀ + u_e e + W α, and a reference's α.
 
     e is what disturbances add to z⁺, zero by default. With a Constant observable its coordinate is 1 in z₀ and 0 in Z.
-    α(r, e) minimises ‖C z − r‖²_Q; where u, or a limited output G z, would leave its limits, it minimises the same
-    inside them: low ≤ rows α + from_disturbance e ≤ high.
+    α(r, e) minimises ‖C z − r‖²_Q. Where u, or a limited output G z, would leave its limits, α is the minimiser inside
+    them: low ≤ rows α + rows_disturbance e ≤ high, the first `hard` rows being the inputs'.
     """
 
     z0: Float[np.ndarray, " nz"]

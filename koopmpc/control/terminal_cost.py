@@ -187,11 +187,12 @@ def believed_steps(
     """Return the longest tail of `most` steps, a half, a quarter or none whose loop costs at most 5 % above the least.
 
     Without limits, N planned steps and a tail are a law u = −K z. Each law steers the re-lifted model
-    x⁺ = C (A ψ(x) + B u) for 3 N steps. Modes of A that the lifted states do not have grow in a long
-    tail until they rule the law, and here they cost what they do on the plant: a lift afresh does not follow them. All
-    is told in deviations from the mean of the data, which so is at rest. The starts lie a standard deviation from it,
-    along the first eight principal axes of the states in units of their standard deviations. Where all laws are alike,
-    and on a model of delays or of fewer coordinates than its lifting has, it is `most`.
+    x⁺ = C (A ψ(x) + B u) for 3 N steps. Modes of A that the lifted states do not have grow in a long tail until they
+    rule the law; in these trials such a law costs what it would on the plant, for states that are lifted afresh do not
+    have the mode. States, z and u are deviations from the mean of the data, which is taken to be at rest. The trials
+    start a standard deviation from it, along the first eight principal axes of the states in units of their standard
+    deviations. The tail has `most` steps where all laws are alike, and on a model of delays or of fewer coordinates
+    than its lifting has.
     """
     scale, lifting = predictor.scale, predictor.lifting
     if scale is None or predictor.embedding is not None or lifting.nz != len(scale):

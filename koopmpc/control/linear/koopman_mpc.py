@@ -143,7 +143,7 @@ class KoopmanMPC(MPCBase):
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
-        self._given_row, self._rows_left = 0, False  # if u_target has rows: that of step k, and if another follows
+        self._given_row, self._rows_left = 0, False  # of a u_target in rows: this step's, and whether more follow
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
     def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:

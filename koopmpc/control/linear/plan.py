@@ -20,8 +20,9 @@ from koopmpc.predict.predictors import LinearPredictor
 class PlanLimits(NamedTuple):
     """The limits of every entry of a plan [moves; their changes, where they have limits; outputs], stage by stage.
 
-    `size` is the norm of the entry's row of D, root mean square of all stages. `next` is the entry a step on: of
-    outputs that of the next step, of moves that of the one that then holds; past the end it is the number of entries.
+    `size` is the norm of the entry's row of D, root mean square of all stages. `next` is the entry that takes the place
+    of this one when the plan moves on by one step: the same output one step later, or the move that holds then. Where
+    the plan has ended by then, it is the number of entries.
     """
 
     low: Float[np.ndarray, " nv"]
@@ -32,12 +33,12 @@ class PlanLimits(NamedTuple):
 
 
 class PlanMap:
-    """t = M [z; u_{−1}; g; 1] with low ≤ t ≤ high where the unconstrained plan is the optimum.
+    """t = M [z; u_{−1}; g; 1]: the unconstrained plan, which is the optimum where low ≤ t ≤ high.
 
     t = [v; lowest and highest target], v the plan as in `Condensed`. u_{−1} is there where the change of inputs is
-    weighed or limited, g = [w_0 … w_{N−1}; d] where disturbances are known; the last column of M is that of the
-    reference. Without a g it holds all of the reference's part. With one it holds that of targets which no limit moves,
-    and the last rows of t, of the limits `checked`, show where a limit does move one.
+    weighed or limited, g = [w_0 … w_{N−1}; d] where disturbances are known. The last column of M is written anew for
+    each reference. Where there is a g, it is that of targets that no limit moves, for g moves them, too: the last rows
+    of t are the lowest and highest values of the limits `checked`, and show whether a target has to be moved inside.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ class Linearisation(NamedTuple):
 
 
 class Chord(NamedTuple):
-    """A Gauss–Newton step at s₀, no limit active: H (F(x, u) + e − x) + T residuals; and ∂[u; g]/∂s.
+    """A Gauss–Newton step from s₀ without active limits, H (F(x, u) + e − x) + T residuals; `limited` is ∂[u; g]/∂s.
 
     s is [x; u] by its sizes, and so is F(x, u) + e − x.
     """
@@ -197,7 +197,7 @@ class Equilibria:
     def follow(
         self, begin: Equilibrium, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"]
     ) -> Equilibrium | None:
-        """Return the equilibrium by one step from `begin`, None where it is not close, or a limit has a say.
+        """Return the equilibrium by one step from `begin`; None where it is not close, or a limit is active.
 
         The step takes the factors of an earlier one as long as that was close by: repeated, it converges the faster
         the closer that was, at a fraction of the time.

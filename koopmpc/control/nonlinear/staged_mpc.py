@@ -40,7 +40,11 @@ class StagePlan(NamedTuple):
 
 
 class Preview(NamedTuple):
-    """Reference rows, the reference inputs and their slopes, which rows equal the last one, and the last target."""
+    """What the rows of a reference ask for, before disturbances: see `StagedMPC._aim`.
+
+    R holds the rows r_0 … r_N, U and `slopes` the reference inputs and ∂u/∂e of all but the last, `held` says which of
+    these equal the last one, and `target` is the last one's.
+    """
 
     R: Float[np.ndarray, "N1 nr"]
     U: Float[np.ndarray, "N nu"]

@@ -155,7 +155,7 @@ class Choice(NamedTuple):
 class StepSolver:
     """The QP of a step, by the first of some solvers that has an answer, started from the last one moved on by a step.
 
-    Where another solver than the first had the answer, it is asked first in the next steps, until a plan meets all
+    A solver that had the answer where the first one had none is asked first in the next steps, until a plan meets all
     limits: a first-order method that has reached its bound of iterations will reach it in the next step, too, and an
     active-set method then needs few iterations.
 
