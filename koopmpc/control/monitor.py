@@ -83,23 +83,18 @@ class Monitor(Value):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level) - 1e-9))} are needed for a "
                 f"level of {level:g}; pass more data, or a lower level"
             )
-        band, inside = _whitening(E, _EXACT, X), _whitening(V, 0.0, V)
-        return cls(_to_one(inside, V, rank), _to_one(band, E, rank), level, model.lifting)
+        inside = _bounds(V, np.zeros(V.shape[1]), rank)
+        return cls(inside, _bounds(E, _EXACT * np.sqrt((X**2).mean(axis=0)), rank), level, model.lifting)
 
 
-def _whitening(rows: Float[np.ndarray, "M n"], share: float, of: Float[np.ndarray, "K n"]) -> Float[np.ndarray, "n n"]:
-    """Return G with mean ‖G v‖² = n over the rows; a column counts as no smaller than this share of that of `of`."""
-    floor = share * np.sqrt((of**2).mean(axis=0))
+def _bounds(rows: Float[np.ndarray, "M n"], floor: Float[np.ndarray, " n"], rank: int) -> Float[np.ndarray, "n n"]:
+    """Return G with ‖G v‖² of 1 for the rank-th smallest of the rows, and at most 1 for each column's `floor` alone."""
     norm = np.sqrt((rows**2).mean(axis=0) + floor**2)
     norm = np.where(norm > 0, norm, 1.0)
     scaled = rows / norm
     values, Q = np.linalg.eigh(scaled.T @ scaled / len(rows) + np.diag((floor / norm) ** 2))
-    return (Q / np.sqrt(np.maximum(values, _THIN * values.max()))).T / norm
-
-
-def _to_one(G: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "M n"], rank: int) -> Float[np.ndarray, "n n"]:
-    """Return G scaled so that the rank-th smallest ‖G v‖² of the rows is 1."""
-    bound = np.sort(((rows @ G.T) ** 2).sum(axis=1))[rank - 1]
+    G = (Q / np.sqrt(np.maximum(values, _THIN * values.max()))).T / norm  # mean ‖G v‖² = n
+    bound = max(np.sort(((rows @ G.T) ** 2).sum(axis=1))[rank - 1], ((G * floor) ** 2).sum(axis=0).max())
     return G / np.sqrt(bound) if bound > 0 else G
 
 

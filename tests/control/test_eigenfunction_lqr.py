@@ -46,6 +46,12 @@ def test_the_input_is_that_of_the_scalar_riccati_equation_at_the_present_b(rate)
         np.testing.assert_allclose(law(x, [0.4]).u, -(K * (x[0] - 0.4)).ravel(), rtol=1e-7)
 
 
+def test_a_weight_in_brackets_is_the_same_weight():
+    x, plain = [0.3, -0.7], controller(cost=km.Cost(Q=3, R=2, of=H))
+    for Q in ([3.0], [[3.0]]):
+        assert np.array_equal(controller(cost=km.Cost(Q=Q, R=[2.0], of=H))(x, [0.1]).u, plain(x, [0.1]).u)
+
+
 def test_a_reference_off_zero_is_held_by_the_input_that_the_eigenvalue_asks_for():
     class Leak(km.Dynamics):
         states, inputs = ("level [m]",), ("flow [m/s]",)

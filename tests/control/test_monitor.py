@@ -42,6 +42,26 @@ def test_the_monitor_is_the_leverage_and_the_conformal_quantile_of_the_data(mode
     assert np.mean(((E @ monitor.band.T) ** 2).sum(axis=1) <= 1) == pytest.approx(0.99, abs=0.001)
 
 
+def test_a_model_without_errors_is_monitored_to_a_billionth_of_the_states(data):
+    """Exact data leave no band of errors: what differs by more than 1e-9 of a state's size is unknown."""
+    A, B = np.array([[1.0, 0.1], [-0.1, 0.9]]), np.array([[0.0], [0.1]])
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(20):
+        X, U = np.zeros((31, 2)), rng.uniform(-1, 1, (30, 1))
+        X[0] = rng.uniform(-1, 1, 2)
+        for k, u in enumerate(U):
+            X[k + 1] = A @ X[k] + B @ u
+        rows.append(km.Episode(X=X, U=U))
+    exact = km.Episodes(rows, DT)
+    monitor = km.Monitor.of(km.edmd(exact, km.State()), exact)
+    size = np.sqrt(np.mean(np.vstack([e.X for e in exact]) ** 2, axis=0))
+    for i in range(2):
+        off = np.eye(2)[i] * size[i]
+        assert np.linalg.norm(monitor.band @ (2e-9 * off)) > 1
+        assert np.linalg.norm(monitor.band @ (0.99e-9 * off)) < 1
+
+
 def driven(controller, episodes):
     """Return what the controller knows of each step of these episodes, its own inputs left aside."""
     known = []

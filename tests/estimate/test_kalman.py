@@ -204,6 +204,8 @@ def test_samples_are_bridged_for_a_while_and_reset_repeats_to_the_bit():
         runs.append(np.array(seen))
         assert good == [True] * 7 + [False] * 2 + [True] * 3
     np.testing.assert_array_equal(*runs)
+    observer.reset()
+    assert [observer.observe(Y[4], np.zeros(1), NO_W) for _ in range(4)] == [True] * 3 + [False]  # from the first step
 
 
 def test_infinities_are_missed_samples():
@@ -273,6 +275,7 @@ def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words)
         ({"patience": -1}, km.errors.DataError, "patience is -1"),
         ({"outputs": [[1.0, 2.0], [1.0]]}, km.errors.DataError, "outputs is not an array"),
         ({"outputs": ()}, km.errors.ShapeError, "outputs has shape"),
+        ({"outputs": ("x0", 2.0)}, km.errors.DataError, "outputs is not an array"),
     ],
 )
 def test_settings_are_refused_in_words(options, error, words):

@@ -1,5 +1,7 @@
 """Priors: brute-force CVXPY on the full data, KKT conditions, truths that change nothing, clear refusals."""
 
+import warnings
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -176,6 +178,33 @@ def test_measured_disturbances_are_the_last_columns_of_B() -> None:
     model = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(B=[[NAN, 0.5], [NAN, 0.0]]))
     assert np.array_equal(model.E, [[0.5], [0.0]])
     assert model.B.shape == (2, 1)
+
+
+DOUBLE = km.Episodes([km.Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]]), U=e.U) for e in random_episodes(0, [60], 2, 1)], 0.1)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("prior", "ridge", "doubted"),
+    [
+        (km.Prior(), 0.0, True),
+        (km.Prior(), 1e-3, False),  # who asks for a ridge knows of dependent observables
+        (km.Prior(mask_A=[[1, 0, 1], [1, 1, 0], [1, 1, 0]]), 0.0, True),  # free in one row is enough
+        (km.Prior(mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 0]]), 0.0, False),
+    ],
+)
+def test_dependent_columns_are_doubted_where_one_row_may_use_them(prior: km.Prior, ridge: float, doubted: bool) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = km.constrained_edmd(DOUBLE, km.State(), prior=prior, ridge=ridge)
+    assert ["linear functions of others" in str(w.message) for w in caught] == [True] * doubted
+    assert len(model.report.warnings) == doubted
+
+
+def test_a_symmetric_model_meets_its_prior_and_nothing_is_doubted() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = km.constrained_edmd(random_episodes(0, [60], 2, 1), km.State(), prior=km.Prior(symmetric=True))
+    assert np.allclose(model.A, model.A.T, atol=1e-9)
 
 
 REFUSED = [

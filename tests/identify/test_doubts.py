@@ -53,6 +53,26 @@ def test_a_duplicate_column_is_named() -> None:
     assert len(sentences) == 1
     assert "'c' of 'a'" in sentences[0] or "'a' of 'c'" in sentences[0]
     assert "'b'" not in sentences[0]
+    assert "…" not in sentences[0]  # the list is whole
+
+
+def test_of_many_duplicate_columns_some_are_named_and_the_list_says_that_it_goes_on() -> None:
+    data = random_episodes(0, [90], 2, 0)
+    copies = np.arange(1.0, 13.0)
+    many = km.Episodes([km.Episode(X=np.column_stack([e.X, np.outer(e.X[:, 0], copies)])) for e in data], 0.1)
+    _, sentences = warned(many, km.State())
+    assert "12 of 14 observables are linear functions of others" in sentences[0]
+    assert ", …" in sentences[0]
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-6])
+def test_the_condition_number_is_that_of_columns_of_unit_norm(size: float) -> None:
+    data = random_episodes(0, [60], 2, 1)
+    scaled = km.Episodes([km.Episode(X=e.X * [1.0, size], U=e.U) for e in data], 0.1)
+    model, sentences = warned(scaled, km.State())
+    P = np.vstack([np.hstack([e.X[:-1], e.U]) for e in scaled])
+    assert not sentences
+    assert model.report.condition == pytest.approx(np.linalg.cond(P / np.linalg.norm(P, axis=0)), rel=1e-6)
 
 
 def test_inputs_that_move_together_are_named() -> None:
