@@ -25,13 +25,13 @@ def listening() -> Generator[None]:
     A handler that raises nothing, as that of a loop that ends after its step, goes on as it meant to. Handlers belong
     to the main thread; in any other one this does nothing. It costs about 5 µs.
     """
-    came: list[BaseException] = []
+    came: list[BaseException] = []  # copies: the one that is on its way holds its frames, and these would hold it
 
     def called(handler: Handler, number: int, frame: FrameType | None) -> None:
         try:
             handler(number, frame)
         except BaseException as error:
-            came.append(error)
+            came.append(type(error)(*error.args))
             raise
 
     try:

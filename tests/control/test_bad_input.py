@@ -47,9 +47,14 @@ def test_it_is_refused_with_what_was_got_and_what_to_do(what):
         make()
 
 
-def test_a_tail_of_nan_is_refused():
-    (line,) = shown('show(lambda: km.Cost(1, 1, tail=float("nan")))')
-    assert line == "DataError tail is nan; pass a whole number"
+def test_a_tail_of_nan_and_settings_without_names_are_refused():
+    lines = shown(
+        'show(lambda: km.Cost(1, 1, tail=float("nan")))\n'
+        "model = km.LinearPredictor([[1.0]], [[1.0]], [[1.0]], km.State(), 0.1, ('p',), ('u',))\n"
+        "show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), None, 5, settings=3))"
+    )
+    assert lines[0] == "DataError tail is nan; pass a whole number"
+    assert lines[1].startswith("DataError settings is a int, expected a Mapping; pass the solver's own by name")
 
 
 @pytest.mark.parametrize("kind", CONTROLLERS)

@@ -29,6 +29,13 @@ CASES = {
 }
 
 
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop", "sqpmethod"])
+def test_no_solver_prints(solver, capfd):
+    mpc = km.NonlinearMPC(step_map(A, B), *CASES["inputs"], 5, solver=solver)
+    assert np.isfinite(mpc([0.5, 0.0], [0.0, 0.0]).u).all()
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_on_a_linear_plant_it_equals_koopman_mpc(name):
     cost, limits = CASES[name]

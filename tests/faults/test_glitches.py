@@ -69,6 +69,21 @@ def test_an_outlier_is_not_learned_and_is_counted(size, where):
     assert worst(learner.predictor(), PLANT) == pytest.approx(worst(twin.predictor(), PLANT), rel=0.2)
 
 
+@pytest.mark.parametrize(("size", "outliers"), [(0.29, 0), (0.31, 1)])
+def test_where_forecasts_are_exact_the_gate_is_thirty_percent_of_what_the_column_is_itself(size, outliers):
+    """30 spreads, which count as at least 1 % of the column's root-mean-square."""
+    A, B = np.array([[0.9, 0.2], [-0.2, 0.8]]), np.array([[0.5], [1.0]])
+    learner = km.OnlineEDMD(km.State(), dt=0.05, states=("a", "b"), inputs=("u",), forgetting=0.99)
+    rng = np.random.default_rng(0)
+    X, U = rng.choice([-1.0, 1.0], (1001, 2)), rng.uniform(-1, 1, (1001, 1))
+    X_next = X @ A.T + U @ B.T
+    rms = np.sqrt(np.mean(X_next[:, 0] ** 2))
+    learner.learn(X[:-1], U[:-1], X_next[:-1])
+    assert learner.outliers == 0
+    learner.learn(X[-1], U[-1], X_next[-1] + [size * rms, 0.0])
+    assert learner.outliers == outliers
+
+
 @pytest.mark.parametrize("at", [0, 3, 19, 25, 32, 40, 60])  # memory of 32 pairs a block, forecasts from some 60 on
 @pytest.mark.parametrize("where", ["x", "x_next", "both"])
 def test_an_outlier_before_there_are_forecasts_is_not_learned_either(at, where):

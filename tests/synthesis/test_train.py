@@ -74,6 +74,15 @@ def test_the_gradient_is_that_of_differences_and_the_error_is_the_score_of_the_f
     assert np.exp(value) == pytest.approx(km.score(model, points, 5, stride=5).total, rel=1e-5)
 
 
+def test_a_state_counts_by_its_own_size_and_one_that_stays_zero_counts_nothing(data):
+    points = _drawn(source_of(data), 5, 200, np.random.default_rng(0)).all
+    small = km.Episodes([km.Episode(X=e.X * [1e-6, 0.0], U=e.U) for e in points], points.dt)
+    windows = Windows.of(small, 5, 2)
+    size = np.sum(np.stack([e.X[1:] for e in small]) ** 2, axis=0)
+    np.testing.assert_allclose(windows.weight[:, 0] * size[:, 0], 1 / (5 * 2), rtol=1e-12)
+    np.testing.assert_array_equal(windows.weight[:, 1], 0.0)
+
+
 @pytest.mark.parametrize("lifting", list(LIFTINGS.values())[:4], ids=list(LIFTINGS)[:4])
 def test_on_held_out_data_it_is_never_worse_than_untrained_and_mostly_better(data, lifting):
     other = collected(20, rng=8)
