@@ -83,8 +83,9 @@ class Monitor(Value):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level) - 1e-9))} are needed for a "
                 f"level of {level:g}; pass more data, or a lower level"
             )
-        inside = _bounds(V, np.zeros(V.shape[1]), rank)
-        return cls(inside, _bounds(E, _EXACT * np.sqrt((X**2).mean(axis=0)), rank), level, model.lifting)
+        size = np.sqrt(np.mean(X**2, axis=0))
+        inside, band = _bounds(V, np.zeros(V.shape[1]), rank), _bounds(E, _EXACT * size, rank)
+        return cls(inside, band, level, model.lifting)
 
 
 def _bounds(rows: Float[np.ndarray, "M n"], floor: Float[np.ndarray, " n"], rank: int) -> Float[np.ndarray, "n n"]:

@@ -54,7 +54,7 @@ def test_a_model_without_errors_is_monitored_to_a_billionth_of_the_states(data):
             X[k + 1] = A @ X[k] + B @ u
         rows.append(km.Episode(X=X, U=U))
     exact = km.Episodes(rows, DT)
-    monitor = km.Monitor.of(km.edmd(exact, km.State()), exact)
+    monitor = km.control.Monitor.of(km.edmd(exact, km.State()), exact)
     size = np.sqrt(np.mean(np.vstack([e.X for e in exact]) ** 2, axis=0))
     for i in range(2):
         off = np.eye(2)[i] * size[i]

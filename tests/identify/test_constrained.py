@@ -186,10 +186,10 @@ DOUBLE = km.Episodes([km.Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]]), U=e.U)
 @pytest.mark.parametrize(
     ("prior", "ridge", "doubted"),
     [
-        (km.Prior(), 0.0, True),
-        (km.Prior(), 1e-3, False),  # who asks for a ridge knows of dependent observables
-        (km.Prior(mask_A=[[1, 0, 1], [1, 1, 0], [1, 1, 0]]), 0.0, True),  # free in one row is enough
-        (km.Prior(mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 0]]), 0.0, False),
+        (km.identify.Prior(), 0.0, True),
+        (km.identify.Prior(), 1e-3, False),  # who asks for a ridge knows of dependent observables
+        (km.identify.Prior(mask_A=[[1, 0, 1], [1, 1, 0], [1, 1, 0]]), 0.0, True),  # free in one row is enough
+        (km.identify.Prior(mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 0]]), 0.0, False),
     ],
 )
 def test_dependent_columns_are_doubted_where_one_row_may_use_them(prior: km.Prior, ridge: float, doubted: bool) -> None:
@@ -203,7 +203,7 @@ def test_dependent_columns_are_doubted_where_one_row_may_use_them(prior: km.Prio
 def test_a_symmetric_model_meets_its_prior_and_nothing_is_doubted() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = km.constrained_edmd(random_episodes(0, [60], 2, 1), km.State(), prior=km.Prior(symmetric=True))
+        model = km.constrained_edmd(random_episodes(0, [60], 2, 1), km.State(), prior=km.identify.Prior(symmetric=True))
     assert np.allclose(model.A, model.A.T, atol=1e-9)
 
 
