@@ -83,7 +83,7 @@ class Monitor(Value):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level) - 1e-9))} are needed for a "
                 f"level of {level:g}; pass more data, or a lower level"
             )
-        size = np.sqrt(np.mean(X**2, axis=0))
+        size: Float[np.ndarray, " nx"] = np.sqrt(np.mean(X**2, axis=0))
         inside, band = _bounds(V, np.zeros(V.shape[1]), rank), _bounds(E, _EXACT * size, rank)
         return cls(inside, band, level, model.lifting)
 

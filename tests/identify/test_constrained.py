@@ -192,7 +192,9 @@ DOUBLE = km.Episodes([km.Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]]), U=e.U)
         (km.identify.Prior(mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 0]]), 0.0, False),
     ],
 )
-def test_dependent_columns_are_doubted_where_one_row_may_use_them(prior: km.Prior, ridge: float, doubted: bool) -> None:
+def test_dependent_columns_are_doubted_where_one_row_may_use_them(
+    prior: km.identify.Prior, ridge: float, doubted: bool
+) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model = km.constrained_edmd(DOUBLE, km.State(), prior=prior, ridge=ridge)
