@@ -83,13 +83,14 @@ class Monitor(Value):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level) - 1e-9))} are needed for a "
                 f"level of {level:g}; pass more data, or a lower level"
             )
-        size: Float[np.ndarray, " nx"] = np.sqrt(np.mean(X**2, axis=0))
-        inside, band = _bounds(V, np.zeros(V.shape[1]), rank), _bounds(E, _EXACT * size, rank)
-        return cls(inside, band, level, model.lifting)
+        return cls(_bounds(V, 0.0, V, rank), _bounds(E, _EXACT, X, rank), level, model.lifting)
 
 
-def _bounds(rows: Float[np.ndarray, "M n"], floor: Float[np.ndarray, " n"], rank: int) -> Float[np.ndarray, "n n"]:
-    """Return G with ‖G v‖² of 1 for the rank-th smallest of the rows, and at most 1 for each column's `floor` alone."""
+def _bounds(
+    rows: Float[np.ndarray, "M n"], share: float, of: Float[np.ndarray, "K n"], rank: int
+) -> Float[np.ndarray, "n n"]:
+    """Return G with ‖G v‖² = 1 for the rank-th smallest of the rows, and at most 1 for this share of a column of `of`."""
+    floor = share * np.sqrt((of**2).mean(axis=0))
     norm = np.sqrt((rows**2).mean(axis=0) + floor**2)
     norm = np.where(norm > 0, norm, 1.0)
     scaled = rows / norm

@@ -5,6 +5,7 @@ grow by 20 MB at most.
 """
 
 import argparse
+import gc
 import os
 import random
 import signal
@@ -69,6 +70,7 @@ def files(seed: int, folder: Path) -> None:
 def interrupt(seed: int) -> None:
     rng = random.Random(seed)
     _, controller, _ = rng.choice(list(controllers(seed)))
+    gc.collect()  # Python drops one that comes while it deletes the recordings of the round
     timer = threading.Timer(rng.uniform(0.0, 0.1), lambda: os.kill(os.getpid(), signal.SIGINT))
     end = time.monotonic() + 10
     try:

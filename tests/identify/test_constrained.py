@@ -197,7 +197,7 @@ def test_dependent_columns_are_doubted_where_one_row_may_use_them(
 ) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model = km.constrained_edmd(DOUBLE, km.State(), prior=prior, ridge=ridge)
+        model = km.identify.constrained_edmd(DOUBLE, km.State(), prior=prior, ridge=ridge)
     assert ["linear functions of others" in str(w.message) for w in caught] == [True] * doubted
     assert len(model.report.warnings) == doubted
 
@@ -205,7 +205,7 @@ def test_dependent_columns_are_doubted_where_one_row_may_use_them(
 def test_a_symmetric_model_meets_its_prior_and_nothing_is_doubted() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = km.constrained_edmd(random_episodes(0, [60], 2, 1), km.State(), prior=km.identify.Prior(symmetric=True))
+        model = km.identify.constrained_edmd(random_episodes(0, [60], 2, 1), km.State(), prior=km.identify.Prior(symmetric=True))
     assert np.allclose(model.A, model.A.T, atol=1e-9)
 
 
