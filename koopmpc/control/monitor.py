@@ -89,7 +89,7 @@ class Monitor(Value):
 def _bounds(
     rows: Float[np.ndarray, "M n"], share: float, of: Float[np.ndarray, "K n"], rank: int
 ) -> Float[np.ndarray, "n n"]:
-    """Return G with ‖G v‖² = 1 for the rank-th smallest of the rows, and at most 1 for this share of a column of `of`."""
+    """Return G with ‖G v‖² = 1 for the rank-th smallest of the rows, and ≤ 1 for this share of a column of `of`."""
     floor = share * np.sqrt((of**2).mean(axis=0))
     norm = np.sqrt((rows**2).mean(axis=0) + floor**2)
     norm = np.where(norm > 0, norm, 1.0)

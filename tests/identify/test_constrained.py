@@ -205,7 +205,9 @@ def test_dependent_columns_are_doubted_where_one_row_may_use_them(
 def test_a_symmetric_model_meets_its_prior_and_nothing_is_doubted() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = km.identify.constrained_edmd(random_episodes(0, [60], 2, 1), km.State(), prior=km.identify.Prior(symmetric=True))
+        model = km.identify.constrained_edmd(
+            random_episodes(0, [60], 2, 1), km.State(), prior=km.identify.Prior(symmetric=True)
+        )
     assert np.allclose(model.A, model.A.T, atol=1e-9)
 
 
