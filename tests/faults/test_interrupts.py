@@ -100,9 +100,12 @@ def test_an_interrupt_is_never_swallowed_in_python(tmp_path: Path, name: str, co
 @pytest.fixture(autouse=True)
 def _ctrl_c_is_heard():
     """Listen to Ctrl-C, which a shell lets its jobs in the background ignore, and with them all that they start."""
+    gc.collect()
+    gc.disable()  # Python drops one that comes in a `__del__` of garbage, or in a callback of its collector
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+    gc.enable()
 
 
 SENDER = """
@@ -117,7 +120,6 @@ while os.getppid() == int(sys.argv[1]):
 @pytest.mark.parametrize("name", BUILD)
 @pytest.mark.parametrize("least", [20, pytest.param(2000, marks=pytest.mark.slow)])
 def test_a_rain_of_interrupts_is_raised_one_by_one_and_the_controller_goes_on(controllers, name, least):  # noqa: F811
-    gc.collect()  # Python drops one that comes while it deletes what an earlier test has left
     (controller, _), rng = controllers[name], random.Random(name)
     raised = caught = 0
     listens = False
