@@ -18,7 +18,7 @@ from zipfile import ZipFile, ZipInfo, is_zipfile
 
 import numpy as np
 
-from koopmpc.errors import FullDiskError, LogError
+from koopmpc.errors import DataError, FullDiskError, LogError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
@@ -27,7 +27,10 @@ _PIECE = 1 << 22  # bytes that are read at once
 
 def existing(path: str | PathLike[str], advice: str) -> Path:
     """Return the path of a file that is there; `advice` ends the message where it is not."""
-    file = Path(path)
+    try:
+        file = Path(path)
+    except TypeError as error:
+        raise DataError(f"{path!r} is no path; {advice}") from error
     if file.is_dir():
         raise LogError(f"{file} is a folder; {advice}")
     if not file.exists():

@@ -13,7 +13,7 @@ from rich.text import Text
 from koopmpc.cli import sweeps
 from koopmpc.cli.console import bar, console, folder_of, friendly, new_file, new_folder, program, say_page, split
 from koopmpc.cli.sweeps import Logs
-from koopmpc.errors import KoopmpcError, ProblemError
+from koopmpc.errors import DataError, KoopmpcError, ProblemError
 
 if TYPE_CHECKING:
     pass
@@ -118,6 +118,9 @@ def fit(
         out.print(Text(f"then: {shlex.join(again)}"), soft_wrap=True)
         return
     if goal is not None:
+        with friendly():
+            if horizon is not None:
+                raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
             designed = design_data(
                 source,

@@ -1,5 +1,6 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, cast
 
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.base import Lifting, short
 from koopmpc.values import Value
 
 SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
@@ -158,7 +159,7 @@ class Limits(Value):
             )
         return margin
 
-    def tightened(self, band: ArrayLike, most: float = TIGHTEST) -> "Limits":
+    def tightened(self, band: ArrayLike, most: float = TIGHTEST, *, states: Sequence[str] = ()) -> "Limits":
         """Return the limits with margins: at step k of the horizon by the error band of min(k, 5) steps.
 
         A margin is at most `most` of the range between the two limits of its state, and `capped` of the result says
@@ -173,6 +174,8 @@ class Limits(Value):
             the steps before it, which a controller chooses anew.
         most
             Share of the range, below a half.
+        states
+            Names for what `capped` says; without them it counts the states from 0.
 
         Raises
         ------
@@ -191,10 +194,11 @@ class Limits(Value):
         cap = share * (high - low)
         capped = rows > cap
         said: list[str] = []
-        for i in np.flatnonzero(capped.any(axis=0)):
+        for i in np.flatnonzero(capped.any(axis=0)).tolist():
             first = int(capped[:, i].argmax())
+            name = short(states[i]) if len(states) == len(cap) else f"state {i}"
             said.append(
-                f"state {i}: from step {first + 1} on the margin is {cap[i]:.4g}, {100 * share:.3g} % of the range, "
+                f"{name}: from step {first + 1} on the margin is {cap[i]:.4g}, {100 * share:.3g} % of the range, "
                 f"though the errors ask for up to {rows[:, i].max():.4g}"
             )
         rows = np.minimum(rows, cap)

@@ -134,6 +134,7 @@ def _whole(split: Divided) -> Episodes:
 def _read(data: Data, memory: int, draw: np.random.Generator, reading: dict[str, Any]) -> tuple[Divided, list[str]]:
     notes: list[str] = []
     told = {name: value for name, value in reading.items() if value is not None}
+    divide = partial(divided, horizon=None, rng=draw, memory=memory, short="record more episodes, or longer ones")
     with noted(notes):
-        files, split = evenly(logs_of(data), told, partial(divided, horizon=None, rng=draw, memory=memory), notes)
+        files, split = evenly(logs_of(data), told, divide, notes)
     return split, [*shortened(notes, files.files), *guessed(files.files, told)]

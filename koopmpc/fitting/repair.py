@@ -192,8 +192,16 @@ class Divided:
     delay: int
 
 
-def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory: int) -> Divided:
+def divided(
+    files: Files,
+    horizon: int | None,
+    rng: np.random.Generator,
+    memory: int,
+    short: str = "pass a shorter --horizon, or more data",
+) -> Divided:
     """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
+
+    `short` is what to do where too few episodes are as long as the horizon.
 
     Raises
     ------
@@ -206,7 +214,8 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     if size <= memory or len(parts) < 2:
         looked = audited(joined([part.load() for part in parts]))
         repair = needed(looked.episodes)
-        return _in_memory(repair(looked.episodes), horizon, rng, told, (*looked.notes, *repair.notes), looked.delay)
+        notes = (*looked.notes, *repair.notes)
+        return _in_memory(repair(looked.episodes), horizon, rng, told, notes, looked.delay, short)
     looked = audited(sampled(files, _JUDGED)[0], cut=False)
     repair = needed(looked.episodes)
     past = max(PAST, looked.delay)
@@ -220,7 +229,7 @@ def divided(files: Files, horizon: int | None, rng: np.random.Generator, memory:
     if len(held_out) < 2:
         held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + past))], ahead + past)
     if len(held_out) < 2:
-        raise DataError(_too_short(len(judged), ahead))
+        raise DataError(_too_short(len(judged), ahead, short))
     seen, _ = sampled(rest, _JUDGED)
     note = (
         f"larger than {_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
@@ -244,6 +253,7 @@ def _in_memory(
     files: str,
     repaired: tuple[str, ...],
     delay: int,
+    short: str,
 ) -> Divided:
     past = max(PAST, delay)
     lengths = [len(episode) for episode in episodes]
@@ -264,7 +274,7 @@ def _in_memory(
             )
     long = [i for i, episode in enumerate(whole) if len(episode) >= needed]
     if len(long) < 4:
-        raise DataError(_too_short(len(episodes), ahead))
+        raise DataError(_too_short(len(episodes), ahead, short))
     count = max(round(_SHARE * len(long)), min(_ENOUGH, len(long) // 3), 2)
     # blocks in order are held out evenly spread, episodes at random
     order = [int((i + 0.5) * len(long) / count) for i in range(count)]
@@ -282,10 +292,10 @@ def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:
     return [episode for episode in episodes if len(episode) >= needed]
 
 
-def _too_short(episodes: int, horizon: int) -> str:
+def _too_short(episodes: int, horizon: int, advice: str) -> str:
     return (
         f"{episodes} episode{'s' * (episodes > 1)} of these lengths give too few of {horizon + PAST} steps, horizon "
-        "and delays, to fit to some and judge by others; pass a shorter --horizon, or more data"
+        f"and delays, to fit to some and judge by others; {advice}"
     )
 
 

@@ -44,7 +44,7 @@ def load_value(path: str | Path, *kinds: type[V]) -> V:
     LogError
         The file is missing, a folder, damaged, or holds something else.
     """
-    wanted = " or ".join(kind.__name__ for kind in kinds)
+    wanted = " or ".join(kind.__name__.removeprefix("Saved") for kind in kinds)
     advice = f"pass the .npz of a saved {wanted}"
     source = disk.existing(path, advice)
     try:

@@ -180,6 +180,33 @@ def outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Seq
     return said
 
 
+def outside_limits(asked: Asked, data: Episodes) -> list[str]:
+    """Return a sentence for each limit that a start or a moving reference lies beyond.
+
+    A reference that rests is not looked at here: `unheld` says what can be held instead.
+    """
+    cost, limits, states = asked.cost.of.bind(data.states), asked.limits, data.states
+    names, starts, boxes = list(states), asked.starts, [limits.states(data.nx)]
+    if limits.of is not None:
+        of = limits.of.bind(states)
+        names, starts = [*names, *of.names], np.hstack([starts, of(starts)])
+        boxes.append(limits.outputs(of.nz))
+    ends = np.concatenate([np.column_stack([box.low, box.high]) for box in boxes])
+    targets = dict(zip(cost.names, asked.reference.T, strict=True)) if asked.moves else {}
+    said: list[str] = []
+    for name, start, (low, high) in zip(names, starts.T, ends, strict=True):
+        for what, values, meaning in (
+            ("a start", start, "no input can keep the limit from there; start inside it, or widen it"),
+            ("the reference", targets.get(name), "the loop stays at the limit there; ask for less, or widen it"),
+        ):
+            over = np.zeros(1) if values is None else np.maximum(low - values, values - high)
+            if values is not None and over.max() > 1e-9 * np.abs(values).max():
+                value = values[over.argmax()]
+                limit = quantity(name, f"= {low if value < low else high:.4g}")
+                said.append(f"{what} has {quantity(name, f'= {value:.4g}')}, beyond the limit {limit}: {meaning}")
+    return said
+
+
 def unweighted(asked: Asked, data: Episodes) -> list[str]:
     """Return a sentence for each limited state that the cost does not weigh."""
     of = asked.cost.of.bind(data.states)

@@ -21,7 +21,7 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.parallel import Progress, StageProgress, Workers
-from koopmpc.synthesis.asked import Asked, asked_of, outside_data, unweighted
+from koopmpc.synthesis.asked import Asked, asked_of, outside_data, outside_limits, unweighted
 from koopmpc.synthesis.candidates import Candidate, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
@@ -270,7 +270,7 @@ def _test(
     test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, tighten)
     unreachable = unheld(surrogates[0], asked)
     holds = not asked.moves and not unreachable
-    return test, [*unreachable, *outside_data(asked, data, tracked, free)], holds
+    return test, [*unreachable, *outside_limits(asked, data), *outside_data(asked, data, tracked, free)], holds
 
 
 class _StandIn(NamedTuple):

@@ -124,7 +124,7 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
             )
     if len(long) < 2:
         raise DataError(
-            f"{len(episodes)} episodes give {len(long)} of {needed} steps or more, and a choice needs 2: pass a "
+            f"of {len(episodes)} episodes {len(long)} have {needed} steps or more, and a choice needs 2: pass a "
             "shorter horizon, or longer episodes"
         )
     count = min(folds, len(long))

@@ -82,7 +82,8 @@ class LoopTest:
         """Return the limits that a controller gets if its model has these errors."""
         if not self.tighten:
             return self.asked.limits
-        return self.asked.limits.tightened(np.where(np.isfinite(band), band, self.asked.high - self.asked.low))
+        width = np.where(np.isfinite(band), band, self.asked.high - self.asked.low)
+        return self.asked.limits.tightened(width, states=self.episodes.states)
 
     @property
     def nominal(self) -> tuple[int, ...]:

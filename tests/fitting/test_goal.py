@@ -201,9 +201,21 @@ def test_the_commands_write_a_template_design_and_check(tmp_path, monkeypatch):
     checked = call(app, ["check", file, "--runs", "2"])
     assert checked.exit_code == 0, checked.output
     assert "the goal is kept" in checked.stdout
+    both = call(app, ["fit", "logs.npz", "--goal", "goal.toml", "--horizon", "9"])
+    assert both.exit_code == 2
+    assert "--horizon 9 is of no use with --goal; write horizon = 9 into goal.toml" in " ".join(both.stderr.split())
     missing = call(app, ["check", "none.npz"])
     assert missing.exit_code == 2
     assert "none.npz" in missing.stderr
+
+
+def test_too_few_short_logs_for_a_goal_are_refused_with_what_to_record(tmp_path):
+    short = km.Episodes([km.Episode(X=e.X[:9], U=e.U[:8]) for e in logs()][:2], logs().dt, logs().states, logs().inputs)
+    short.save(tmp_path / "short.npz")
+    (tmp_path / "goal.toml").write_text(GOAL)
+    with pytest.raises(km.KoopmpcError, match="record more episodes, or longer ones") as caught:
+        design_data(tmp_path / "short.npz", tmp_path / "goal.toml", tmp_path)
+    assert "--horizon" not in str(caught.value)
 
 
 def test_a_check_of_what_is_no_controller_exits_with_2_and_says_what_to_pass(tmp_path, made):
@@ -215,7 +227,7 @@ def test_a_check_of_what_is_no_controller_exits_with_2_and_says_what_to_pass(tmp
         assert result.exit_code == 2
         said = " ".join(result.stderr.split())
         assert file.name in said
-        assert "pass the .npz of a saved SavedController or SavedDesign" in said
+        assert "pass the .npz of a saved Controller or Design" in said
 
 
 def test_the_check_exits_with_1_where_the_goal_is_not_kept(tmp_path, monkeypatch, made):

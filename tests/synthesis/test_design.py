@@ -1,6 +1,7 @@
 """design: what it chooses, what it says of what is asked, and that time and workers do not count."""
 
 import importlib
+import re
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -173,11 +174,8 @@ def test_a_goal_that_no_input_holds_is_told_with_the_limit_in_the_way_and_the_ne
 
 
 def test_limits_inside_which_nothing_rests_are_told():
-    with pytest.warns(km.FitWarning, match=r"x1 = 0, and its limit is 0\.3; the plant rests nowhere inside these"):
-        km.design(
-            data(), COST, km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, 0.3], x_max=[np.inf, 0.9]), horizon=8,
-            reference=[0.0, 0.0], candidates=[PLAIN], delays=[0], bilinear=False,
-        )  # fmt: skip
+    found = designed(data(), limits=km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, 0.3], x_max=[np.inf, 0.9]))
+    assert any("x1 = 0, and its limit is 0.3; the plant rests nowhere inside these" in said for said in found.advice)
 
 
 def test_a_moving_state_is_no_equilibrium_to_rest_at():
@@ -190,12 +188,27 @@ def test_a_moving_state_is_no_equilibrium_to_rest_at():
     [
         ({"starts": [0.0, 3.0]}, r"a start has x1 = 3, outside the data"),
         ({"reference": np.column_stack([np.zeros(40), np.linspace(0, 3, 40)])}, r"the reference has x1 = 3, outside"),
+        ({"starts": [0.0, -0.6]}, r"a start has x1 = -0\.6, beyond the limit x1 = -0\.5: no input can keep the limit"),
+        (
+            {"reference": np.column_stack([np.zeros(40), np.linspace(0, 0.6, 40)])},
+            r"the reference has x1 = 0\.6, beyond the limit x1 = 0\.5: the loop stays at the limit there; ask for less",
+        ),
     ],
 )
-def test_a_start_or_a_reference_outside_the_data_is_told(more, sentence):
-    asked = {"horizon": 8, "reference": [0.0, 0.0], "candidates": [PLAIN], "delays": [0], "bilinear": False} | more
-    with pytest.warns(km.FitWarning, match=sentence):
-        km.design(data(), COST, LIMITS, **asked)
+def test_a_start_or_a_reference_outside_the_data_or_the_limits_is_told(more, sentence):
+    assert any(re.match(sentence, said) for said in designed(data(), **more).advice)
+
+
+def test_a_moving_reference_of_an_observable_is_held_against_the_limits_of_that_observable():
+    square = km.Expressions(lambda x: [x[1] ** 2], ["speed squared"])
+    limits = km.Limits(u_min=-1, u_max=1, of=square, y_max=[0.04])
+    found = designed(
+        data(), km.Cost(Q=[1.0], R=0.1, of=square), limits, reference=np.linspace(0, 0.09, 40)[:, None], tighten=False
+    )
+    assert any(
+        sentence.startswith("the reference has speed squared = 0.09, beyond the limit speed squared = 0.04")
+        for sentence in found.advice
+    )
 
 
 def test_a_limited_state_without_weight_is_told():
@@ -246,7 +259,8 @@ def test_limits_are_tightened_by_the_models_errors_unless_told():
 
 def test_a_margin_that_is_capped_is_advice():
     found = designed(noisy(data(), 0.3))
-    assert any("20 % of the range, though the errors ask for up to" in sentence for sentence in found.advice)
+    said = next(sentence for sentence in found.advice if "though the errors ask for up to" in sentence)
+    assert said.startswith("x1: from step 1 on the margin is 0.2, 20 % of the range")
 
 
 def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(monkeypatch):
