@@ -22,7 +22,18 @@ InputFunction = Callable[[int, Float[np.ndarray, " ny"], np.random.Generator], A
 
 @dataclass(frozen=True, eq=False, init=False)
 class Uniform(Value):
-    """Initial states uniform in the box from `low` to `high`, (nx,) each."""
+    """Initial states uniform in the box from `low` to `high`.
+
+    Parameters
+    ----------
+    low, high
+        (nx,) in the units of the states; one number for `high` serves all states.
+
+    Raises
+    ------
+    ShapeError, DataError
+        The two have other lengths, or an end of `low` is above that of `high`.
+    """
 
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]

@@ -67,6 +67,18 @@ class Levels(OpenLoop):
 class Noise(Levels):
     """u uniform between `low` and `high`, drawn anew every `hold` steps.
 
+    Parameters
+    ----------
+    low, high
+        Scalars or (nu,), in the units of the inputs.
+    hold
+        Steps between two draws.
+
+    Raises
+    ------
+    ShapeError, DataError
+        The two have other lengths, an end of `low` is above that of `high`, or hold is below 1.
+
     Examples
     --------
     >>> import koopmpc as km
@@ -112,6 +124,11 @@ class PRBS(Levels):
     order
         Length of the register; it repeats after 2^order − 1 bits. Each episode starts at a random bit, and
         the inputs run nu-th parts of the period apart, so that they are hardly correlated.
+
+    Raises
+    ------
+    ShapeError, DataError
+        As for `Noise`; order lies outside 3 … 16.
     """
 
     order: int
@@ -144,6 +161,12 @@ class Multisine(OpenLoop):
         The multiples j: a number n for 1 … n, or the list of them; below half the samples of a period.
     offset
         Mean, scalar or (nu,).
+
+    Raises
+    ------
+    ShapeError, DataError
+        A number is not above zero, the lengths differ, or, when it excites a plant, the period is no multiple of dt or
+        a harmonic is not below the Nyquist frequency.
     """
 
     amplitude: Float[np.ndarray, " nu"]
@@ -198,6 +221,12 @@ class Chirp(OpenLoop):
         First and last frequency [Hz], below half the sample rate.
     duration
         Length of the sweep [s].
+
+    Raises
+    ------
+    ShapeError, DataError
+        A number is not above zero, the lengths differ, or, when it excites a plant, a frequency is not below half the
+        sample rate.
     """
 
     amplitude: Float[np.ndarray, " nu"]
@@ -248,6 +277,11 @@ class Feedback(Excitation):
         The point to hold the plant at, scalars or (ny,) and (nu,); zero by default.
     u_min, u_max
         Limits on u, scalars or (nu,).
+
+    Raises
+    ------
+    ShapeError, DataError
+        K is no matrix, the other arguments or the plant's y do not fit it, or the limits cross.
 
     Examples
     --------

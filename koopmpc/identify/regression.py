@@ -32,7 +32,7 @@ class Regression:
     Attributes
     ----------
     method, route
-        What the report says of them.
+        Name of the method, and how the data were read, as the report gives them.
     rows
         P = [ψ(x) u]; T begins with ψ(x⁺).
     x_next
@@ -42,11 +42,11 @@ class Regression:
     C, state_residual
         (nx, nz), None where ψ(x) is x; and the root-mean-square of x − C ψ(x).
     disturbances
-        Names of w, the last of the inputs.
+        Names of the measured disturbances w, which stand last among the inputs.
     B
-        (nz, nu) where it is known.
+        (nz, nu) where it is known; None where it is fitted.
     scaled
-        Solve on columns of unit norm.
+        True where the regression is solved on columns of unit norm.
     embedding
         As in the predictor.
     """

@@ -206,7 +206,7 @@ class VariableProjection:
     windows
         The data.
     ridge
-        Of the least squares, as in `edmd`.
+        Ridge of the least squares, as in `edmd`.
     """
 
     def __init__(self, tuning: Tuning, windows: Windows, ridge: float) -> None:

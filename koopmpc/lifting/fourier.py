@@ -28,6 +28,11 @@ class Fourier(Lifting):
     states
         The chosen states, by index or by name, with or without the unit; all of them by default.
 
+    Raises
+    ------
+    DataError
+        harmonics is below 1, or, when it is bound, there is no such state.
+
     Examples
     --------
     >>> import koopmpc as km
@@ -89,6 +94,11 @@ class RandomFourier(Lifting):
         Standard deviation of the kernel, in the unit of the states; standardize states that differ much.
     rng
         A seed, or a Generator that one is drawn from.
+
+    Raises
+    ------
+    DataError
+        count is below 1, or width is not above zero.
 
     References
     ----------

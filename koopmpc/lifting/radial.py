@@ -81,6 +81,13 @@ class Gaussian(Lifting):
     width
         Standard deviation of the bell, in the unit of the states; one for all centres, or (nc,), one for each. Scale
         states that differ much.
+
+    Raises
+    ------
+    DataError
+        There is no centre, or a width is not above zero.
+    ShapeError
+        The centres are no rows, there are more or fewer widths, or, when it is bound, states.
     """
 
     tunable: ClassVar[Mapping[str, str]] = {"centers": "real", "width": "positive"}
@@ -127,6 +134,13 @@ class ThinPlate(Lifting):
     ----------
     centers
         (nc, nx), one centre a row.
+
+    Raises
+    ------
+    DataError
+        There is no centre.
+    ShapeError
+        The centres are no rows, or, when it is bound, are made for another number of states.
     """
 
     tunable: ClassVar[Mapping[str, str]] = {"centers": "real"}

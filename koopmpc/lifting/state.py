@@ -26,6 +26,11 @@ class State(Lifting):
     states
         The chosen states, by index or by name, with or without the unit; all of them by default.
 
+    Raises
+    ------
+    DataError
+        When it is bound: there is no such state.
+
     Examples
     --------
     >>> import koopmpc as km
@@ -87,6 +92,16 @@ class Monomials(Lifting):
 
     Degree 1 is `State`, degree 0 is `Constant`; add them where they are wanted.
 
+    Parameters
+    ----------
+    degree
+        The highest total degree, 2 or more.
+
+    Raises
+    ------
+    DataError
+        degree is below 2.
+
     Examples
     --------
     >>> import koopmpc as km
@@ -141,6 +156,11 @@ class Expressions(Lifting):
         Takes the column x and returns a list of expressions: ``lambda x: [x[1] * ca.sin(x[0])]``.
     names
         The name of each expression, by which limits and costs find it.
+
+    Raises
+    ------
+    DataError
+        When it is bound: fn does not return one expression for each name. When it is saved unbound.
 
     Examples
     --------

@@ -23,6 +23,11 @@ class Combination(Value):
         Limits of the sum; −inf and inf where there is none.
     A, B
         The weights F (nz, nz) and G (nz, nu); zero by default.
+
+    Raises
+    ------
+    ShapeError, DataError
+        There are no weights, they are no matrices, or low is above high.
     """
 
     low: float
@@ -61,6 +66,13 @@ class Dissipation(Value):
         (nu, nz) of the output y = C z + D u, one output for each input.
     D
         (nu, nu); zero by default. A sampled system whose B is not zero needs D + Dᵀ ≻ 0 to be passive.
+
+    Raises
+    ------
+    ShapeError, DataError
+        P, C or D is no matrix, decay is not above zero, or D comes without C.
+    DefinitenessError
+        P is not symmetric, or is indefinite.
 
     References
     ----------

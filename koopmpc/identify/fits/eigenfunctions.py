@@ -31,16 +31,14 @@ def eigenfunctions(
 
     With an eigenvalue (0 for conserved quantities) the regression is implicit: c and the coefficients of β are in the
     null space of the matrix with the rows (ψ(x⁺) − e^{λ dt} ψ(x)) / dt − u (w₀ β(x) + w₁ β(x⁺)), that is, c minimises
-    the residual for a gradient ∇φ of root-mean-square 1; constants, and sums that are constant everywhere, are so ruled
-    out. Without inputs the rows are exact for any dt; w are those of a β that is linear over a step, with an error of
-    dt². With
-    eigenvalue=None the regression is explicit: λ and c are eigenpairs of the least squares of ψ(x⁺) on [ψ(x) u ψ(x)],
-    each then refined by the implicit one.
+    the residual for a gradient ∇φ of root-mean-square 1. This rules out constants, and sums that are constant
+    everywhere. Without inputs the rows are exact for any dt; w₀ and w₁ assume that β is linear over a step, with an
+    error of dt². With eigenvalue=None the regression is explicit: λ and c are eigenpairs of the least squares of ψ(x⁺)
+    on [ψ(x) u ψ(x)], and the implicit regression then refines each.
 
-    Each φ keeps the fewest observables, in the order of their contribution, for which the residual stays below `growth`
-    times that of all. In a null space of several dimensions the sparsest vectors are looked for by alternating
-    directions. Last, φ is predicted over held-out episodes from its first value; those that miss `tolerance` are
-    rejected.
+    Observables are added to φ in the order of their contribution until the residual is below `growth` times that of
+    all of them. In a null space of several dimensions, alternating directions look for the sparsest vectors. Last, each
+    φ is predicted over held-out episodes from its first value, and is rejected where it misses `tolerance`.
 
     Parameters
     ----------

@@ -48,9 +48,9 @@ def kernel_edmd(
         landmarks are at least as many as these. "gaussian", k = exp(−‖x − y‖² / (2 width²)). In both, x stands for
         the states less their mean, in standard deviations, so that units do not matter.
     degree
-        Of the polynomial kernel.
+        Degree of the polynomial kernel.
     width
-        Of the Gaussian kernel, in standard deviations; by default the median distance of two landmarks.
+        Width of the Gaussian kernel in standard deviations; by default the median distance of two landmarks.
     landmarks
         Number of states, drawn from the data at random, that span the observables; all states where the data hold no
         more.
@@ -60,7 +60,7 @@ def kernel_edmd(
     ridge, **options
         As in `edmd`.
     rng
-        Draws the landmarks.
+        Generator or seed that draws the landmarks.
 
     Returns
     -------

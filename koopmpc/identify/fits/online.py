@@ -28,12 +28,13 @@ class OnlineEDMD:
     With neither forgetting nor a window it is the batch fit.
 
     With forgetting, a pair whose innovation, ψ(x⁺) less its forecast, is beyond 30 times the spread of innovations so
-    far is an outlier: it is not learned, and counted in `outliers`. One reading that is far off would else be
-    remembered for thousands of pairs. As long as there are no forecasts, a value beyond 1000 times the size of its
-    observable is one. A plant that has changed is learned after a few pairs, for spreads grow with outliers. A memory
-    of less than four pairs a regressor knows no outliers. Readings that are bad for longer are learned, and spoil the
-    model for as long as they stay in the memory; where they are so far off that it would hold them for good, what is
-    learned once they are over takes its place ten to twenty memories later.
+    far is an outlier: it is not learned, and counted in `outliers`. Otherwise one reading that is far off would be
+    remembered for thousands of pairs. As long as there are no forecasts, a pair with a value beyond 1000 times the size
+    of its observable is an outlier. A plant that has changed is learned after a few pairs, because outliers widen the
+    spread. Outliers are not looked for with a memory of less than four pairs a regressor. Readings that stay bad for
+    longer are learned, and spoil the model for as long as the memory holds them. Where they are so far off that it
+    would hold them for good, a second memory, begun once they are over, takes its place after ten to twenty times
+    1 / (1 − λ) pairs.
 
     It takes no embedding, because it keeps no past steps. A model with delays learns from points ζ as states:
     ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.

@@ -65,16 +65,17 @@ def second_moments(
     embedding
         ψ acts on ζ, the state and its past, as `Delay` makes it.
     route
-        "gram" sums products, "qr" updates a triangular factor. By default the scaled condition number of a
-        pilot, chunks sampled from up to 4 parts, chooses: up to 1e6 its Gram sums are kept and the other chunks
-        added to them, beyond it all is read in QR; so it is if the whole turns out worse than the pilot. A stream
+        "gram" sums products, "qr" updates a triangular factor. By default a pilot chooses, chunks sampled from up to
+        4 parts: where its scaled condition number is at most 1e6, its Gram sums are kept and the other chunks are
+        added to them. Where it is larger, or that of all data turns out larger, everything is read in QR. A stream
         that can be read only once is summed in QR.
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
     weights
-        The weight w of each pair, 0 or above; by default 1. With Episodes one item an episode, a number or (T,), one
-        a step, of which an embedding of d steps leaves the last T − d; with any source a function Episode → number
-        or (T,). They weigh pairs against each other: residuals are weighted means, and a common factor changes nothing.
+        The weight w ≥ 0 of each pair; by default 1. For Episodes a sequence with one item for each episode: a number,
+        or an array (T,) with a weight for each step. For any source a function from an Episode to such an item. An
+        embedding of d steps uses the last T − d weights of an episode. Residuals are weighted means, so that a common
+        factor changes nothing.
     workers, scheduler, progress
         As in `koopmpc.parallel.map_tasks`: local processes, a Dask cluster, and what is called after each part.
 

@@ -88,7 +88,7 @@ class LiftedChunk(NamedTuple):
     P
         The rows, of one piece after the other.
     first, last
-        Where the pieces begin and end: rows that belong to one pair, where all others belong to two.
+        Indices of the first and the last row of each piece. These rows belong to one pair, all others to two.
     nz
         Number of observables.
     weights

@@ -148,10 +148,10 @@ class Gate:
     of the column's own. An innovation beyond the gate counts there as if it stood at the gate: the spread grows
     tenfold with four of them in sequence, so that a plant that has changed is learned after a few rows.
 
-    Until there is a forecast, a row is an outlier where a value is beyond 1000 times the size of its column, the
-    root-mean-square over about 100 rows, or among the first rows beyond 1000 times all others of its column. Inputs are
-    what they are: nothing is said of them. `fell` tells that 20 rows in sequence stayed below 1 % of the size of some
-    column: the plant came to rest, or what was learned before was no signal.
+    As long as there is no forecast, a value beyond 1000 times the size of its column makes its row an outlier; the size
+    is the root-mean-square over about 100 rows. The very first rows have no size to compare with: among them a value is
+    compared with all others of its column. Inputs never make an outlier. `fell` is True once 20 rows in sequence have
+    stayed below 1 % of the size of some column: the plant came to rest, or what was learned before was no signal.
 
     Parameters
     ----------
