@@ -2,7 +2,6 @@
 
 import copy
 from time import perf_counter
-from typing import Self
 
 import numpy as np
 import scipy.linalg
@@ -44,7 +43,7 @@ class FeedbackLaw:
         self._inside = 0
         FeedbackLaw.reset(self)
 
-    def __copy__(self) -> Self:
+    def __copy__(self) -> "FeedbackLaw":
         """Return a copy that shares nothing with this one that moves in a step."""
         return copy.deepcopy(self)
 
