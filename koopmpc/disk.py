@@ -25,12 +25,16 @@ _DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
 _PIECE = 1 << 22  # bytes that are read at once
 
 
+def path_of(path: object, advice: str = "pass text or a pathlib.Path") -> Path:
+    """Return the path; DataError where it is neither text nor a path."""
+    if isinstance(path, str | PathLike):
+        return Path(os.fsdecode(cast("str", path)))
+    raise DataError(f"{path!r} is no path; {advice}")
+
+
 def existing(path: str | PathLike[str], advice: str) -> Path:
     """Return the path of a file that is there; `advice` ends the message where it is not."""
-    try:
-        file = Path(path)
-    except TypeError as error:
-        raise DataError(f"{path!r} is no path; {advice}") from error
+    file = path_of(path, advice)
     if file.is_dir():
         raise LogError(f"{file} is a folder; {advice}")
     if not file.exists():
@@ -77,7 +81,7 @@ def target(path: str | PathLike[str]) -> Path:
     LogError
         It is a folder, or a file that may not be written.
     """
-    file = Path(path)
+    file = path_of(path)
     if file.is_dir():
         raise LogError(f"{file} is a folder; pass the path of a file in it")
     with suppress(OSError):  # a loop of links is refused when it is opened

@@ -87,7 +87,7 @@ def save_video(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: st
     LogError
         imageio-ffmpeg is not installed, or the path cannot be written.
     """
-    suffix = Path(path).suffix.lower()
+    suffix = disk.path_of(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
         raise DataError(f"{path} ends in {suffix or 'nothing'}; a video is a .gif or an .mp4")
     if suffix == ".gif":

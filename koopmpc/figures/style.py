@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from functools import wraps
 from io import BytesIO
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, ParamSpec, TypeVar, cast
 
 import numpy as np
@@ -202,7 +201,7 @@ def save(made: "Figure", path: str | PathLike[str]) -> None:
     LogError
         The path cannot be written.
     """
-    suffix = Path(path).suffix.lower()
+    suffix = disk.path_of(path).suffix.lower()
     if suffix not in _SUFFIXES:
         raise DataError(f"{path} is no picture by its name; end it with one of {', '.join(_SUFFIXES)}")
     with disk.writing(path) as stream:

@@ -14,6 +14,7 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
+from koopmpc.disk import path_of
 from koopmpc.errors import DataError
 from koopmpc.interrupts import heard
 from koopmpc.loop.run import About, Run, Step, StepRows
@@ -118,7 +119,7 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     """
     checks.kind(run, "run", Run, "pass what simulate returned; a model is written by km.recording.record_model")
     scene, model = scene or run.scene, run.model if model is None else model
-    writer = Writer(About(**run.about()), path=Path(path), scene=scene, model=model, steps=run.steps)
+    writer = Writer(About(**run.about()), path=path_of(path), scene=scene, model=model, steps=run.steps)
     try:
         writer.write(block_of_run(run))
         writer.end(run)
@@ -188,7 +189,7 @@ class Recorder:
             angles=tuple(angles),
             metadata=dict(metadata or {}),
         )
-        self._path, self._live, self._port = None if path is None else Path(path), live, port
+        self._path, self._live, self._port = None if path is None else path_of(path), live, port
         self._scene, self._model = scene, model
         self._writers: dict[str, BackgroundWriter] = {}
         self._open = False

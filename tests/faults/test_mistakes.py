@@ -171,3 +171,14 @@ def test_the_example_of_the_page_runs():
     namespace = {}
     exec(text.split("```python\n")[1].split("```")[0], namespace)
     assert namespace["mine"] is not namespace["mpc"]
+
+
+@pytest.mark.parametrize("bad", [3, None, [1], object()])
+def test_what_is_no_path_is_said_by_everything_that_reads_or_writes(model, bad, tmp_path):
+    run = km.simulate(PLANT, km.LQR(model, PENDULUM.cost), x0=[0.1, 0], reference=[0, 0], steps=2)
+    data = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=2, steps=3)
+    readers = (km.load_model, km.load_run, km.load_episodes, km.load_controller)
+    writers = (model.save, data.save, lambda path: km.record(run, path))
+    for call in (*readers, *writers):
+        with pytest.raises(km.errors.DataError, match=" is no path; pass "):
+            call(bad)

@@ -28,7 +28,7 @@ _READERS = {".rrd": ("koopmpc.recording.format.reader", "run_episodes")}  # impo
 
 def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     """Write the episodes to a .npz, .parquet or .csv file; `Episodes.save` is this."""
-    file = Path(path)
+    file = disk.path_of(path)
     suffix = _suffix(file, (".npz", *_WRITERS))
     X = np.concatenate([episode.X for episode in episodes])
     driven = episodes.driven()  # U with W behind it
@@ -90,7 +90,7 @@ def load_episodes(
         There are gaps, columns that are constant or repeat another, or no column with the name of an input.
     """
     told = Told(dt, states, inputs, disturbances, resample)
-    files = [Path(file) for file in (path, *more)]
+    files = [disk.path_of(file) for file in (path, *more)]
     sets = [_read(file, told) for file in files]
     plant = PlantSignature.of(sets[0], str(files[0]))
     for file, one in zip(files, sets, strict=True):
@@ -254,7 +254,8 @@ def _read_folder(file: Path, reader: Reader) -> Episodes:
 def _found(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[Path, ...]:
     """Return the files, those of a folder by name."""
     if not isinstance(paths, str | PathLike):
-        files = tuple(Path(path) for path in paths)
+        each = paths if hasattr(paths, "__iter__") else [paths]
+        files = tuple(map(disk.path_of, each))
         if not files:
             raise DataError("there is no path; pass a folder, or at least one file")
         for file in files:

@@ -9,6 +9,7 @@ import numpy as np
 from koopmpc.control.move import Fallback, Status
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.sampling import Signals, episodes_from
+from koopmpc.disk import path_of
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
@@ -26,7 +27,7 @@ def load_run(path: str | Path) -> Run:
     LogError
         The file is missing, no log of koopmpc, damaged, or holds no whole step.
     """
-    path = Path(path)
+    path = path_of(path)
     log = read_columns(path, tuple(f"/{entity}" for entity in Entity if entity not in DRAWN))
     try:
         return _run(log, path)
