@@ -185,6 +185,24 @@ def from_data(tree: Any, arrays: Keyed | None = None, enums: Sequence[type[Enum]
         raise LogError(f"the file holds a {kind!r} that cannot be built: {error}") from error
 
 
+class Viewing:
+    """Base of objects that keep views of their own arrays: copies and pickles leave these out, and make their own."""
+
+    _VIEWS: ClassVar[tuple[str, ...]] = ()
+    """Names of the attributes that `_see` makes."""
+
+    def _see(self) -> None:
+        """Make the views."""
+        raise NotImplementedError
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._see()
+
+
 def class_of(name: str) -> type[Value] | None:
     """Return the Value of koopmpc that has this name, or had it once; None where there is none.
 

@@ -20,9 +20,10 @@ from koopmpc.control.saved import Savable
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
 from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.values import Viewing
 
 
-class InitialCondition:
+class InitialCondition(Viewing):
     """known = [z; u_{−1}; w_0 … w_{N−1}; d; 1] of the step at which an input computed now acts, L steps from now.
 
     z is predicted over these L steps, z ← F(z, u) + E w + d with the inputs that are still to act. u_{−1} is there
@@ -64,20 +65,13 @@ class InitialCondition:
         self._see()
 
     def _see(self) -> None:
-        """Make the views; a copy makes its own."""
+        """Make the views; see `Viewing`."""
         nz, nu, nw, N = self._sizes
         first = nz + nu * self._with_rates
         self.z = self.known[:nz]
         self.u_prev = self.known[nz:first]
         self.drive = self.known[first:-1]
         self.W, self.d = self.drive[: N * nw].reshape(N, nw), self.drive[N * nw :]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._see()
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""

@@ -15,7 +15,7 @@ from koopmpc.estimate.observer import StateModel
 from koopmpc.lifting.base import Lifting, buffered
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.scoring import comparable, forecast_errors
-from koopmpc.values import Value
+from koopmpc.values import Value, Viewing
 
 if TYPE_CHECKING:
     from koopmpc.control.base import InitialCondition
@@ -117,7 +117,7 @@ def monitor_of(given: Monitor | Episodes, model: Any) -> Monitor:
     return monitor
 
 
-class Watch:
+class Watch(Viewing):
     """The monitor in one closed loop: whether the last step was `inside` the data, and whether the prediction `fits`.
 
     The state is compared with its prediction from the step before, with the input that the plant got, the measured
@@ -147,19 +147,12 @@ class Watch:
         self.reset()
 
     def _see(self) -> None:
-        """Make the views; a copy makes its own."""
+        """Make the views; see `Viewing`."""
         n, nx = self._n, len(self.monitor.band)
         self._before, self._now = self._rows[:n], self._rows[n:]
         self._acted = self._before[n - self._nu :]
         self._z, self._u = self._now[: n - self._nu], self._now[n - self._nu :]
         self._error, self._reach = self._found[:nx], self._found[nx:]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._see()
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Compare with the predictions of another model from now on; region and band stay."""

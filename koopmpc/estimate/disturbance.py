@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from math import exp
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,7 +14,7 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Measured, StateModel
 from koopmpc.plants.compiled import interpreter
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Value
+from koopmpc.values import Value, Viewing
 
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
 
@@ -78,7 +77,7 @@ class LiftedDisturbance(Value):
         return Filtered(model, max(1 - exp(-4 / horizon), GAIN) if self.gain is None else self.gain)
 
 
-class Filtered(Measured):
+class Filtered(Viewing, Measured):
     """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is.
 
     The Constant and the past of a state have no disturbances. A step is one product,
@@ -92,7 +91,7 @@ class Filtered(Measured):
         Weight of the newest misfit, in (0, 1].
     """
 
-    _OWN = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_evaluate", "_buffer")
+    _VIEWS = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_evaluate", "_buffer")
 
     def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
         super().__init__(model)
@@ -110,20 +109,13 @@ class Filtered(Measured):
         self._take(model)
 
     def _see(self) -> None:
-        """Make the views of the memory, and the call of the rule on these arrays; a copy makes its own."""
+        """Make the views of the memory, and the call of the rule on these arrays; see `Viewing`."""
         nz, nu, nw = self._sizes
         self.z, self._u, self._w, _, self.d = np.split(self._memory, np.cumsum([nz, nu, nw, nz, nz]))[:5]
         self._driven, self._seen = self._memory[: nz + nu + nw], self._memory[-1:]
         self._x, self._after = np.zeros(self._rule.numel_in(0)), np.zeros(len(self._memory))
         arguments = self._x, self._predicted, self._memory, self._C
         self._evaluate, self._buffer = interpreter(self._rule, arguments, (self._after,))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in self._OWN}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._see()
 
     def _take(self, model: LinearPredictor | StateModel) -> None:
         """Take over the matrices of a model."""

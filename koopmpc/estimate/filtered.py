@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.values import Viewing
 
 
 class Augmented:
@@ -55,7 +56,7 @@ class FilterModel(NamedTuple):
     R: Float[np.ndarray, "ny ny"]
 
 
-class Kalman:
+class Kalman(Viewing):
     """The observer of a `LiftedKalman`: s ← s + K (y − M s − h), the gain K from the stationary covariance P.
 
     Entries of y that are NaN are left out of the correction; where all are NaN, s is only predicted. Where no entry is
@@ -78,17 +79,10 @@ class Kalman:
         self.reset()
 
     def _see(self) -> None:
-        """Make the views of the arrays that the product reads and writes; a copy makes its own."""
+        """Make the views of the arrays that the product reads and writes; see `Viewing`."""
         n, inputs, nz = self._parts
         self._s, self._uw, self._y, _ = np.split(self._known, [n, n + inputs, n + inputs + self.ny])
         self._s_new, self.z, self.d = np.split(self._found, [n, n + nz])
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._see()
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with another model, from the same state."""

@@ -1,7 +1,7 @@
 """The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,6 +15,7 @@ from koopmpc.control.solvers.qp import StepQP
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.values import Viewing
 
 
 class PlanLimits(NamedTuple):
@@ -32,7 +33,7 @@ class PlanLimits(NamedTuple):
     next: Int[np.ndarray, " nv"]
 
 
-class PlanMap:
+class PlanMap(Viewing):
     """t = M [z; u_{−1}; g; 1]: the unconstrained plan, which is the optimum where low ≤ t ≤ high.
 
     t = [v; lowest and highest target], v the plan as in `Condensed`. u_{−1} is there where the change of inputs is
@@ -103,18 +104,11 @@ class PlanMap:
         self._see()
 
     def _see(self) -> None:
-        """Make the bytes and their views; a copy makes its own."""
+        """Make the bytes and their views; see `Viewing`."""
         rows = len(self.low)
         self.met = bytearray(2 * rows)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:rows], met[rows:]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in self._VIEWS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._see()
 
 
 def plan_map(
