@@ -130,3 +130,25 @@ def test_an_unstable_plant_with_a_long_horizon():
         at_limit += move.status is km.Status.OPTIMAL
         x = A @ x + B @ move.u
     assert at_limit >= 3
+
+
+def test_in_inputs_the_QP_is_curved_alike_along_each_of_them():
+    """1 along w moves each input by its share of the room: the mean of the Hessian's diagonal over the stages is 1."""
+    model, N = linear(np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0, 0.3], [0.2, 0.0]])), 8
+    mpc = km.KoopmanMPC(model, km.Cost([1, 1], [2, 30]), km.Limits([-1, -50], [1, 50]), N, solver="osqp")
+    assert mpc.coordinates == "plain"
+    np.testing.assert_allclose(np.diag(mpc._map.qp.P).reshape(N, 2).mean(axis=0), [1, 1], rtol=1e-12)
+
+
+def test_an_input_without_limits_between_others_acts_as_one_with_limits_that_nothing_meets():
+    A = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.1], [0.0, -0.2, 0.9]])
+    model, cost, x = linear(A, np.diag([0.1, 0.05, 0.2])), km.Cost([1, 1, 1], 0.01), [2.0, 1.0, -1.0]
+    free, far = (
+        km.KoopmanMPC(model, cost, km.Limits([-3, -end, -2], [3, end, 2], x_max=[9, 0.5, 9]), 15, solver="daqp")
+        for end in (np.inf, 40.0)
+    )
+    for k in range(10):
+        one, other = free(x, np.zeros(3)), far(x, np.zeros(3))
+        np.testing.assert_allclose(one.u, other.u, atol=1e-5)
+        assert k > 2 or one.status is not km.Status.UNCONSTRAINED
+        x = A @ x + model.B @ one.u

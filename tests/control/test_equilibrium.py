@@ -1,5 +1,7 @@
 """Equilibria near a guess are those of ipopt, with the same limits active; a moving load takes one step of Newton's."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -178,3 +180,19 @@ def test_one_step_goes_on_as_far_as_its_error_is_small_and_no_further(share: flo
     per_radian = np.abs(np.concatenate([a_little.x, a_little.u]) / SWING.size - s).max() / 0.001
     row = np.array([0.2 + share * reach / per_radian, 0.0])
     assert (SWING.follow(begin, row, np.zeros(2)) is not None) == goes_on
+
+
+def test_with_another_model_the_last_target_goes_on_from_where_it_was_without_ipopt(monkeypatch):
+    before, row = pendulum(), np.array([0.2, 0.0])
+    after = replace(before, A=before.A * np.where(before.A == 0.05, 1.02, 1.0))  # gravity
+
+    seen = state_tracking(before.states, before.nu, COST, km.Limits(-4, 4))
+    targets = TerminalTargets(learned_map(before), COST, seen, 300)
+    targets(np.array([0.7, 0.0]))
+    old = targets(row)
+    alone = TerminalTargets(learned_map(after), COST, seen, 300)(row)
+    monkeypatch.setattr(Equilibria, "find", None)
+    targets.update(learned_map(after))
+    assert np.abs(targets(row).u - old.u).max() > 1e-4
+    np.testing.assert_allclose(targets(row).u, alone.u, atol=1e-6)
+    np.testing.assert_allclose(targets(row).equilibrium.x, alone.equilibrium.x, atol=1e-6)

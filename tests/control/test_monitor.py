@@ -227,3 +227,17 @@ def test_a_bilinear_mpc_does_not_know_where_no_data_were(data):
         mpc.reset()
         mpc(x, [0.0, 0.0])
         assert mpc.watch.inside is inside
+
+
+def test_errors_near_rounding_count_as_a_billionth_of_the_states():
+    """W of the errors is that of their second moments plus (1e-9 of the size of each state)²."""
+    rng, A = np.random.default_rng(0), np.array([[0.9, 0.2], [-0.2, 0.8]])
+    X = [rng.uniform(-1, 1, 2) * [1.0, 100.0] for _ in range(200)]
+    own = [A @ x + rng.normal(size=2) * [3e-9, 1e-8] for x in X]
+    data = km.Episodes([km.Episode(X=np.array(pair), U=np.zeros((1, 1))) for pair in zip(X, own, strict=True)], DT)
+    model = km.LinearPredictor(A, np.zeros((2, 1)), np.eye(2), km.State(), DT, data.states, data.inputs)
+    monitor = km.control.Monitor.of(model, data)
+    E, rms = np.array(own) - np.array(X) @ A.T, np.sqrt(np.mean([e.X**2 for e in data], axis=(0, 1)))
+    expected = np.linalg.inv(E.T @ E / len(E) + np.diag((1e-9 * rms) ** 2))
+    got = monitor.band.T @ monitor.band
+    np.testing.assert_allclose(got / np.trace(got), expected / np.trace(expected), rtol=1e-6)

@@ -247,3 +247,22 @@ def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
         km.identify.Dissipation([1.0], decay=0)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
         km.identify.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.identify.Prior(), ridge=-1)
+
+
+def test_columns_that_depend_on_each_other_are_doubted_unless_a_ridge_was_asked_for() -> None:
+    data = random_episodes(0, [60], 2, 1)
+    double = km.Episodes([km.Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]]), U=e.U) for e in data], 0.1)
+    prior = km.identify.Prior(lower_A=-100.0)
+    with pytest.warns(km.FitWarning, match="1 of 3 observables are linear functions of others"):
+        km.identify.constrained_edmd(double, km.State(), prior=prior)
+    assert not km.identify.constrained_edmd(double, km.State(), prior=prior, ridge=1e-3).report.warnings
+
+
+def test_a_symmetry_that_the_plain_fit_has_needs_no_program() -> None:
+    data = linear(np.array([[0.9, 0.2], [0.2, -0.7]]), np.ones((2, 1)))
+    model = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(symmetric=True))
+    assert "linear algebra under priors" in model.report.route
+    skewed = linear(np.array([[0.9, 0.2], [0.201, -0.7]]), np.ones((2, 1)))
+    model = km.identify.constrained_edmd(skewed, km.State(), prior=km.identify.Prior(symmetric=True))
+    assert "Clarabel under priors" in model.report.route
+    assert np.array_equal(model.A, model.A.T)

@@ -158,3 +158,13 @@ def test_a_doubt_points_at_the_callers_line() -> None:
     with pytest.warns(km.FitWarning) as caught:
         km.edmd(data, km.State() + km.Monomials(2))
     assert {(Path(warning.filename).name, warning.lineno) for warning in caught} == {("test_doubts.py", line)}
+
+
+def test_three_dependent_columns_are_named_and_more_are_hinted_at() -> None:
+    data = random_episodes(0, [60], 1, 0)
+    for count in (3, 4):
+        X = [np.column_stack([(i + 1) * e.X[:, 0] for i in range(count + 1)]) for e in data]
+        _, sentences = warned(km.Episodes([km.Episode(X=each) for each in X], 0.1), km.State())
+        assert f"{count} of {count + 1} observables are linear functions of others" in sentences[0]
+        assert sentences[0].count(" of 'x") == 3
+        assert (", …)" in sentences[0]) == (count > 3)

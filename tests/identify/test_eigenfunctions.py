@@ -187,3 +187,10 @@ def test_bad_input_is_refused_in_a_sentence(one):
     (H,) = km.eigenfunctions(one, QUARTIC)
     with pytest.raises(km.KoopmpcError, match="φ is of 2 states, and there are 3"):
         H.bind(("a", "b", "c"))
+
+
+def test_an_error_as_large_as_the_tolerance_is_within_it(one):
+    found = km.eigenfunctions(one, QUARTIC, tolerance=10.0)
+    again = km.eigenfunctions(one, QUARTIC, tolerance=found[0].error)
+    assert again[0].error == found[0].error
+    assert len(again) + len(again.rejected) == len(found) + len(found.rejected)

@@ -221,8 +221,14 @@ def test_moments_of_other_liftings_do_not_add() -> None:
 
 
 @pytest.mark.parametrize("route", ["gram", "qr"])
-def test_an_observable_that_is_not_finite_is_named(route: str) -> None:
-    data = km.Episodes([km.Episode(X=[[1.0], [0.5], [0.0], [0.5]])], 0.1, ["x [m]"])
-    inverse = km.State() + km.Expressions(lambda x: [1 / x[0]], ["1/x"])
-    with pytest.raises(km.errors.DataError, match="the observable '1/x' is NaN, infinite"):
-        km.moments.second_moments(data, inverse, route=route)
+@pytest.mark.parametrize("k", [0, 3, 19])
+def test_by_either_route_the_observable_that_is_infinite_is_named_wherever_it_is(route: str, k: int) -> None:
+    x = np.linspace(1.0, 2.0, 21)
+    x[k] = 0.0
+    lifting = km.State() + km.Expressions(lambda x: [1 / x[0]], ["1/x"])
+    data = km.Episodes([km.Episode(X=x[:, None])], 0.1)
+    with (
+        np.errstate(divide="ignore"),
+        pytest.raises(km.errors.DataError, match="the observable '1/x' is NaN, infinite"),
+    ):
+        km.moments.second_moments(data, lifting, route=route)

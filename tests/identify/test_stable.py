@@ -243,3 +243,13 @@ def test_a_wrong_radius_or_ridge_is_refused() -> None:
         km.identify.stable_edmd(data, km.State(), radius=np.nan)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
         km.identify.stable_edmd(data, km.State(), ridge=-1)
+
+
+def test_the_size_of_the_data_does_not_change_how_near_the_descent_comes() -> None:
+    rng = np.random.default_rng(3)
+    A0, Z = 0.9 * rng.standard_normal((4, 4)), rng.standard_normal((30, 4))
+    misfit, start = Misfit(A0, Z.T @ Z), clipped(A0, 1.0)
+    least = misfit(nearest(misfit, 1.0, [start]))
+    assert least < 0.8 * misfit(start)
+    for size in (1e-12, 1e12):
+        assert misfit(nearest(Misfit(A0, size * Z.T @ Z), 1.0, [start])) == pytest.approx(least, rel=0.02)

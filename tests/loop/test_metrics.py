@@ -246,3 +246,9 @@ def test_the_running_cost_grows_by_the_cost_of_each_step_and_ends_at_the_runs(R_
         assert cost[k] - cost[k - 1] == pytest.approx(step)
     assert np.isnan(running_cost(replace(run, cost=None))).all()
     assert running_cost(replace(run, cost=None)).shape == (13,)
+
+
+def test_references_bear_the_names_of_what_is_tracked_where_these_are_known():
+    run = random_run(np.random.default_rng(0), cost=km.Cost(1, 1))
+    assert run.tracked(len(run.states)) == run.states
+    assert run.tracked(1) == ("reference 0",)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import warnings
+from collections import deque
 from contextlib import closing
 from pathlib import Path
 
@@ -278,3 +279,12 @@ def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys):
     assert paced.ended == "done"
     assert paced.steps + paced.skipped == 300
     assert 300 - paced.skipped <= km.load_run("rig.rrd").steps <= 300  # ticks that are skipped last have no row
+
+
+def test_the_report_tells_the_median_and_the_99_percent_quantile_of_the_delays():
+    paced = km.loop.Paced(steps=101, late=2, jitter=deque(np.linspace(0.0, 0.1, 101)))
+    assert str(paced).splitlines() == [
+        "101 steps, 2 late, 0 skipped, 0 held; ended: done",
+        "steps began 50.000 ms after their time at the median, 99.000 ms at the 99 % quantile",
+    ]
+    assert "nan ms" in str(km.loop.Paced())

@@ -95,7 +95,9 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _is_skipped(node: ast.AST) -> bool:
-    """Return whether a node is a union of types, an import for them, or a warning's words."""
+    """Return whether a node is a union of types, an import for them, a warning's words, or zip's assertion."""
+    if isinstance(node, ast.keyword) and node.arg == "strict":
+        return True
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
         return True
     if isinstance(node, ast.Call):

@@ -20,7 +20,7 @@ def f(x: "1 n" = 3, *, on=True) -> float | None:
         raise ValueError(f"{x + 1} is too small, ä")
     y = x - 1.5
     self.kept = y
-    print(max(x, y), isinstance(x, int | float))
+    print(max(x, y), isinstance(x, int | float), zip(x, strict=True))
     return y
 '''.encode()
 HEAD = 'def f(x: "1 n" = {}, *, on={}) -> float | None:'
@@ -37,7 +37,7 @@ EXPECTED = [
     "y = x - 3.0",
     "pass",
     "pass",
-    "print(min(x, y), isinstance(x, int | float))",
+    "print(min(x, y), isinstance(x, int | float), zip(x, strict=True))",
     "return None",
 ]
 

@@ -193,3 +193,12 @@ def test_bad_input_is_refused_in_a_sentence(data):
         km.train(lifting, km.Stream(iter([data])))
     with pytest.raises(km.errors.DataError, match="too short to hold a part of them out"):
         km.train(lifting, data[:1], horizon=12)
+
+
+def test_small_states_count_relative_to_their_size_as_in_the_score(data):
+    small = km.Episodes([km.Episode(X=1e-3 * e.X, U=e.U) for e in data], 0.1, data.states, data.inputs)
+    points = _drawn(source_of(small), 5, 200, np.random.default_rng(0)).all
+    tuning = Tuning((km.State() + km.Gaussian(1e-3 * CENTERS, 0.8e-3)).bind(data.states))
+    value, _ = VariableProjection(tuning, Windows.of(points, 5, 2), 1e-6)(np.zeros(tuning.n))
+    model = km.edmd(points, tuning.at(np.zeros(tuning.n)), ridge=1e-6)
+    assert np.exp(value) == pytest.approx(km.score(model, points, 5, stride=5).total, rel=1e-5)

@@ -141,7 +141,6 @@ class KoopmanMPC(MPCBase):
         self._qps = StepSolver(self._map.qp, [*choices, Choice(SOLVERS["osqp"], {}, late=True)])
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
-        self._reference = np.zeros((self._N + 1, len(track.tracked)))
         self._reference_key: bytes | None = None
         self._given_row, self._rows_left = 0, False  # of a u_target in rows: this step's, and whether more follow
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
@@ -252,7 +251,7 @@ class KoopmanMPC(MPCBase):
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
         """Write the reference's part of the plan into the matrix's last column: all NaN if a row is not finite."""
         plan, maps, found = self._map, self._map.maps, self._map.targets
-        R = self._reference = checks.reference_rows(reference, self._N, self._reference.shape[1], self._latency)
+        R = self._reference = checks.reference_rows(reference, self._N, len(plan.track.tracked), self._latency)
         given, column = plan.track.given, plan.matrix[:, -1]
         self._rows_left = given is not None and self._given_row + 1 < len(given)
         if not np.isfinite(R).all():

@@ -128,12 +128,10 @@ def _doubt(before: float, after: float) -> list[str]:
 
 def _losses(regression: Regression, plain: Float[np.ndarray, "n nz"], stable: Float[np.ndarray, "n nz"]) -> list[str]:
     """Return a sentence for each state: its one-step residual in the plain and in the stable model."""
-    pairs = zip(
-        *(regression.rows.residual(regression.x_next, regression.decoded(K)) for K in (plain, stable)), strict=True
-    )
+    losses = (regression.rows.residual(regression.x_next, regression.decoded(K)) for K in (plain, stable))
     return [
         f"one-step residual of {name!r}: {before:.3g} before, {after:.3g} after"
-        for name, (before, after) in zip(regression.states, pairs, strict=True)
+        for name, before, after in zip(regression.states, *losses, strict=True)
     ]
 
 

@@ -173,3 +173,24 @@ show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5})
 """
     )
     assert line == "DataError DAQP's iter_limit is 2.5; pass a whole number"
+
+
+def test_a_row_that_pushes_must_be_at_its_end():
+    """v = 3 − λ with |v| ≤ 1 and the price 10 of giving way: λ = 2 at v = 1 alone; elsewhere H v + q + λ = 0 is not enough."""
+    prices = Softness(10 * ONE, np.zeros(2), np.zeros(2))
+    solver = DAQP(QP(EYE, -3 * ONE, EYE, -ONE, ONE, prices))
+    solver._send(None)
+    assert solver._accurate(ONE, 2 * ONE)
+    for v in (0.0, 0.9, 1.1, 2.0):
+        assert not solver._accurate(np.array([v, 1.0]), np.array([3 - v, 2.0]))
+    assert not solver._accurate(ONE, np.array([2.0, 2.1]))  # no minimum of the cost
+
+
+def test_no_more_iterations_are_taken_than_are_asked_for():
+    qp = random_qp(np.random.default_rng(0), "hard", 60)
+    solver = DAQP(qp)
+    for limit in (0.0, 60.0):
+        for most in (5, 3, 8):
+            solver.reset()
+            solver._send(None)
+            assert solver._run(limit, most)[3] == most
