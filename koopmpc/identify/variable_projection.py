@@ -153,7 +153,7 @@ def _copied(lifting: Lifting, values: Iterator[Any], *, symbols: bool) -> Liftin
 
 @dataclass(frozen=True)
 class Windows:
-    """Pieces of N steps as arrays: what ψ acts on, with the states first; all inputs; 1 / (N nx Σ x²) of each state."""
+    """Pieces of N steps: X, what ψ acts on, the states first; V, all inputs; the weights 1 / (N nx Σ x²) of errors."""
 
     X: Float[np.ndarray, "M N1 np"]
     V: Float[np.ndarray, "M N nv"]

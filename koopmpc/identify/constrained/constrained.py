@@ -47,8 +47,8 @@ def constrained_edmd(
     prior
         The known entries, bounds and couplings of A and B, in the order of the lifting's observables and the inputs.
     ridge
-        Tikhonov weight as in `edmd`, on the free entries; in a row whose constant is known the columns keep their
-        mean. "gcv" chooses it for the fit without the prior.
+        Tikhonov weight as in `edmd`, on the free entries. In a row whose entry for the Constant is known, columns are
+        not taken as deviations from their mean. "gcv" chooses the ridge for the fit without the prior.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 

@@ -35,8 +35,8 @@ class _Solved(NamedTuple):
 class EigenfunctionRows:
     """The triangular factors of the data, from which the matrix of any λ follows.
 
-    R are those of [ψ(x⁺) or ψ̇, ψ(x), u₁ψ(x) …, u₁ψ(x⁺) …], G of ∇ψ in standard deviations of the states, `spread`.
-    `speed` [1/s] is the root-mean-square of ẋ in the same units.
+    R is the factor of [ψ(x⁺) or ψ̇, ψ(x), u₁ψ(x) …, u₁ψ(x⁺) …], G that of ∇ψ in standard deviations of the states,
+    which are `spread`. `speed` [1/s] is the root-mean-square of ẋ in these units.
     """
 
     lifting: Lifting

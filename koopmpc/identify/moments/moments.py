@@ -142,7 +142,7 @@ class Moments(Value):
     bilinear
         The rows are [ψ(x) u u⊗ψ(x) ψ(x⁺)]; a Constant is left out of the products, for u times it is u.
     embedding
-        Where ψ acts on ζ, what makes it.
+        The embedding that makes ζ, where ψ acts on ζ; else None.
     """
 
     lifting: Lifting
@@ -247,7 +247,7 @@ class Moments(Value):
     def decoder(self, where: Int[np.ndarray, " nx"]) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
         """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked.
 
-        `where` says which of the observables, with the appended states, is each state.
+        `where` holds the index of each state among the observables and the states appended to them.
         """
         nz = self.nz
         C, residual = np.zeros((len(where), nz)), np.zeros(len(where))

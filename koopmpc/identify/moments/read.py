@@ -208,7 +208,7 @@ def _summed(reading: _Reading, episodes: Episodes, which: Sequence[int] | None) 
 
 
 def _pilot(source: Source, reading: _Reading) -> tuple[_Sums, dict[int, tuple[int, ...]], bool]:
-    """Return Gram sums of chunks sampled from a few parts, which they are, part by part, and whether they are all."""
+    """Return Gram sums of chunks sampled from a few parts, their numbers by part, and whether they are all chunks."""
     parts = source.parts()
     if isinstance(parts, list):
         every = len(parts) <= _PILOT

@@ -23,7 +23,7 @@ class RowColumns:
     full
         ψ, then the states that it lacks.
     products
-        The observables in u⊗ψ(x): all but a Constant, for u times it is u; none where the model is not bilinear.
+        Indices of the observables in u⊗ψ(x): all but a Constant, since u · 1 is u; none unless the model is bilinear.
     names
         Name of each column.
     regressors

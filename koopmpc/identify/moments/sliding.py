@@ -12,10 +12,10 @@ from koopmpc.identify.moments.moments import Table, Triangle, absorb, empty
 class Forgetting:
     """The factor of all rows, each weighted by forgetting^age.
 
-    A row of R is one equation r·k = t of the triangular system R K = T. Forgetting multiplies it by √λ. Where no
-    new row speaks about its direction it would fade to nothing, and the next bit of noise would decide (wind-up). So
-    an equation whose information r_jj² falls below `keep` times the most that it ever was is forgotten no further: it
-    is scaled back to that floor, left side and right side together, which leaves K as it is.
+    A row of R is one equation r·k = t of the triangular system R K = T. Forgetting multiplies it by √λ. A direction
+    about which new rows say nothing would fade away, until noise alone decided it (wind-up). So an equation whose
+    information r_jj² falls below `keep` times its maximum so far is forgotten no further: it is scaled back to that
+    floor, left side and right side together, which leaves K as it is.
 
     Parameters
     ----------
@@ -63,12 +63,12 @@ class Forgetting:
 
 
 class Window:
-    """The factor of the last `length` rows, as of a queue made of two stacks: nothing is ever subtracted.
+    """The factor of the last `length` rows, kept like a queue made of two stacks: nothing is ever subtracted.
 
-    New blocks are absorbed at the back. For old ones the front holds one factor for each block: of it and all later
-    ones of the front, so the oldest leaves by dropping a factor. When the front is used up, the back becomes the
-    front. A row is absorbed twice in its life, errors do not add up over time, and it takes the memory of about
-    2 · length rows. Turning the back into the front takes one step that costs as much as `length` updates.
+    New blocks are absorbed at the back. For each old block the front holds one factor, that of the block and of all
+    later ones of the front, so that the oldest block leaves when its factor is dropped. When the front is used up, the
+    back becomes the front. Each row is absorbed twice, errors do not add up over time, and about 2 · length rows are
+    held in memory. Turning the back into the front takes one step that costs as much as `length` updates.
 
     Parameters
     ----------
