@@ -176,7 +176,7 @@ class Compiled:
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
-        """Have the C know the targets of these rows; only a BilinearMPC needs that."""
+        """Give the C the targets of these rows; only that of a BilinearMPC asks for them."""
         if self._targets is not None:
             self._aimed = rows.tobytes()
             self._table = self._targets.of(rows).astype(self._y.dtype)

@@ -243,7 +243,7 @@ def _measure_objects(root: Path, name: str) -> tuple[int, int, int] | None:
 
 
 def _readme(controller: Exportable, tables: Tables, measured: tuple[int, int, int] | None, precision: Precision) -> str:
-    """Return what there is to know of the folder."""
+    """Return the README of the folder: how to build and call the controller, its memory and its operations."""
     sizes, model, single = tables.sizes, tables.model, precision == "float"
     numbers_held = constants(tables) * (4 if single else 8)
     rows = [("constants", f"{numbers_held} bytes")]

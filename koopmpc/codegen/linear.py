@@ -176,7 +176,7 @@ def daqp_defaults() -> dict[str, Any]:
 
 
 def _shared(predictor: LinearPredictor, targets: Targets, inputs: Interval) -> Tables:
-    """Return the part that both have: sizes, the lifting, limits of the inputs, targets."""
+    """Return what an LQR and a KoopmanMPC have in common: sizes, the lifting, limits of the inputs, targets."""
     sizes = {
         "NX": predictor.nx,
         "NY": predictor.nx,

@@ -173,7 +173,7 @@ class DroppedSamples(_Windowed):
     probability: float
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
-        """Return the line of one run."""
+        """Return the connection of one run, which holds the last measurement that arrived."""
         arrived: list[Float[np.ndarray, " ny"]] = []  # the last measurement that arrived
 
         def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
@@ -183,6 +183,19 @@ class DroppedSamples(_Windowed):
             return arrived[0].copy()
 
         return Injection(measured=measured)
+
+
+def _delayed(
+    steps: int, before: list[Float[np.ndarray, " n"]]
+) -> Callable[[int, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
+    """Return a delay line that holds the signals `before`; until one is `steps` old it gives the oldest that it has."""
+    line: deque[Float[np.ndarray, " n"]] = deque(before, maxlen=steps + 1)
+
+    def late(k: int, signal: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        line.append(signal.copy())
+        return line[0].copy()
+
+    return late
 
 
 @dataclass(frozen=True)
@@ -195,14 +208,8 @@ class SensorDelay(Fault):
         checks.count(self.steps, "steps", 0)
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
-        """Return the line of one run."""
-        line: deque[Float[np.ndarray, " ny"]] = deque(maxlen=self.steps + 1)
-
-        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
-            line.append(y.copy())
-            return line[0].copy()
-
-        return Injection(measured=measured)
+        """Return the delay line of one run."""
+        return Injection(measured=_delayed(self.steps, []))
 
 
 @dataclass(frozen=True)
@@ -244,15 +251,9 @@ class ActuatorDelay(Fault):
         checks.count(self.steps, "steps", 0)
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
-        """Return the line of one run."""
+        """Return the delay line of one run."""
         rest = np.clip(np.zeros(len(wiring.inputs.low)), *wiring.inputs)
-        line: deque[Float[np.ndarray, " nu"]] = deque([rest] * self.steps, maxlen=self.steps + 1)
-
-        def applied(k: int, u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
-            line.append(u.copy())
-            return line[0].copy()
-
-        return Injection(applied=applied)
+        return Injection(applied=_delayed(self.steps, [rest] * self.steps))
 
 
 @dataclass(frozen=True)
