@@ -114,6 +114,34 @@ def test_the_controller_that_stands_by_takes_over_where_the_model_does_not_know(
     assert km.metrics(found).fallback["OTHER_CONTROLLER"] == len(other)
 
 
+class Scripted:
+    """A controller that returns its own number, and knows what it is told to."""
+
+    dt, nu, horizon = 0.1, 1, 0
+
+    def __init__(self, own, known):
+        self.own, self.told = own, known
+
+    def reset(self, x0=None, u_prev=None):
+        self.left = iter(self.told)
+
+    def __call__(self, y, reference, applied=None, w=None):
+        known = next(self.left, None)
+        return km.Move(np.array([self.own]), km.Status.OPTIMAL, km.control.Fallback.NONE, 0.25, 1, known=known)
+
+
+def test_only_so_many_unknown_steps_in_sequence_hand_over_and_as_many_known_ones_back():
+    known = [bool(int(digit)) for digit in "0010010001101110000"]
+    acting = [int(digit) for digit in "0000000011111100011"]  # 1: the one that stands by
+    guarded = km.control.Guarded(Scripted(0.0, known), Scripted(1.0, ()), patience=3)
+    for _ in range(2):
+        guarded.reset()
+        moves = [guarded([0.0], [0.0]) for _ in known]
+        assert [int(move.u[0]) for move in moves] == acting
+        assert [move.known for move in moves] == known
+        assert {move.solve_time for move in moves} == {0.5}  # of both
+
+
 def test_guarded_controllers_must_agree_and_the_first_must_say_what_it_knows(model, train):
     first, other = km.KoopmanMPC(model, COST, LIMITS, HORIZON), km.LQR(model, COST, LIMITS)
     with pytest.raises(km.errors.DataError, match="does not say whether it knows; give it monitor=data"):

@@ -199,6 +199,18 @@ def test_the_tail_of_a_learned_model_ends_where_its_gain_rests_as_far_as_the_mod
     assert n < 80
 
 
+@pytest.mark.parametrize("offset", [3.0, 40.0])
+def test_the_origin_of_the_states_does_not_matter_to_the_tail(offset):
+    _, data = learned(0, 3e-2, km.State())
+    moved = km.Episodes([km.Episode(X=e.X + offset, U=e.U) for e in data], data.dt, data.states, data.inputs)
+    here, there = (
+        km.KoopmanMPC(km.edmd(each, km.State() + km.Constant()), km.Cost(Q=[10, 1], R=0.1, u_target=[0.0]), horizon=8)
+        for each in (data, moved)
+    )
+    x, r = np.array([0.7, -0.3]), np.array([0.2, 0.0])
+    np.testing.assert_allclose(there(x + offset, r + offset).u, here(x, r).u, rtol=1e-7)
+
+
 def test_a_model_without_errors_has_the_tail_of_a_given_one():
     rng = np.random.default_rng(1)
     A, B = random_pair(rng, 3, 1, radius=1.1)
