@@ -120,6 +120,8 @@ while os.getppid() == int(sys.argv[1]):
 @pytest.mark.parametrize("name", BUILD)
 @pytest.mark.parametrize("least", [20, pytest.param(2000, marks=pytest.mark.slow)])
 def test_a_rain_of_interrupts_is_raised_one_by_one_and_the_controller_goes_on(controllers, name, least):  # noqa: F811
+    if sys.gettrace() is not None:
+        pytest.skip("an interrupt in coverage's own lock leaves it locked for ever")
     (controller, _), rng = controllers[name], random.Random(name)
     raised = caught = 0
     listens = False
