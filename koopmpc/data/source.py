@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from typing import cast
 
@@ -13,12 +14,35 @@ from koopmpc.values import Named
 EpisodesMap = Callable[[Episodes], Episodes]
 
 
-class Part(ABC):
-    """A share of a source; ``str(part)`` says in messages where it is from."""
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A share of a source: where it is from, in words for messages, and what loads its episodes.
 
-    @abstractmethod
-    def load(self) -> Episodes:
-        """Return the episodes of the part; a part that pickles can be loaded in another process."""
+    `load` pickles, so that a part can be loaded in another process.
+    """
+
+    place: str
+    load: Callable[[], Episodes]
+
+    def __str__(self) -> str:
+        return self.place
+
+    @classmethod
+    def held(cls, episodes: Episodes, place: str) -> "Part":
+        """Return a part that is in memory."""
+        return cls(place, partial(_same, episodes))
+
+    def changed(self, change: EpisodesMap) -> "Part":
+        """Return a part whose episodes go through `change` when it is loaded."""
+        return Part(self.place, partial(_changed, self.load, change))
+
+
+def _same(episodes: Episodes) -> Episodes:
+    return episodes
+
+
+def _changed(load: Callable[[], Episodes], change: EpisodesMap) -> Episodes:
+    return change(load())
 
 
 class Source(Named, ABC):
@@ -82,7 +106,7 @@ class Held(Source):
 
     def parts(self, history: int = 0) -> list[Part]:
         """Return a list of the one part."""
-        return [Loaded(self.episodes, "these data")]
+        return [Part.held(self.episodes, "these data")]
 
 
 class Changed(Source):
@@ -116,38 +140,8 @@ class Changed(Source):
     def parts(self, history: int = 0) -> Iterable[Part]:
         """Return the parts in order."""
         parts = self.source.parts(history + self.history)
-        changed = (ChangedPart(part, self.change) for part in parts)
+        changed = (part.changed(self.change) for part in parts)
         return list(changed) if isinstance(parts, Sized) else changed
-
-
-@dataclass(frozen=True, eq=False)
-class Loaded(Part):
-    """A part that is in memory."""
-
-    episodes: Episodes
-    place: str
-
-    def __str__(self) -> str:
-        return self.place
-
-    def load(self) -> Episodes:
-        """Return the episodes, which are in memory."""
-        return self.episodes
-
-
-@dataclass(frozen=True, eq=False)
-class ChangedPart(Part):
-    """A part whose episodes go through `change` when it is loaded."""
-
-    part: Part
-    change: EpisodesMap
-
-    def __str__(self) -> str:
-        return str(self.part)
-
-    def load(self) -> Episodes:
-        """Return the changed episodes."""
-        return self.change(self.part.load())
 
 
 def source_of(given: object) -> Source:
@@ -220,12 +214,12 @@ class Stream(Source):
             self._plant.check(_set(one, place), place)
             own = sum(e.X.nbytes + e.U.nbytes + e.W.nbytes for e in one)
             if held and size + own > _PART:
-                yield Loaded(joined(held), _place(start, len(held)))
+                yield Part.held(joined(held), _place(start, len(held)))
                 held, start, size = [], i, 0
             held.append(one)
             size += own
         if held:
-            yield Loaded(joined(held), _place(start, len(held)))
+            yield Part.held(joined(held), _place(start, len(held)))
 
 
 def _set(given: object, place: str) -> Episodes:

@@ -67,20 +67,11 @@ def work(page: Page, quick: bool, tell: Tell) -> list[Claim]:
         assert trained.report is not None
         changes.append(trained.report.changes[-1])
     errors = {name: np.array([_error(model, unseen) for model in models]) for name, models in found.items()}
+    columns = [errors["25 fixed"], widths["25 fixed"], errors["25 trained"], errors["100 fixed"], widths["100 fixed"]]
     page.text("## Errors on unseen trajectories", "One row for each draw of the centres.")
     page.table(
         ("25 fixed [%]", "their width", "25 trained [%]", "100 fixed [%]", "their width"),
-        [
-            (percent(a), w, percent(b), percent(c), v)
-            for a, w, b, c, v in zip(
-                errors["25 fixed"],
-                widths["25 fixed"],
-                errors["25 trained"],
-                errors["100 fixed"],
-                widths["100 fixed"],
-                strict=True,
-            )
-        ],
+        [(percent(a), w, percent(b), percent(c), v) for a, w, b, c, v in zip(*columns, strict=True)],
     )
     page.items(changes)
     centers = np.random.default_rng(10).uniform(-2, 2, (MANY, 2))

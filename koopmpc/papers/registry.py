@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
@@ -226,14 +227,6 @@ def find_paper(name: str) -> Paper:
     return next(each for each in vars(module).values() if isinstance(each, Paper) and each.name == name)
 
 
-class PaperTask(NamedTuple):
-    """A paper to reproduce in a folder, by its name, so that it can go to another process."""
-
-    name: str
-    folder: Path
-    quick: bool
-
-
 class TimedReproduction(NamedTuple):
     """A paper done again, and how long that took [s]."""
 
@@ -242,11 +235,11 @@ class TimedReproduction(NamedTuple):
     seconds: float
 
 
-def reproduced(task: PaperTask) -> TimedReproduction:
-    """Reproduce one paper."""
+def reproduced(name: str, folder: Path, quick: bool) -> TimedReproduction:
+    """Reproduce the paper of this name."""
     start = perf_counter()
-    outcome = find_paper(task.name).reproduce(task.folder, task.quick, lambda words: None)
-    return TimedReproduction(task.name, outcome, perf_counter() - start)
+    outcome = find_paper(name).reproduce(folder, quick, lambda words: None)
+    return TimedReproduction(name, outcome, perf_counter() - start)
 
 
 def reproduce_all(folder: Path, quick: bool, tell: Tell, workers: int = 2) -> list[TimedReproduction]:
@@ -261,8 +254,8 @@ def reproduce_all(folder: Path, quick: bool, tell: Tell, workers: int = 2) -> li
     def progress(done: int, total: int | None) -> None:
         tell(f"{done} of {total} papers done")
 
-    tasks = [PaperTask(name, folder, quick) for name in PAPERS]
-    found = list(map_tasks(reproduced, tasks, workers=workers, progress=progress))
+    task = partial(reproduced, folder=folder, quick=quick)
+    found = list(map_tasks(task, PAPERS, workers=workers, progress=progress))
     page = Page(folder)
     page.text(
         "# Papers, done again",

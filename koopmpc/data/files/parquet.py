@@ -6,7 +6,7 @@ A group of rows is read without the rest of the file, so that a fit never holds 
 
 import json
 import zlib
-from dataclasses import dataclass
+from functools import partial
 from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -146,11 +146,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     return X, _stacked(table, named["inputs"] + named.get("disturbances", []))[~last], steps, about
 
 
-@dataclass(frozen=True, eq=False)
-class RowGroup(Part):
-    """Stretches of the episodes of one file, whose pairs end in one group of its rows.
+def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignature | None, place: str) -> Episodes:
+    """Return stretches of the episodes of a file as episodes of their own; only the groups with their rows are read.
 
-    Attributes
+    Parameters
     ----------
     file
         A file that `Episodes.save` wrote.
@@ -158,47 +157,39 @@ class RowGroup(Part):
         (first row, steps) of each.
     plant
         The sample time and names that the file must have; None for the first file, which defines them.
+    place
+        The file and its rows, for messages.
     """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    file: Path
-    stretches: tuple[tuple[int, int], ...]
-    plant: PlantSignature | None
-
-    def __str__(self) -> str:
-        return f"{self.file} (rows {self.stretches[0][0]} to {sum(self.stretches[-1])})"
-
-    def load(self) -> Episodes:
-        """Return the stretches as episodes of their own; only the groups that hold their rows are read."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        first, last = self.stretches[0][0], sum(self.stretches[-1])
-        try:
-            with pq.ParquetFile(self.file, page_checksum_verification=True) as held:
-                ends = np.cumsum([held.metadata.row_group(i).num_rows for i in range(held.num_row_groups)])
-                groups = np.arange(np.searchsorted(ends, first, "right"), np.searchsorted(ends, last, "right") + 1)
-                table = held.read_row_groups(groups.tolist())
-            named = json.loads(table.schema.metadata[_KEY])
-            disturbances = named.get("disturbances", [])
-            X, U, W = (_stacked(table, some) for some in (named["states"], named["inputs"], disturbances))
-            episode, step = (table[name].to_numpy() for name in ("episode", "step"))
-            before = int(ends[groups[0] - 1]) if groups[0] else 0
-            found: list[Episode] = []
-            for row, steps in self.stretches:
-                a, b = row - before, row - before + steps
-                if np.ptp(episode[a : b + 1]) or (np.diff(step[a : b + 1]) != 1).any():
-                    raise ValueError("rows are missing or out of order")
-                found.append(Episode(X=X[a : b + 1], U=U[a:b], W=W[a:b]))
-            _verify(table, named, before, int(ends[-1]))
-            episodes = Episodes(found, named["dt"], named["states"], named["inputs"], disturbances)
-        except (KeyError, IndexError, TypeError, ValueError, OSError, pa.ArrowException) as error:
-            raise LogError(f"{self} holds no episodes that can be read: {error}") from error
-        if self.plant is not None:
-            self.plant.check(episodes, str(self.file))
-        return episodes
+    first, last = stretches[0][0], sum(stretches[-1])
+    try:
+        with pq.ParquetFile(file, page_checksum_verification=True) as held:
+            ends = np.cumsum([held.metadata.row_group(i).num_rows for i in range(held.num_row_groups)])
+            groups = np.arange(np.searchsorted(ends, first, "right"), np.searchsorted(ends, last, "right") + 1)
+            table = held.read_row_groups(groups.tolist())
+        named = json.loads(table.schema.metadata[_KEY])
+        disturbances = named.get("disturbances", [])
+        X, U, W = (_stacked(table, some) for some in (named["states"], named["inputs"], disturbances))
+        episode, step = (table[name].to_numpy() for name in ("episode", "step"))
+        before = int(ends[groups[0] - 1]) if groups[0] else 0
+        found: list[Episode] = []
+        for row, steps in stretches:
+            a, b = row - before, row - before + steps
+            if np.ptp(episode[a : b + 1]) or (np.diff(step[a : b + 1]) != 1).any():
+                raise ValueError("rows are missing or out of order")
+            found.append(Episode(X=X[a : b + 1], U=U[a:b], W=W[a:b]))
+        _verify(table, named, before, int(ends[-1]))
+        episodes = Episodes(found, named["dt"], named["states"], named["inputs"], disturbances)
+    except (KeyError, IndexError, TypeError, ValueError, OSError, pa.ArrowException) as error:
+        raise LogError(f"{place} holds no episodes that can be read: {error}") from error
+    if plant is not None:
+        plant.check(episodes, str(file))
+    return episodes
 
 
-def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[RowGroup] | None:
+def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[Part] | None:
     """Return a part for each group of rows of the file, in order; None where it is a plain table or damaged.
 
     No pair is lost or comes twice: x_k → x_{k+1} belongs to the group that holds x_{k+1}. A stretch that begins inside
@@ -220,7 +211,7 @@ def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[R
     except (KeyError, TypeError, ValueError, OSError, pa.ArrowException):
         return None
     ends = np.cumsum(counts)
-    parts: list[RowGroup] = []
+    parts: list[Part] = []
     for stop, length in zip(np.cumsum(lengths).tolist(), lengths, strict=True):
         stretches: list[tuple[int, int]] = []
         first, last = (int(np.searchsorted(ends, row, "right")) for row in (stop - length, stop - 1))
@@ -231,7 +222,8 @@ def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[R
             if steps > history:
                 stretches.append((start, steps))
         if stretches:
-            parts.append(RowGroup(file, tuple(stretches), plant))
+            place = f"{file} (rows {stretches[0][0]} to {sum(stretches[-1])})"
+            parts.append(Part(place, partial(_read_rows, file, stretches, plant, place)))
     return parts
 
 

@@ -3,7 +3,6 @@
 import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from filecmp import cmp
 from functools import partial
 from importlib import import_module
@@ -16,7 +15,7 @@ import numpy as np
 from koopmpc import disk
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature, joined
 from koopmpc.data.files import csv, parquet
-from koopmpc.data.files.parquet import RowGroup, row_groups
+from koopmpc.data.files.parquet import row_groups
 from koopmpc.data.files.tables import Told, read_table
 from koopmpc.data.source import Part, Source
 from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
@@ -202,7 +201,7 @@ class Files(Source):
             size = file.stat().st_size
             cut = self._cut(file, history, self._signature)
             if group and (cut or size > room):
-                parts.append(FilePart(tuple(group), self._reader, self._signature))
+                parts.append(_together(tuple(group), self._reader, self._signature))
                 group, room = [], _PART
             if cut:
                 parts += cut
@@ -210,35 +209,30 @@ class Files(Source):
                 group.append(file)
                 room -= size
         if group:
-            parts.append(FilePart(tuple(group), self._reader, self._signature))
+            parts.append(_together(tuple(group), self._reader, self._signature))
         return parts
 
-    def _cut(self, file: Path, history: int, plant: PlantSignature | None) -> list[RowGroup] | None:
+    def _cut(self, file: Path, history: int, plant: PlantSignature | None) -> list[Part] | None:
         """Return the parts of a large file that can be read in groups of rows."""
         if not self._plain or file.suffix != ".parquet" or file.stat().st_size < _LARGE:
             return None
         return row_groups(file, history, plant)
 
 
-@dataclass(frozen=True, eq=False)
-class FilePart(Part):
-    """Several files that are read together as one part."""
+def _together(files: tuple[Path, ...], reader: Reader, plant: PlantSignature) -> Part:
+    """Return several files as one part."""
+    first, *others = files
+    more = f" and {len(others)} files after it" if others else ""
+    return Part(f"{first}{more}", partial(_read_together, files, reader, plant))
 
-    files: tuple[Path, ...]
-    reader: Reader
-    plant: PlantSignature
 
-    def __str__(self) -> str:
-        more = len(self.files) - 1
-        return f"{self.files[0]}{f' and {more} files after it' if more else ''}"
-
-    def load(self) -> Episodes:
-        """Return the episodes of the files; an error names the file."""
-        sets: list[Episodes] = []
-        for file in self.files:
-            sets.append(_read_folder(file, self.reader))
-            self.plant.check(sets[-1], str(file))
-        return joined(sets)
+def _read_together(files: tuple[Path, ...], reader: Reader, plant: PlantSignature) -> Episodes:
+    """Return the episodes of the files; an error names the file."""
+    sets: list[Episodes] = []
+    for file in files:
+        sets.append(_read_folder(file, reader))
+        plant.check(sets[-1], str(file))
+    return joined(sets)
 
 
 def _read_folder(file: Path, reader: Reader) -> Episodes:

@@ -164,10 +164,12 @@ def sparse_edmd(
     K = linear(few, Entries(known, np.full_like(known, -np.inf), np.full_like(known, np.inf)), 0.0)
     dropped = [names[int(i)] for i in np.flatnonzero(~kept)]
     plain = solve(rows).K[:, stay]
+    whole = np.zeros((len(used), len(stay)))
+    whole[columns] = K
     changes = [
         f"{len(dropped)} of {nz} observables dropped" + (f": {', '.join(dropped)}" if dropped else ""),
         f"{int(np.isnan(known).sum())} of {known.size} entries of [A B] are not zero",
-        growth(RegressionRows(rows.P, few.T, few.rest, rows.samples), _spread(K, columns, len(used)), plain),
+        growth(RegressionRows(rows.P, few.T, few.rest, rows.samples), whole, plain),
     ]
     assert regression.C is not None, "an extended regression has its C"
     place = {name: i for i, name in enumerate(picked.names)}
@@ -208,10 +210,3 @@ def _closed(
         if not more.any():
             return used, worst
         kept |= more
-
-
-def _spread(K: Float[np.ndarray, "c k"], columns: np.ndarray, n: int) -> Float[np.ndarray, "n k"]:
-    """Return the rows of K at `columns` of n rows, all others zero."""
-    whole = np.zeros((n, len(K.T)))
-    whole[columns] = K
-    return whole
