@@ -70,7 +70,7 @@ def test_it_equals_cvxpy_along_a_closed_loop(name, nu):
     x, statuses = np.array([0.9, -0.5]), []
     t = np.arange(60)
     signal = np.column_stack([0.5 * np.sign(np.sin(0.5 * t)), 0.3 * np.cos(0.3 * t)])
-    for k in range(9):
+    for k in range(6):
         rows = signal[k : k + N + 1]
         move = mpc(x, rows)
         found = oracle(model, cost, limits, x, rows)
