@@ -271,16 +271,16 @@ def condense(
     most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
     chosen, deviation, hessian = _coordinates(W, n, coordinates, most)
     maps = Condensed(
-        v[:, :nx],
-        W @ (reference / unit),
-        W @ (target / unit),
-        W @ (given / unit),
-        v[:, nx : nx + nf - 1],
-        v[:, nx + nf - 1],
-        deviation,
-        hessian,
-        unit,
-        chosen,
+        from_state=v[:, :nx],
+        from_reference=W @ (reference / unit),
+        from_target=W @ (target / unit),
+        from_given=W @ (given / unit),
+        from_drive=v[:, nx : nx + nf - 1],
+        offset=v[:, nx + nf - 1],
+        deviation=deviation,
+        hessian=hessian,
+        unit=unit,
+        coordinates=chosen,
     )
     return _of_model(maps, h, units)
 

@@ -204,33 +204,31 @@ class StageTargets(NamedTuple):
 def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int, ...]) -> StagedProblem:
     """Return the problem of a horizon that is cut into blocks of held inputs."""
     o, N, F = outputs, sum(blocks), model.F
-    x_sizes, u_sizes = point_sizes(model, o), o.sizes.inputs
     starts = np.cumsum([0, *blocks[:-1]])
     free = np.zeros(N, dtype=np.bool_)
     free[starts] = True
-    held_from = np.repeat(starts, blocks)
     nx, nu = F.size1_in(0), F.size1_in(1)
+    plain = StagedProblem(
+        F=F,
+        tracked=o.tracked,
+        limited=o.limited,
+        Q=o.Q,
+        R=o.R,
+        inputs=o.inputs,
+        box=o.outputs,
+        softness=o.softness,
+        free=free,
+        held_from=np.repeat(starts, blocks),
+        with_rates=False,
+        soft_rates=np.zeros(0, dtype=np.intp),
+        nx=nx,
+        sizes=point_sizes(model, o),
+        input_sizes=o.sizes.inputs,
+        margin=ahead(o.margin, N),
+        scale=o.sizes.scale,
+    )
     if not o.with_rates and len(blocks) == N:
-        none = np.zeros(0, dtype=np.intp)
-        return StagedProblem(
-            F,
-            o.tracked,
-            o.limited,
-            o.Q,
-            o.R,
-            o.inputs,
-            o.outputs,
-            o.softness,
-            free,
-            held_from,
-            False,
-            none,
-            nx,
-            x_sizes,
-            u_sizes,
-            ahead(o.margin, N),
-            o.sizes.scale,
-        )
+        return plain
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates
     given = np.isfinite(rates.low) | np.isfinite(rates.high)
@@ -244,25 +242,20 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
     after = ca.Function("F", [sym, v, theta], [ca.vertcat(F(sym[:nx], u, theta), u, v[soft.tolist(), 0])])
     s = ca.SX.sym("s", ns)
     x, last = s[:nx], s[nx : nx + nu]
-    hard = np.full(nu, np.inf), np.zeros(nu), SOFTENED * u_sizes
-    return StagedProblem(
-        after.expand("F") if F.is_a("SXFunction") else after,
-        ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
-        ca.Function("limited", [s], [ca.vertcat(last, s[nx + nu :], o.limited(x))]),
-        block_diag(o.Q, o.R),
-        np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
-        Interval(low, high),
-        Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.outputs[i]]) for i in (0, 1))),
-        Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1, 2))),
-        free,
-        held_from,
-        True,
-        soft,
-        ns,
-        np.concatenate([x_sizes, u_sizes, u_sizes[soft]]),
-        u_sizes,
-        ahead(o.margin, N),
-        o.sizes.scale,
+    hard = np.full(nu, np.inf), np.zeros(nu), SOFTENED * plain.input_sizes
+    return plain._replace(
+        F=after.expand("F") if F.is_a("SXFunction") else after,
+        tracked=ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
+        limited=ca.Function("limited", [s], [ca.vertcat(last, s[nx + nu :], o.limited(x))]),
+        Q=block_diag(o.Q, o.R),
+        R=np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
+        inputs=Interval(low, high),
+        box=Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.outputs[i]]) for i in (0, 1))),
+        softness=Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1, 2))),
+        with_rates=True,
+        soft_rates=soft,
+        nx=ns,
+        sizes=np.concatenate([plain.sizes, plain.input_sizes, plain.input_sizes[soft]]),
     )
 
 
