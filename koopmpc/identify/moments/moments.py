@@ -262,7 +262,7 @@ class Moments(Value):
 
     def _constant(self, regressors: Int[np.ndarray, " n"]) -> int | None:
         place = np.flatnonzero(regressors == self.lifting.constant_index)
-        return int(place[0]) if self.lifting.constant_index is not None and place.size else None
+        return int(place[0]) if place.size else None
 
     def _gram(self) -> Float[np.ndarray, "nd nd"]:
         return self.sums if self.route == "gram" else self.sums.T @ self.sums

@@ -194,3 +194,12 @@ def test_no_more_iterations_are_taken_than_are_asked_for():
             solver.reset()
             solver._send(None)
             assert solver._run(limit, most)[3] == most
+
+
+def test_the_metric_of_hard_rows_is_as_large_as_the_cost():
+    """AᵀA of the hard rows alone, of all rows where none is hard, with the trace of P."""
+    A, P, none = np.array([[1.0, 2.0], [0.0, 3.0], [5.0, 1.0]]), np.diag([4.0, 6.0]), np.zeros(3)
+    for linear, rows in (([np.inf, np.inf, 9.0], A[:2]), ([9.0, 9.0, 9.0], A)):
+        solver = DAQP(QP(P, ONE, A, none - 1, none + 1, Softness(np.array(linear), none + 1, none)))
+        gram = rows.T @ rows
+        np.testing.assert_allclose(solver._metric(), gram * 10.0 / np.trace(gram), rtol=1e-12)
