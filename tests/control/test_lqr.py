@@ -133,3 +133,14 @@ def test_a_measured_disturbance_moves_the_target():
         km.errors.ShapeError, match=r"w has shape \(2,\), the predictor has 1 disturbances; pass one value"
     ):
         lqr(x, held, w=[0, 0])
+
+
+@pytest.mark.parametrize("gain", [km.dlqr, km.lqr])
+def test_a_mode_on_the_boundary_that_the_cost_does_not_see_has_no_gain(gain):
+    """The Riccati equation has a solution, under which the mode stays where it is."""
+    for A_, Q in (
+        (np.diag([1.0 if gain is km.dlqr else 0.0, -0.5]), [0.0, 1.0]),
+        (np.array([[0.0, 1.0], [-1.0, 0.0]]), [0.0, 0.0]),
+    ):
+        with pytest.raises(km.errors.DataError, match="Q does not see a mode on the stability boundary"):
+            gain(A_, [[1.0 if Q[1] else 0.0], [1.0]], Q, 1.0)

@@ -89,3 +89,34 @@ def test_a_hundred_thousand_random_qps_through_whole_controllers():
     lines = [f"{' '.join(key):40s} {n}" for key, n in sorted(seen.items())]
     lines += [f"worst {' '.join(key):20s} {value:.2g}" for key, value in worst.items()]
     sys.stdout.write("\n" + "\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("solver", ["osqp", "daqp"])
+def test_failed_steps_apply_the_last_plan_step_by_step_also_where_moves_are_held(solver):
+    A, B = np.array([[1.02, 0.1], [0.05, 1.01]]), np.array([[0.005], [0.1]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "v"), ("u",))
+    mpc = km.KoopmanMPC(model, km.Cost([1, 0.2], 0.1), km.Limits(-0.9, 0.9), 10, moves=(1, 2, 3, 4), solver=solver)
+    x = [0.5, -0.3]
+    assert mpc(x, [0, 0]).status is km.Status.OPTIMAL
+    U = mpc.plan().U
+    assert len(np.unique(U)) == 4  # four moves for ten steps
+    mpc.solver_fails = True
+    for u in U[1:]:
+        move = mpc(x, [0, 0])
+        assert (move.status, move.fallback) == (km.Status.FAILED, km.control.Fallback.SHIFTED_PLAN)
+        assert np.array_equal(move.u, u)
+    assert mpc(x, [0, 0]).fallback is km.control.Fallback.CLIPPED_LQR
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [0, 1])
+def test_lqr_holds_its_input_where_a_reference_is_no_number_in_one_place(bad, place):
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "v"), ("u",))
+    lqr = km.LQR(model, km.Cost(Q=[1, 1], R=0.1), km.Limits(-1, 1))
+    reference = np.zeros(2)
+    reference[place] = bad
+    before = lqr([0.1, 0.0], [0.0, 0.0]).u
+    move = lqr([0.1, 0.0], reference)
+    assert move.status is km.Status.BAD_MEASUREMENT
+    assert np.array_equal(move.u, before)
