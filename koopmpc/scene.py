@@ -1,12 +1,16 @@
-"""Shapes of a scene: plain data that a problem returns and the recording draws; SI units, y up."""
+"""Shapes of a scene: plain data that a problem returns and the recording draws; SI units.
+
+A scene lies in the plane, of points (x, y) with y up, or in space, of points (x, y, z) with z up; never in both.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
-Point = tuple[float, float]
+Point = Sequence[float] | Real[np.ndarray, " d"]
 Color = tuple[int, int, int]
 
 
@@ -15,30 +19,54 @@ class Line:
     """A polyline through `points` [m], `width` [m] wide."""
 
     name: str
-    points: Sequence[Point]
+    points: Sequence[Point] | Real[np.ndarray, "n d"]
     width: float = 0.03
     color: Color = (70, 90, 110)
+
+    def __post_init__(self) -> None:
+        _store(self, "points")
 
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle of `size` (width, height) [m] about `center` [m], turned by `angle` [rad] counter-clockwise."""
+    """A rectangle of `size` (width, height) [m] about `center` [m], turned by `angle` [rad] counter-clockwise.
+
+    In space a cuboid of `size` along x, y and z; `angle` turns it about the vertical or, of three numbers, about the
+    axis in which they point, by their length [rad].
+    """
 
     name: str
     center: Point
     size: Point
-    angle: float = 0.0
+    angle: float | Point = 0.0
     color: Color = (70, 90, 110)
+
+    def __post_init__(self) -> None:
+        _store(self, "center", "size", "angle")
 
 
 @dataclass(frozen=True)
 class Disk:
-    """A disk of `radius` [m] about `center` [m]."""
+    """A disk of `radius` [m] about `center` [m]; in space a ball."""
 
     name: str
     center: Point
     radius: float
     color: Color = (200, 90, 40)
+
+    def __post_init__(self) -> None:
+        _store(self, "center")
+
+
+def _store(shape: Any, *names: str) -> None:
+    """Store points as tuples, those of arrays too, so that shapes compare as plain data."""
+    for name in names:
+        object.__setattr__(shape, name, _plain(getattr(shape, name)))
+
+
+def _plain(value: Any) -> Any:
+    plain = value.tolist() if isinstance(value, np.ndarray) else value
+    return tuple(map(_plain, cast("list[Any]", plain))) if isinstance(plain, list | tuple) else plain
 
 
 Shape = Line | Box | Disk

@@ -40,10 +40,7 @@ class Furuta(km.Dynamics):
         return ca.vertcat(turn, rate, (J * arm - h * C * fall) / det, (outer * fall - h * C * arm) / det)
 
     def scene(self, x: np.ndarray, u: np.ndarray) -> list[km.scene.Shape]:
-        """Draw arm and pendulum as seen from 30° above, the circle of the arm's end, and the torque as an arc."""
-
-        def seen(p: np.ndarray) -> tuple[float, float]:
-            return float(p[0]), float(0.5 * p[1] + 0.866 * p[2])
+        """Draw arm and pendulum in space, the circle of the arm's end, and the torque as an arc."""
 
         def around(angle: float, radius: float) -> np.ndarray:
             return np.array([radius * np.sin(angle), -radius * np.cos(angle), 0.0])
@@ -52,14 +49,14 @@ class Furuta(km.Dynamics):
         sideways = np.array([np.cos(arm), np.sin(arm), 0.0])
         end = around(arm, self.L)
         tip = end + 2 * self.l * (np.sin(theta) * sideways + np.array([0.0, 0.0, np.cos(theta)]))
-        ring = [seen(around(a, self.L)) for a in np.linspace(-np.pi, np.pi, 49)]
+        ring = [around(a, self.L) for a in np.linspace(-np.pi, np.pi, 49)]
         sweep = np.linspace(0.0, float(np.clip(u[0] / 0.3, -1, 1)) * np.pi, 20)
         return [
             km.scene.Line("circle", ring, width=0.004, color=(150, 160, 170)),
-            km.scene.Line("torque", [seen(around(a, 0.08)) for a in sweep], width=0.012, color=(40, 120, 200)),
-            km.scene.Line("arm", [(0.0, 0.0), seen(end)], width=0.015),
-            km.scene.Line("pendulum", [seen(end), seen(tip)], width=0.012, color=(120, 130, 150)),
-            km.scene.Disk("tip", seen(tip), 0.02),
+            km.scene.Line("torque", [around(a, 0.08) for a in sweep], width=0.012, color=(40, 120, 200)),
+            km.scene.Line("arm", [0 * end, end], width=0.015),
+            km.scene.Line("pendulum", [end, tip], width=0.012, color=(120, 130, 150)),
+            km.scene.Disk("tip", tip, 0.02),
         ]
 
 

@@ -16,15 +16,27 @@ from koopmpc.errors import DataError, LogError, install
 
 _MARGIN = 0.06  # around what is drawn, as a share of its size
 _SHADES = 48  # colours of a .gif
+_EYE = np.deg2rad((-65.0, 25.0))  # where a scene in space is seen from: angle from the x-axis, and above the horizon
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """A line with round ends: `points` (n, 2) and `width` in m, y up, and a colour."""
+    """A line with round ends: `points` (n, 2) and `width` in m, y up, and a colour; `filled`, it is a face.
+
+    `near` is how much nearer than the origin it is to the eye [m].
+    """
 
     points: Float[np.ndarray, "n 2"]
     width: float
     color: tuple[int, int, int]
+    near: float = 0.0
+    filled: bool = False
+
+
+def project(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return points in space, z up, as they are seen from afar: to the right, upwards, and towards the eye."""
+    (a, e), (b, f) = ((np.cos(angle), np.sin(angle)) for angle in _EYE)
+    return points @ np.array([[-e, -f * a, b * a], [a, -f * e, b * e], [0.0, b, f]])
 
 
 def draw_frames(
@@ -57,10 +69,10 @@ def draw_frames(
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     text = figure.text(0.02, 1 - 0.5 * caption / even[1], "", fontsize=0.45 * caption, color="#3a4048", va="center")
     for strokes, words in zip(frames, captions, strict=True):
-        for old in list(axes.lines):
+        for old in [*axes.lines, *axes.patches]:
             old.remove()
         for stroke in strokes:
-            axes.add_line(_drawn(stroke, scale))
+            axes.add_artist(_drawn(stroke, scale))
         text.set_text(words)
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -69,9 +81,12 @@ def draw_frames(
 def _drawn(stroke: Stroke, scale: float) -> Any:
     """Return the stroke for matplotlib; `scale` is in pixels a metre, of which there are 100 in 72 points."""
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Polygon
 
     x, y = stroke.points.T
     thick, shade = max(0.72 * stroke.width * scale, 0.5), _share(stroke.color)
+    if stroke.filled:
+        return Polygon(stroke.points, facecolor=shade, edgecolor=_share((70, 80, 90)), linewidth=0.5, zorder=2)
     if np.ptp(stroke.points, axis=0).max() < 0.01 * stroke.width:  # matplotlib draws no ends of so short a line
         return Line2D(x[:1], y[:1], linestyle="none", marker="o", markersize=thick, color=shade, markeredgewidth=0)
     return Line2D(x, y, linewidth=thick, color=shade, solid_capstyle="round", solid_joinstyle="round")

@@ -1,19 +1,23 @@
 # pyright: basic
 """export_video: the animation of a log as a .gif or .mp4, without a screen and without the problem's file."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from koopmpc import checks
 from koopmpc.errors import LogError
-from koopmpc.figures.animation import Stroke, draw_frames, save_video
+from koopmpc.figures.animation import Stroke, draw_frames, project, save_video
 from koopmpc.recording.description import title_of
 from koopmpc.recording.format.reader import about_of
 from koopmpc.recording.format.rrd import LogColumns, read_columns
 from koopmpc.recording.views.scenes import BACKGROUND
+from koopmpc.recording.views.shapes import faces
+from koopmpc.scene import Color
 
 
 @dataclass
@@ -78,7 +82,7 @@ def export_video(
     steps = np.floor(moments / about.dt + 1e-6).astype(int).tolist()
     title = title_of(about)
     pictures = draw_frames(
-        [[stroke for layer in layers for stroke in layer.at(k)] for k in steps],
+        [_strokes_at(layers, k) for k in steps],
         [f"{title}   {t:.1f} s" for t in moments],
         low=np.min([s.points.min(axis=0) - s.width / 2 for s in bodies], axis=0),
         high=np.max([s.points.max(axis=0) + s.width / 2 for s in bodies], axis=0),
@@ -88,26 +92,56 @@ def export_video(
     save_video(pictures, path, fps)
 
 
+def _strokes_at(layers: Sequence[_Layer], k: int) -> list[Stroke]:
+    """Return the strokes at step k from the lowest to the highest; of one drawing order the farthest first."""
+    found = [(layer.order, stroke.near, stroke) for layer in layers for stroke in layer.at(k)]
+    return [stroke for *_, stroke in sorted(found, key=lambda one: one[:2])]
+
+
 def _layers(columns: LogColumns) -> list[_Layer]:
-    """Return the shapes that the log holds; Rerun's y points down."""
+    """Return the shapes that the log holds."""
     found: list[_Layer] = []
     for entity in columns.entities():
-        k, strips = columns.lists(entity, "strips")
+        k, colors = columns.lists(entity, "colors")
         if not len(k):
             continue
-        _, radii = columns.lists(entity, "radii")
-        _, colors = columns.lists(entity, "colors")
-        rows = [_strokes(*row) for row in zip(strips, radii, colors, strict=True)]
-        plain = not entity.startswith("/world/prediction/")
-        found.append(_Layer(float(columns.static(entity, "draw_order") or 0.0), k, rows, plain))
+        lower = next((i for i, part in enumerate(("reference", "prediction")) if f"/world/{part}/" in entity), 2)
+        order = columns.static(entity, "draw_order")  # in the plane only
+        strokes = _strokes(columns, entity, [[_shade(number) for number in row or ()] for row in colors])
+        found.append(_Layer(lower if order is None else float(order), k, strokes, lower != 1))
     return found
 
 
-def _strokes(strips: Any, radii: Any, colors: Any) -> list[Stroke]:
-    """Return the strokes of one row; a colour is one number, 0xRRGGBBAA."""
-    drawn: list[Stroke] = []
-    for strip, radius, color in zip(strips or (), radii or (), colors or (), strict=True):
-        points = np.array(strip, dtype=np.float64).reshape(-1, 2) * (1.0, -1.0)
-        shade = (color >> 24 & 255, color >> 16 & 255, color >> 8 & 255)
-        drawn.append(Stroke(points, 2 * float(radius), shade))
-    return drawn
+def _strokes(columns: LogColumns, entity: str, colors: list[list[Color]]) -> list[list[Stroke]]:
+    """Return the strokes of each row of an entity: of its lines, its balls or its boxes."""
+
+    def rows(what: str) -> list[Any]:
+        return [row or () for row in columns.lists(entity, what)[1]]
+
+    boxes = zip(rows("half_sizes"), rows("centers"), rows("quaternions"), colors, strict=False)
+    sides = [
+        [
+            _stroke(face, 0.0, color, filled=True)
+            for half, center, turn, color in zip(*row, strict=True)
+            for face in faces(center, 2 * np.array(half), Rotation.from_quat(turn))
+        ]
+        for row in boxes
+    ]
+    strips = rows("strips") or [[[place, place] for place in row] for row in rows("positions")]
+    return sides or [
+        [_stroke(np.array(strip), 2 * radius, color) for strip, radius, color in zip(*row, strict=True) if strip]
+        for row in zip(strips, rows("radii"), colors, strict=True)
+    ]
+
+
+def _stroke(points: np.ndarray, width: float, color: Color, *, filled: bool = False) -> Stroke:
+    """Return the stroke through points of a log: Rerun's y points down in the plane, its z up in space."""
+    if points.shape[1] == 2:
+        return Stroke(points * (1.0, -1.0), width, color)
+    seen = project(points)
+    return Stroke(seen[:, :2], width, color, float(seen[:, 2].mean()), filled)
+
+
+def _shade(number: int) -> Color:
+    """Return a colour that is one number, 0xRRGGBBAA."""
+    return number >> 24 & 255, number >> 16 & 255, number >> 8 & 255

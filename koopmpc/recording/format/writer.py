@@ -179,8 +179,11 @@ class Writer:
         if Entity.STATE not in self._styled:
             for entity, style in styles(self._about, rows).items():
                 self._style(entity, style)
+        if drawings and self._extent.in_space:
+            self._style("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for entity, drawing in drawings.items():
-            self._style(entity, drawing.style)
+            if drawing.style is not None:
+                self._style(entity, drawing.style)
             self._rec.send_columns(entity, times(k, self._about.dt), drawing.columns)
         if len(rows.planned):
             self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
@@ -419,7 +422,7 @@ class Writer:
         if any(aims):
             for aim in aims:
                 self._names.checked(aim, rows.k) if aim else None
-            drawn = draw_reference(self._names, aims, self._extent)
+            drawn = draw_reference(self._names, now, aims, self._extent)
             found |= {f"world/reference/{name}": drawing for name, drawing in drawn.items()}
         return found
 

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from koopmpc.control.move import Fallback, Status
+from koopmpc.figures.animation import project
 from koopmpc.loop.run import About
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable, status_words
@@ -38,6 +39,7 @@ _LINKED = 50.0  # length of a run whose plots are moved together [s]
 _ENDLESS = 1e100  # a span that no axis shows
 _CROWDED = 3  # plots of states from which on their titles are left out
 _AHEAD = 16  # at most so many stages of a plan are drawn into the plots
+_DISTANCE = 0.75  # of the eye from the middle of a scene in space, in its diagonals
 _SEPARATE = 4  # up to so many states have a plot each
 
 _STATUS_COLORS: dict[Status, Color] = {
@@ -276,11 +278,18 @@ def _now(entity: str, horizon: int, dt: float) -> dict[str, Any]:
 def _animation(extent: Extent) -> Any:
     import rerun.blueprint as rrb
 
-    ranges = extent.ranges()
+    ranges, name = extent.ranges(), "Animation; fainter: the plan, grey: the reference"
+    if ranges is not None and extent.in_space:
+        low, high = np.array(ranges).T
+        middle, away = (low + high) / 2, _DISTANCE * float(np.linalg.norm(high - low))
+        eye = rrb.EyeControls3D(position=middle + away * project(np.eye(3))[:, 2], look_target=middle, eye_up=(0, 0, 1))
+        return rrb.Spatial3DView(
+            origin="world", name=name, background=list(BACKGROUND), line_grid=False, eye_controls=eye
+        )
     fixed = None if ranges is None else rrb.VisualBounds2D(x_range=ranges[0], y_range=ranges[1])
     return rrb.Spatial2DView(
         origin="world",
-        name="Animation; fainter: the plan, grey: the reference",
+        name=name,
         background=list(BACKGROUND),
         visual_bounds=fixed,
     )

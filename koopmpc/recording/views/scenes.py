@@ -3,13 +3,14 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.errors import DataError
 from koopmpc.loop.run import About, StepRows
+from koopmpc.recording.views.shapes import Drawing, drawing_of, line_radius, outline
 from koopmpc.scene import Box, Color, Disk, Line, Scene, Shape
 
 BACKGROUND: Color = (247, 248, 250)
@@ -18,57 +19,66 @@ _AIM: Color = (188, 193, 201)  # of the reference
 _DRAWN = 1e30  # the viewer draws in float32
 _AIMS = 2000  # states of so many different references are looked for
 _STAGES = 4  # how many future stages of a plan are drawn
-_STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
-
-
-class Drawing(NamedTuple):
-    """One entity of a scene: a static archetype with the drawing order, and columns over time."""
-
-    style: Any
-    columns: Any
 
 
 @dataclass
-class Box2D:
-    """The least box around some points, y up [m]; empty at first."""
+class Bounds:
+    """The least box around some points in the plane or in space [m], their last coordinate up; empty at first."""
 
-    low: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(2, np.inf))
-    high: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(2, -np.inf))
+    low: Float[np.ndarray, "..."] = field(default_factory=lambda: np.array(np.inf))
+    high: Float[np.ndarray, "..."] = field(default_factory=lambda: np.array(-np.inf))
 
-    def include(self, shape: Shape) -> None:
-        """Widen the box by one shape."""
-        points = _points(shape)
-        if len(points) and np.isfinite(points).all():
-            self.low = np.minimum(self.low, points.min(axis=0) - _radius(shape))
-            self.high = np.maximum(self.high, points.max(axis=0) + _radius(shape))
+    def include(self, scenes: Iterable[Sequence[Shape]]) -> None:
+        """Widen the box by all shapes."""
+        for shape in (shape for scene in scenes for shape in scene):
+            points = outline(shape)
+            if len(points) and np.isfinite(points).all():
+                self.low = np.minimum(self.low, points.min(axis=0) - line_radius(shape))
+                self.high = np.maximum(self.high, points.max(axis=0) + line_radius(shape))
 
 
 @dataclass
 class Extent:
     """The box that the animation shows: all drawn shapes, and predicted shapes that are not far from them."""
 
-    drawn: Box2D = field(default_factory=Box2D)
-    predicted: Box2D = field(default_factory=Box2D)
+    drawn: Bounds = field(default_factory=Bounds)
+    predicted: Bounds = field(default_factory=Bounds)
 
-    def ranges(self) -> tuple[list[float], list[float]] | None:
-        """Return the ranges of x and of Rerun's y (down), with a margin; None before anything was drawn."""
+    @property
+    def in_space(self) -> bool:
+        """Whether what was drawn has three coordinates."""
+        return self.drawn.low.size == 3
+
+    def ranges(self) -> list[list[float]] | None:
+        """Return the range of each of Rerun's coordinates, with a margin; None before anything was drawn.
+
+        Rerun's y points down in the plane, and its z up in space.
+        """
         low, high = self.drawn.low, self.drawn.high
         if not np.isfinite(low).all():
             return None
         size = float((high - low).max())
-        (x0, y0) = np.minimum(low, np.maximum(self.predicted.low, low - _FAR * size)) - 0.06 * size - 1e-9
-        (x1, y1) = np.maximum(high, np.minimum(self.predicted.high, high + _FAR * size)) + 0.06 * size + 1e-9
-        return [float(x0), float(x1)], [-float(y1), -float(y0)]
+        low = np.minimum(low, np.maximum(self.predicted.low, low - _FAR * size)) - 0.06 * size - 1e-9
+        high = np.maximum(high, np.minimum(self.predicted.high, high + _FAR * size)) + 0.06 * size + 1e-9
+        found = np.column_stack([low, high])
+        if not self.in_space:
+            found[1] = -found[1, ::-1]
+        return found.tolist()
 
 
 class Names:
-    """The names of a scene's shapes, in their order; empty before the first scene."""
+    """The names of a scene's shapes, in their order, and their kinds; empty before the first scene."""
 
     def __init__(self) -> None:
-        self._names: dict[str, None] | None = None
+        self._kinds: dict[str, type[Shape]] | None = None
+        self._coordinates: set[int] = set()  # how many a point has
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names or {})
+        return iter(self._kinds or {})
+
+    def kind(self, name: str) -> type[Shape] | None:
+        """Return the kind of shape that a name stands for in space, None in the plane."""
+        return self._kinds[name] if self._kinds and 3 in self._coordinates else None
 
     def checked(self, scene: Sequence[Shape], step: int) -> list[Shape]:
         """Return the shapes of `scene`.
@@ -76,23 +86,47 @@ class Names:
         Raises
         ------
         DataError
-            A shape came or went since the first scene.
+            A shape is at NaN, came or went since the first scene, or lies in space while another lies in the plane.
         """
-        own = {shape.name: None for shape in scene}
+        own = {shape.name: type(shape) for shape in scene}
         for shape in scene:
+            self._coordinates |= {np.size(point) for point in _places(shape)}
+            if len(self._coordinates) > 1 or not self._coordinates <= {2, 3}:
+                many = " and ".join(str(n) for n in sorted(self._coordinates))
+                raise DataError(
+                    f"the scene of step {step} draws points with {many} coordinates, the last one of {shape.name!r}; "
+                    "all points and sizes of a scene have two, (x, y), or all have three, (x, y, z)"
+                )
             if not all(
                 np.isfinite(np.asarray(getattr(shape, f.name), dtype=np.float64)).all() for f in _numbers(shape)
             ):
                 raise DataError(
                     f"the scene of step {step} draws {shape.name!r} at NaN or inf; every x and u needs a place"
                 )
-        self._names = own if self._names is None else self._names
-        for name in own.keys() ^ self._names.keys():
+        self._kinds = own if self._kinds is None else self._kinds
+        for name in own.keys() ^ self._kinds.keys():
             what = "has a new shape" if name in own else "lacks the shape"
             raise DataError(
                 f"the scene of step {step} {what} {name!r}; a scene returns the same names for every x and u"
             )
+        for shape in scene:
+            if (kind := self.kind(shape.name)) not in (None, type(shape)):
+                raise DataError(
+                    f"the scene of step {step} draws {shape.name!r} as a {type(shape).__name__} and as a "
+                    f"{kind.__name__}; in space a name stands for one kind of shape"
+                )
         return list(scene)
+
+
+def _places(shape: Shape) -> Iterable[Any]:
+    """Return what of a shape has a number for each coordinate."""
+    match shape:
+        case Line():
+            return shape.points
+        case Disk():
+            return [shape.center]
+        case Box():
+            return [shape.center, shape.size, *([shape.angle] if np.ndim(shape.angle) else [])]
 
 
 def _numbers(shape: Shape) -> list[Field[Any]]:
@@ -100,18 +134,19 @@ def _numbers(shape: Shape) -> list[Field[Any]]:
     return [field for field in fields(shape) if field.name not in ("name", "color")]
 
 
-def draw(names: Iterable[str], scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
+def draw(names: Names, scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
     """Return a drawing by name for one scene a row; an empty scene clears what was there."""
-    for shape in (shape for scene in scenes for shape in scene):
-        extent.drawn.include(shape)
+    extent.drawn.include(scenes)
     return {
-        name: _drawing([[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i)
+        name: drawing_of(
+            names.kind(name), [[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i
+        )
         for i, name in enumerate(names)
     }
 
 
 def draw_ahead(
-    names: Iterable[str],
+    names: Names,
     scenes: Sequence[Sequence[Shape]],
     ahead: Sequence[Sequence[Sequence[Shape]]],
     extent: Extent,
@@ -120,8 +155,7 @@ def draw_ahead(
 
     A shape that does not move within the plan is not drawn again.
     """
-    for shape in (shape for row in ahead for scene in row for shape in scene):
-        extent.predicted.include(shape)
+    extent.predicted.include(scene for row in ahead for scene in row)
     drawings: dict[str, Drawing] = {}
     for name in names:
         rows: list[list[tuple[Shape, Color]]] = []
@@ -129,15 +163,27 @@ def draw_ahead(
             here = [s for s in now if s.name == name]
             later = [(i, s) for i, scene in enumerate(futures) for s in scene if s.name == name and s not in here]
             rows.append([(s, _faded(s.color, (i + 1) / (len(futures) + 1))) for i, s in reversed(later)])
-        drawings[name] = _drawing(rows, 10.0)
+        drawings[name] = drawing_of(names.kind(name), rows, 10.0)
     return drawings
 
 
-def draw_reference(names: Iterable[str], scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
-    """Return a drawing by name, in grey below all others, for the scene of the reference of each row."""
-    for shape in (shape for scene in scenes for shape in scene):
-        extent.drawn.include(shape)
-    return {name: _drawing([[(s, _AIM) for s in scene if s.name == name] for scene in scenes], 2.0) for name in names}
+def draw_reference(
+    names: Names,
+    scenes: Sequence[Sequence[Shape]],
+    aims: Sequence[Sequence[Shape]],
+    extent: Extent,
+) -> dict[str, Drawing]:
+    """Return a drawing by name, in grey below all others, for the scene of the reference of each row.
+
+    In space nothing lies below: a shape that is where it shall be is not drawn again.
+    """
+    extent.drawn.include(aims)
+    if extent.in_space:
+        aims = [[s for s in aim if s not in now] for now, aim in zip(scenes, aims, strict=True)]
+    return {
+        name: drawing_of(names.kind(name), [[(s, _AIM) for s in aim if s.name == name] for aim in aims], 2.0)
+        for name in names
+    }
 
 
 class ReferenceScenes:
@@ -182,52 +228,6 @@ class ReferenceScenes:
 def stages(horizon: int) -> list[int]:
     """Return the few stages of a plan that are drawn, the last one among them."""
     return sorted({round(horizon * (i + 1) / _STAGES) for i in range(_STAGES)} - {0})
-
-
-def _drawing(rows: Sequence[Sequence[tuple[Shape, Color]]], order: float) -> Drawing:
-    """Return one entity; each row holds any number of shapes.
-
-    All are line strips with round ends: Rerun draws points as shaded balls, and a disk is a line without length.
-    """
-    import rerun as rr
-
-    flat = [pair for row in rows for pair in row]
-    with np.errstate(over="ignore"):
-        strips = [(_points(s) * (1.0, -1.0)).astype(np.float32) for s, _ in flat]  # Rerun's y points down
-    columns = rr.LineStrips2D.columns(
-        strips=strips,
-        radii=np.array([_radius(s) for s, _ in flat], dtype=np.float32),
-        colors=np.array([c for _, c in flat], dtype=np.uint8).reshape(-1, 3),
-    )
-    return Drawing(rr.LineStrips2D.from_fields(draw_order=order), columns.partition([len(row) for row in rows]))
-
-
-def _points(shape: Shape) -> Float[np.ndarray, "n 2"]:
-    """Return the line that draws a shape, y up; a box is a line there and back, a disk almost a point."""
-    if isinstance(shape, Line):
-        return np.asarray(shape.points, dtype=np.float64).reshape(-1, 2)
-    if isinstance(shape, Disk):
-        (x, y), length = shape.center, 1e-4 * shape.radius
-        return np.array([(x - length, y), (x + length, y)])
-    width, height = shape.size
-    r, upright = _radius(shape), height > width
-    along, across = max(shape.size) / 2 - r, min(shape.size) / 2 - r
-    rim = [(-along, -across), (along, -across), (along, across), (-along, across), (-along, -across)]
-    fill = [((-1) ** ((i + 1) // 2) * along, y * across) for i, y in enumerate(np.repeat(_STROKES, 2))]
-    path = np.array(rim + fill)
-    c, s = np.cos(shape.angle), np.sin(shape.angle)
-    return (path[:, ::-1] if upright else path) @ np.array([[c, s], [-s, c]]) + np.asarray(shape.center)
-
-
-def _radius(shape: Shape) -> float:
-    """Return half the width of the line that draws a shape."""
-    match shape:
-        case Line():
-            return shape.width / 2
-        case Disk():
-            return shape.radius
-        case Box():
-            return min(shape.size) / 8
 
 
 def _faded(color: Color, share: float) -> Color:
