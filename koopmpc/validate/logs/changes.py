@@ -25,6 +25,7 @@ _SHARE = 0.6  # of the segments that agree on a law
 _RESTARTS = 12
 _TRIED = 4  # segments by which an offset is found
 _GAIN = 0.5  # nats a row and state that a change must win
+_SHIFTED = 0.8  # the same for an offset, which is fitted: a misfit far away may win 0.75 by one
 _MOST = 0.5  # share of what a segment is off that undoing must win
 _NOTHING, _TURN = 0.05, 0.3  # rad by which the offset of an angle may miss 0, and whole turns: then it is no fault
 _REFINED = 9  # rounds in which an offset is narrowed down, each by a factor of six
@@ -106,7 +107,7 @@ def midway(log: Log) -> Iterator[LogFault]:
             undone = change.errors(law, *pairs[s])
             gain = float((np.clip(errors[s], spread, None) - np.clip(undone, spread, None)).mean())
             back = undone.max() < spread + _BACK + change.charged and gain > _MOST * most[s]
-            if gain > _GAIN and back and gain * len(pairs[s][1]) > _SURE:
+            if gain > (_SHIFTED if change.kind == "offset change" else _GAIN) and back and gain * len(pairs[s][1]) > _SURE:
                 won += gain * len(pairs[s][1])
                 which.append(s)
         if len(which) == 1 and change.chosen:

@@ -7,7 +7,7 @@ import koopmpc as km
 from tests.bare import shown
 from tests.validate.logs.corpus import BEDS, FAULTS, Draw, clean, episodes, faulty, simulated
 
-CLEAN = [0, 7, 19, 40, 51, 87]
+CLEAN = [0, 7, 19, 40, 51, 87, 91058]  # in the last the other state follows better from the future of a sensor in time
 
 
 @pytest.mark.parametrize(
@@ -47,6 +47,19 @@ def test_a_late_input_is_told_with_the_delay_that_models_it():
     assert "voltage acts 2 steps late. Let the model see the past: embedding=km.Delay(2)." in str(report)
     fit = lambda **how: km.score(km.edmd(data[:14], km.State() + km.Constant(), **how), data[14:], 10).total
     assert fit(embedding=km.Delay(2)) < 0.5 * fit()  # the advice is worth something
+
+
+@pytest.mark.parametrize(("seed", "steps"), [(7022, 2), (7027, 3)])
+def test_a_sensor_whose_delay_changes_its_own_forecasts_alone_is_told(seed, steps):
+    (fault,) = km.validate.audit(faulty("late sensor", seed)[1]).faults
+    assert (fault.name, fault.steps) == ("late sensor", steps)
+
+
+def test_a_late_input_that_a_late_sensor_would_explain_as_well_is_told_as_both():
+    _, data = faulty("late sensor", 7013)  # T2 is 3 steps behind, and heater 2 warms little else
+    report = km.validate.audit(data)
+    assert report.delay == 3
+    assert "unless the sensor of T2 is 3 steps behind" in " ".join(str(report).split())
 
 
 def test_an_actuator_that_ends_is_told_with_its_limits():
