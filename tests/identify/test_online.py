@@ -332,3 +332,4 @@ def test_a_rival_judges_by_the_second_half_of_each_of_its_periods():
             for k, r in enumerate(rng.normal(size=(300, 1, 2)))
         ]
         assert any(answers) == takes_over
+        assert all(k % 100 == 99 for k, yes in enumerate(answers) if yes)  # at the end of a period
