@@ -76,7 +76,7 @@ def test_the_viewer_draws_every_view_of_the_blueprint(log: Path, tmp_path: Path)
     assert {v.name for v in views} >= {
         "state 0 [m]",
         "Input: input 0",
-        "Animation, with the predicted horizon",
+        "Animation; fainter: the plan, grey: the reference",
     }
     assert [v for v in views if v.reports] == []
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")

@@ -7,7 +7,8 @@ class Entity(StrEnum):
     """Where the columns of a log stand.
 
     An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
-    What only the viewer draws is in views/: `world`, `model`, `plots`, `title`, `solver/log_time` and `…_deadline`.
+    What only the viewer draws is in views/: `world`, `model`, `plots`, `title`, and components `koopmpc.View:…`:
+    one state alone in single precision, the power of ten of a time.
     """
 
     DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
@@ -16,12 +17,12 @@ class Entity(StrEnum):
     REFERENCE = "reference"  # r_k
     INPUT = "control/u"  # u_k as applied
     INPUT_REFERENCE = "control/u_reference"  # the input that holds r_k, in the rows where it is not 0
-    INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and the last step of a block
+    INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and last step of a run or live block
     SLACK = "solver/slack"  # how far the plan breaks a soft limit, in the rows where it does
     KNOWN = "solver/known"  # 1 where the model knows and 0 where it does not, in the rows where a monitor looked
-    SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" and "iterations" hold time and iterations to the bit
+    SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" where it is not ms / 1000 to the bit; "iterations" above 0
     QP = "solver/qp"  # "state": which solver made the move, or "none", in the rows where it changes; "none" before all
-    DEADLINE = "solver/deadline_ms"  # dt [ms], at the first and the last step of a block
+    DEADLINE = "solver/deadline_ms"  # dt [ms], at the same steps
     STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes
     PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
     PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu

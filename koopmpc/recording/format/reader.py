@@ -39,8 +39,8 @@ def _run(log: LogColumns, path: Path) -> Run:
     about, planned_steps = about_of(log, path)
     X, reference = log.vectors(Entity.STATE), log.vectors(Entity.REFERENCE)
     U = log.vectors(Entity.INPUT)
-    seconds = log.column(Entity.SOLVER, "seconds")
-    iterations = log.column(Entity.SOLVER, "iterations")
+    seconds = log.held(Entity.SOLVER, "seconds", log.column(Entity.SOLVER) / 1e3)
+    iterations = log.held(Entity.SOLVER, "iterations", np.zeros(len(seconds), dtype=np.int64))
     counts = [len(X) - 1, len(seconds)]
     counts += [len(U)] if about.inputs else []
     counts += [len(reference) - 1] if len(reference) else []

@@ -84,10 +84,17 @@ class LogColumns:
         k, values = self.matrix(entity)
         return values[: _whole(k)]
 
-    def column(self, entity: str, component: str) -> np.ndarray:
+    def column(self, entity: str) -> np.ndarray:
         """Return one number a row: 0, 1, … up to the first that is missing."""
-        k, values = self.matrix(entity, component)
-        return values[: _whole(k)].reshape(-1)
+        return self.vectors(entity).reshape(-1)
+
+    def held(self, entity: str, component: str, column: np.ndarray) -> np.ndarray:
+        """Return `column`, with the numbers of this component in the rows that have one."""
+        k, widths, values = self.rows(entity, component)
+        k, flat = k[widths > 0], np.array(values)
+        inside, found = k < len(column), column.copy()
+        found[k[inside]] = flat[inside]
+        return found
 
     def changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
@@ -244,7 +251,7 @@ def block_of_steps(steps: Sequence[Step], nx: int, *, end: bool) -> LogBlock:
     return _block(steps[0].k, StepRows.of(steps, nx, end=end), planned, whole.X, whole.U)
 
 
-def blocks(rows: LogBlock, least: int = 100, most: int = 10) -> list[LogBlock]:
+def blocks(rows: LogBlock, least: int = 100, most: int = 5) -> list[LogBlock]:
     """Return `rows` as consecutive blocks of at least `least` steps, at most `most` of them.
 
     The state that the last move led to belongs to the last block.

@@ -29,7 +29,18 @@ from koopmpc.recording.description import (
 from koopmpc.recording.format.columns import NO_SOLVER, Entity
 from koopmpc.recording.format.logfile import CHECK, LogFile
 from koopmpc.recording.format.rrd import LogBlock, blocks
-from koopmpc.recording.views.blueprint import ahead, blueprint, input_limits, panels, state_limits, status_value, styles
+from koopmpc.recording.views.blueprint import (
+    LOG_TIME,
+    SEPARATE,
+    VIEW,
+    ahead,
+    blueprint,
+    input_limits,
+    panels,
+    state_limits,
+    status_value,
+    styles,
+)
 from koopmpc.recording.views.eigenvalues import draw_eigenvalues
 from koopmpc.recording.views.scenes import (
     Drawing,
@@ -168,6 +179,8 @@ class Writer:
         drawings = [self._drawings(part) for part in parts]  # all, because the layout is as wide as the widest
         if not self._opened:
             self._open()
+        if len(rows.U):
+            self._statuses(rows)
         for part, drawn in zip(parts, drawings, strict=True):
             self._write(part, drawn)
 
@@ -178,7 +191,8 @@ class Writer:
         k = rows.k + np.arange(n)
         if Entity.STATE not in self._styled:
             for entity, style in styles(self._about, rows).items():
-                self._style(entity, style)
+                if entity != Entity.MEASUREMENT:  # it may have no row
+                    self._style(entity, style)
         if drawings and self._extent.in_space:
             self._style("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for entity, drawing in drawings.items():
@@ -189,9 +203,11 @@ class Writer:
             self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
             self._vectors(Entity.PLAN_INPUTS, rows.planned, rows.plan_U)
         self._plots(rows, k)
-        measured = _differ(rows.X, rows.Y)
-        self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured])
-        self._vectors(Entity.REFERENCE, k, rows.reference)
+        measured, shown = _differ(rows.X, rows.Y), panels(self._about, self._nr)
+        if len(measured):
+            self._style(Entity.MEASUREMENT, styles(self._about, rows)[Entity.MEASUREMENT])
+        self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured], [i for p in shown for i in p.measured])
+        self._vectors(Entity.REFERENCE, k, rows.reference, [i for p in shown for i in p.references])
         if m:
             self._vectors(Entity.INPUT, k[:m], rows.U)
             held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
@@ -200,23 +216,34 @@ class Writer:
             self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
             looked = np.flatnonzero(rows.known >= 0)
             self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
-            ends = np.unique(k[[0, m - 1]])
+            ends = self._ends(k[:m])
             limits = [value for *_, value in input_limits(self._about)]
             self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
-            self._vectors(Entity.DEADLINE, ends, np.full((len(ends), 1), 1e3 * self._about.dt))
-            self._vectors("solver/log_deadline", ends, np.full((len(ends), 1), np.log10(self._about.dt)))
+            if len(ends):
+                powers = np.full(len(ends), np.log10(self._about.dt))
+                line = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers})
+                scalars = rr.Scalars.columns(scalars=np.full(len(ends), 1e3 * self._about.dt))
+                self._rec.send_columns(Entity.DEADLINE, times(ends, self._about.dt), [*scalars, *line])
             timed = rows.solve_time > 0
-            self._vectors("solver/log_time", k[:m][timed], np.log10(rows.solve_time[timed])[:, None])
-            exact = rr.DynamicArchetype.columns(
-                "koopmpc.Solver", components={"seconds": rows.solve_time, "iterations": rows.iterations}
-            )
-            scalars = rr.Scalars.columns(scalars=1e3 * rows.solve_time)
-            self._sum(f"/{Entity.SOLVER}:seconds", np.ascontiguousarray(rows.solve_time).data, k[:m])
-            self._sum(f"/{Entity.SOLVER}:iterations", np.ascontiguousarray(rows.iterations).data)
-            self._rec.send_columns(Entity.SOLVER, times(k[:m], self._about.dt), [*scalars, *exact])
-            self._statuses(rows)
+            powers = np.log10(rows.solve_time[timed]).astype(np.float32)
+            shown = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers}).partition(timed.astype(np.int64))
+            ms = 1e3 * rows.solve_time
+            parts = {
+                "seconds": (rows.solve_time, ms / 1e3 != rows.solve_time),
+                "iterations": (rows.iterations, rows.iterations != 0),
+            }
+            exact: list[Any] = []
+            for name, (column, held) in parts.items():
+                values = np.ascontiguousarray(column[held])
+                self._sum(f"/{Entity.SOLVER}:{name}", values.data)
+                if held.any():
+                    columns = rr.DynamicArchetype.columns("koopmpc.Solver", components={name: values})
+                    exact += [*columns.partition(held.astype(np.int64))]
+            scalars = rr.Scalars.columns(scalars=ms)
+            self._sum(f"/{Entity.SOLVER}:scalars", ms.data, k[:m])
+            self._rec.send_columns(Entity.SOLVER, times(k[:m], self._about.dt), [*scalars, *exact, *shown])
         self.flush()  # static archetypes reach the file before the states do
-        self._vectors(Entity.STATE, k, rows.X)
+        self._vectors(Entity.STATE, k, rows.X, [i for panel in panels(self._about, self._nr) for i in panel.states])
 
     def flush(self) -> None:
         """Wait until the sinks have what was written; raise where the disk has refused it."""
@@ -299,8 +326,12 @@ class Writer:
             length=None if self._steps is None else self._steps * self._about.dt,
         )
 
-    def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray) -> None:
-        """Write one vector a row; higher dimensions go flat, their last width kept beside them."""
+    def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray, alone: Sequence[int] = ()) -> None:
+        """Write one vector a row; higher dimensions go flat, their last width kept beside them.
+
+        Where a plot shows one element alone, its values stand beside the vector in single precision: a plot cannot
+        pick one element of a vector, and further entities would repeat the times.
+        """
         import rerun as rr
 
         if not values.size:
@@ -312,7 +343,16 @@ class Writer:
             if entity not in self._styled:
                 self._sum(f"/{entity}:last_width", np.array([values.shape[-1]], dtype=np.int64).data)
             self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
+        if alone and len(self._about.states) <= SEPARATE:
+            with np.errstate(over="ignore"):
+                parts = {str(i): values[:, i].astype(np.float32) for i in alone}
+            columns = [*columns, *rr.DynamicArchetype.columns(VIEW, components=parts)]
         self._rec.send_columns(entity, times(k, self._about.dt), columns)
+
+    def _ends(self, k: np.ndarray) -> np.ndarray:
+        """Return the steps at which lines that do not change have points: two a run, two a block of a running loop."""
+        last = k[-1] if self._steps is None else self._steps
+        return np.unique([k[0], last]) if self._steps is None or k[0] == 0 else k[:0]
 
     def _found_spans(self, rows: LogBlock) -> dict[str, list[float]]:
         """Return the least and the largest value of each plot of states; of a running loop nothing is known yet."""
@@ -328,7 +368,7 @@ class Writer:
         return found
 
     def _plots(self, rows: LogBlock, k: np.ndarray) -> None:
-        """Write what the plots of states show, and what the plans of j steps before said of the steps in `rows`.
+        """Write the limits of states, and what the plans of j steps before said of the steps in `rows`.
 
         The plots show the latter j dt after the cursor. Nothing is written beyond the last row, so that the timeline
         ends with the run.
@@ -336,13 +376,10 @@ class Writer:
         plans = zip(rows.planned.tolist(), rows.plan_X, rows.plan_U, strict=True)
         self._plans |= {step: (X, U) for step, X, U in plans if np.isfinite(X).any()}
         N = len(next(iter(self._plans.values()))[1]) if self._plans else 0
-        measured, bounds, ends = _differ(rows.X, rows.Y), state_limits(self._about), np.unique(k[[0, -1]])
+        bounds, ends = state_limits(self._about), self._ends(k)
         for panel in panels(self._about, rows.reference.shape[1]):
             own = [self._about.states[i] for i in panel.states]
             limits = [value for name, _, value in bounds if name in own]
-            self._vectors(f"{panel.entity}/state", k, rows.X[:, panel.states])
-            self._vectors(f"{panel.entity}/reference", k, rows.reference[:, panel.references])
-            self._vectors(f"{panel.entity}/measured", k[measured], rows.Y[measured][:, panel.measured])
             self._vectors(f"{panel.entity}/limits", ends, np.tile(limits, (len(ends), 1)))
         for j in ahead(N):
             of = [step for step in self._plans if k[0] <= step + j <= k[-1]]

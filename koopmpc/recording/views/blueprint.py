@@ -40,7 +40,9 @@ _ENDLESS = 1e100  # a span that no axis shows
 _CROWDED = 3  # plots of states from which on their titles are left out
 _AHEAD = 16  # at most so many stages of a plan are drawn into the plots
 _DISTANCE = 0.75  # of the eye from the middle of a scene in space, in its diagonals
-_SEPARATE = 4  # up to so many states have a plot each
+SEPARATE = 4  # up to so many states have a plot each
+VIEW = "koopmpc.View"  # components that plots alone show, beside the numbers of an entity, in single precision
+LOG_TIME = "log10_seconds"  # the one of them that solver/time_ms and solver/deadline_ms have
 
 _STATUS_COLORS: dict[Status, Color] = {
     Status.UNCONSTRAINED: (46, 160, 120),
@@ -67,9 +69,9 @@ class Panel:
 
 
 def panels(about: About, nr: int) -> list[Panel]:
-    """Return a plot a state, which has entities of its own for a short legend, or one plot for all of many states."""
+    """Return a plot a state, or one plot for all of many states."""
     tracked, places = about.tracked(nr), range(len(about.states))
-    if len(about.states) > _SEPARATE:
+    if len(about.states) > SEPARATE:
         return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))])]
     return [
         Panel(
@@ -85,28 +87,21 @@ def panels(about: About, nr: int) -> list[Panel]:
 
 def styles(about: About, rows: LogBlock) -> dict[str, Any]:
     """Return the static archetypes by entity that name and colour what `rows` hold."""
-    import rerun as rr
-
     nr = rows.reference.shape[1]
     tracked, bounds = about.tracked(nr), state_limits(about)
     stages = ahead(rows.plan_U.shape[1]) if len(rows.planned) else []
 
-    def points(names: Sequence[str], shade: Color, size: float) -> Any:
-        drawn = [drawable(name) for name in names]
-        return rr.SeriesPoints(names=drawn, colors=[shade] * len(drawn), marker_sizes=[size] * len(drawn))
-
     found = {
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
         "reference": _lines([f"{name}, reference" for name in tracked], REFERENCE, 1.5),
+        "measurement": _points([f"{name}, measured" for name in about.outputs], _MEASURED, 1.5),
         "control/u": _lines(about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, **_HELD),
         "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0),
         "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
         "solver/deadline_ms": _lines(["deadline [ms]"], LIMIT, 1.0),
-        "solver/log_time": _lines(["time of a step [10^y s]"], color(2), 1.5),
-        "solver/log_deadline": _lines(["sample time, its deadline"], LIMIT, 1.0),
         "solver/status": _statuses(),
     }
-    found |= {f"plots/u/ahead/{j}": points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
+    found |= {f"plots/u/ahead/{j}": _points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
     for panel in panels(about, nr):
         alone = len(panel.states) == 1
 
@@ -115,15 +110,8 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
 
         own = [about.states[i] for i in panel.states]
         limits = called("limits", [name for name, *_ in bounds if name in own])
-        aims = [tracked[j] for j in panel.references]
-        seen = [about.outputs[j] for j in panel.measured]
-        found |= {
-            f"{panel.entity}/state": _lines(own, [color(i) for i in panel.states], 2.0),
-            f"{panel.entity}/reference": _lines(called("reference", aims), REFERENCE, 1.5),
-            f"{panel.entity}/measured": points(called("measured", seen), _MEASURED, 1.5),
-            f"{panel.entity}/limits": _lines(limits, LIMIT, 1.0),
-        }
-        one = points(called("prediction", own), _PREDICTION, 1.6)
+        found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0)
+        one = _points(called("prediction", own), _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": one for j in stages}
     return found
 
@@ -181,6 +169,35 @@ def _lines(names: Sequence[str], colors: Color | Sequence[Color], width: float, 
     return rr.SeriesLines(names=[drawable(name) for name in names], colors=each, widths=[width] * len(names), **more)
 
 
+def _points(names: Sequence[str], shade: Color, size: float) -> Any:
+    """Return points of one colour and size."""
+    import rerun as rr
+
+    drawn = [drawable(name) for name in names]
+    return rr.SeriesPoints(names=drawn, colors=[shade] * len(drawn), marker_sizes=[size] * len(drawn))
+
+
+def _alone(style: Any, component: str) -> Any:
+    """Return what draws this component of an entity in place of the vector that it belongs to."""
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+
+    source = f"{VIEW}:{component}"
+    to = VisualizerComponentMapping("Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=source)
+    return style.visualizer(mappings=[to])
+
+
+def _shown(panel: Panel) -> dict[str, list[Any]]:
+    """Return what the plot of a panel draws of the state, the reference and the measurement, by entity."""
+    lines = {
+        "/state": [(i, _lines([panel.title], color(i), 2.0)) for i in panel.states],
+        "/reference": [(i, _lines(["reference"], REFERENCE, 1.5)) for i in panel.references],
+        "/measurement": [(i, _points(["measured"], _MEASURED, 1.5)) for i in panel.measured],
+    }
+    if len(panel.states) > SEPARATE:  # the vectors, as they are
+        return {entity: [] for entity, parts in lines.items() if parts}
+    return {entity: [_alone(style, str(i)) for i, style in parts] for entity, parts in lines.items() if parts}
+
+
 def blueprint(
     about: About,
     nr: int,
@@ -199,7 +216,14 @@ def blueprint(
     """
     import rerun.blueprint as rrb
 
-    def plot(entity: str, name: str, contents: Sequence[str] = (), axis_y: Any = None, titled: bool = True) -> Any:
+    def plot(
+        entity: str,
+        name: str,
+        contents: Sequence[str] = (),
+        axis_y: Any = None,
+        titled: bool = True,
+        own: Mapping[str, list[Any]] | None = None,
+    ) -> Any:
         return rrb.TimeSeriesView(
             titlebar=titled,
             contents=[f"/{entity}/**", *contents],
@@ -207,17 +231,23 @@ def blueprint(
             axis_x=shared_time(length),
             axis_y=axis_y,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
-            overrides=cast("Any", _now(entity, horizon, about.dt)),
+            overrides=cast("Any", _now(entity, horizon, about.dt) | {e: v for e, v in (own or {}).items() if v}),
         )
 
     rows = panels(about, nr)
     roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
     axes = [readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
-    shown = [plot(row.entity, row.title, axis_y=axis, titled=roomy) for row, axis in zip(rows, axes, strict=True)]
+    parts = [_shown(row) for row in rows]
+    shown = [
+        plot(row.entity, row.title, [*part], axis, roomy, part)
+        for row, axis, part in zip(rows, axes, parts, strict=True)
+    ]
     bounds = readable([v for *_, v in input_limits(about)], _TICKS[roomy])
     shown.append(plot("plots/u", _title("Input", about.inputs), ["/control/u", "/control/limits"], bounds, roomy))
     slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
-    shown.append(plot("solver/log", _STEP_TIME, ["/solver/log_time", "/solver/log_deadline"], slowest, roomy))
+    time = {"/solver/time_ms": [_alone(_lines(["time of a step [10^y s]"], color(2), 1.5), LOG_TIME)]}
+    time["/solver/deadline_ms"] = [_alone(_lines(["sample time, its deadline"], LIMIT, 1.0), LOG_TIME)]
+    shown.append(plot("solver/log", _STEP_TIME, [*time], slowest, roomy, time))
     status = rrb.StateTimelineView(origin="solver/status", name="How each step ended")
     left = rrb.Vertical(*shown, status, row_shares=[1.0] * len(shown) + [max(0.5, 0.12 * len(shown))])
     texts = rrb.Tabs(
