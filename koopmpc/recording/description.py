@@ -21,7 +21,8 @@ from koopmpc.loop.run import About
 from koopmpc.validate.text import markdown_table
 from koopmpc.values import from_data, to_data
 
-_FORMAT = "koopmpc-log-1"
+_FORMAT = "koopmpc-log-2"
+_OLDER = ("koopmpc-log-1",)  # has "seconds" and "iterations" in every row, and copies of columns for the plots
 
 
 def application_of(about: About) -> str:
@@ -77,7 +78,7 @@ def from_json(text: str) -> tuple[About, int | None]:
     """
     try:
         tree: Any = json.loads(text)
-        if tree["format"] != _FORMAT:
+        if tree["format"] not in (_FORMAT, *_OLDER):
             raise LogError(f"the description has format {tree['format']!r}, this koopmpc reads {_FORMAT!r}")
         about, steps = from_data(tree["about"]), tree["steps"]
     except (ValueError, KeyError, TypeError) as error:

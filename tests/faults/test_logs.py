@@ -218,9 +218,9 @@ def test_a_log_of_another_format_is_refused(tmp_path: Path) -> None:
     km.record(make_run(), path)
     shutil.copy(path, tmp_path / "new.rrd")
     data = path.read_bytes()
-    assert b'"koopmpc-log-1"' in data
-    (tmp_path / "new.rrd").write_bytes(data.replace(b'"koopmpc-log-1"', b'"koopmpc-log-9"'))
+    assert b'"koopmpc-log-2"' in data
+    (tmp_path / "new.rrd").write_bytes(data.replace(b'"koopmpc-log-2"', b'"koopmpc-log-9"'))
     with pytest.raises(
-        km.errors.LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-1'"
+        km.errors.LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-2'"
     ):
         km.load_run(tmp_path / "new.rrd")

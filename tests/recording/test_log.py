@@ -13,8 +13,11 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.loop.run import About, StepRows
+from koopmpc.recording.description import _FORMAT
 from koopmpc.recording.format.rrd import block_of_run, blocks, read_columns
 from koopmpc.recording.views.scenes import ReferenceScenes
+from tests.fixtures.logs.make import FOLDER as LOGS
+from tests.fixtures.logs.make import made
 from tests.recording.runs import make_run, options
 
 
@@ -169,3 +172,12 @@ def test_an_angle_that_is_tracked_by_its_sine_and_cosine_is_drawn_where_it_is(tm
         assert x is not None
         assert np.angle(np.exp(1j * (x[0] - angle))) == pytest.approx(0, abs=1e-4)
     assert aims._state(np.array([2.0, 0.0])) is None  # no angle has such a sine
+
+
+@pytest.mark.parametrize("log", sorted(LOGS.glob("*.rrd")), ids=lambda log: log.stem)
+def test_a_log_of_each_format_reads_to_the_bit(log: Path) -> None:
+    assert km.load_run(log) == made()
+
+
+def test_todays_format_has_its_log() -> None:
+    assert (LOGS / f"{_FORMAT}.rrd").is_file()
