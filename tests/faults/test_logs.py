@@ -73,7 +73,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_a_log_cut_before_its_description_is_refused(written: Path, tmp_path: Path, share: float) -> None:
     whole = written.read_bytes()
-    (tmp_path / "cut.rrd").write_bytes(whole[: int(share * whole.find(b"koopmpc-log-1"))])
+    (tmp_path / "cut.rrd").write_bytes(whole[: int(share * whole.find(b"koopmpc-log-2"))])
     with pytest.raises(km.errors.LogError, match=r"cut\.rrd .*(No recording|or was cut before it)"):
         km.load_run(tmp_path / "cut.rrd")
 

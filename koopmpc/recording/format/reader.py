@@ -87,7 +87,10 @@ def about_of(log: LogColumns, path: Path) -> tuple[About, int | None]:
         raise LogError(
             f"{path} is a Rerun recording, but no log of koopmpc: it has no description, or was cut before it"
         )
-    return from_json(text)
+    try:
+        return from_json(text)
+    except LogError as error:
+        raise LogError(f"{path} is damaged or of another version: {error}") from error
 
 
 def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
