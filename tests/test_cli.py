@@ -8,12 +8,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.cli.app import app
 from koopmpc.cli.console import program
 from tests.bench.tiny import write
+from tests.commands import koopmpc
 
 TWO = ["-c", "lqr", "-c", "koopman-mpc"]
 
@@ -22,10 +21,7 @@ TWO = ["-c", "lqr", "-c", "koopman-mpc"]
 def call(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    def invoke(*arguments):
-        return CliRunner().invoke(app, [str(a) for a in arguments])
-
-    return invoke
+    return koopmpc
 
 
 def folders(tmp_path):

@@ -5,18 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.cli.app import app
 from tests.bench.tiny import SOURCE, write
+from tests.commands import koopmpc
 
 
 def test_a_bench_runs_five_problems_and_with_all_every_shipped_one(monkeypatch, tmp_path):
     ran = []
     monkeypatch.setattr("koopmpc.cli.sweeps._sweep", lambda problems, *_, **__: ran.append([p.name for p in problems]))
     for arguments in (["bench"], ["bench", "--all"]):
-        assert CliRunner().invoke(app, arguments).exit_code == 0
+        assert koopmpc(*arguments).exit_code == 0
     assert ran[0] == ["bilinear_motor", "cart_pole", "cart_pole_swing", "pendulum", "van_der_pol"]
     assert ran[1] == [path.stem for path in km.bench.shipped()]
     assert len(ran[1]) >= 16

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.cli.app import app
 from tests.bench.test_table import printed
 from tests.bench.tiny import write
+from tests.commands import koopmpc
 from tests.control.kkt import CheckedOSQP
 
 EIGHT = [
@@ -286,7 +285,7 @@ def test_live_without_a_viewer_or_a_display_serves_a_page_while_runs_go_on(tmp_p
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
     tiny = str(write(tmp_path))
-    shown = CliRunner().invoke(app, ["run", f"{tiny}:far", "-c", "lqr", "--live", "--logs", str(tmp_path / "logs")])
+    shown = koopmpc("run", f"{tiny}:far", "-c", "lqr", "--live", "--logs", tmp_path / "logs")
     assert shown.exit_code == 0
     assert pages == ([] if fails else [True, "closed"])
     assert ("no page to show the runs on: the port is taken" if fails else "open http://here") in shown.output
