@@ -19,7 +19,7 @@ from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable, written_with
 from koopmpc.recording.format.columns import Entity
-from koopmpc.recording.format.rrd import read_columns
+from koopmpc.recording.format.rrd import naming, read_columns
 from koopmpc.recording.format.writer import file_recording, times
 from koopmpc.recording.views.blueprint import color, framed, shared_time
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
@@ -286,8 +286,8 @@ def load_model_log(path: str | Path) -> ModelLog:
     """
     path = Path(path)
     log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**"))
-    text = log.static(Entity.DESCRIPTION, "json")
-    try:
+    with naming(path):
+        text = log.static(Entity.DESCRIPTION, "json")
         about: dict[str, Any] = {} if text is None else json.loads(text)
         if about.get("format") != _FORMAT:
             raise LogError(f"{path} holds no model that this koopmpc reads: its format is {about.get('format')!r}")
@@ -297,7 +297,5 @@ def load_model_log(path: str | Path) -> ModelLog:
             for i in range(len(about["states"])):
                 curves = log.matrix(f"rollout/{r}/state/{i}")[1]
                 forecasts[r, i] = curves[:, 0], curves[:, -1], curves[:, 1:3] if curves.shape[1] > 2 else None
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise LogError(f"{path} is damaged: {error}") from error
-    facts = {name: str(value) for name, value in about["facts"].items() if value != ""}
-    return ModelLog(facts, tuple(about["states"]), float(about["dt"]), tuple(errors), forecasts)
+        facts = {name: str(value) for name, value in about["facts"].items() if value != ""}
+        return ModelLog(facts, tuple(about["states"]), float(about["dt"]), tuple(errors), forecasts)

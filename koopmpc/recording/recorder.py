@@ -104,7 +104,7 @@ def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Pre
     DataError
         The metadata hold something other than numbers, names, lists and arrays; the scene's shapes come and go.
     LogError
-        The path cannot be written.
+        The path is no .rrd, or cannot be written.
 
     Examples
     --------
@@ -157,7 +157,7 @@ class Recorder:
     DataError
         Neither a path nor live; dt is not positive; called outside of its `with` block.
     LogError
-        The path cannot be written.
+        The path is no .rrd, or cannot be written.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ from koopmpc.errors import LogError
 from koopmpc.figures.animation import Stroke, draw_frames, project, save_video
 from koopmpc.recording.description import title_of
 from koopmpc.recording.format.reader import about_of
-from koopmpc.recording.format.rrd import LogColumns, read_columns
+from koopmpc.recording.format.rrd import LogColumns, naming, read_columns
 from koopmpc.recording.views.scenes import BACKGROUND
 from koopmpc.recording.views.shapes import faces
 from koopmpc.scene import Color
@@ -71,12 +71,13 @@ def export_video(
     fps, width = checks.count(fps, "fps"), checks.count(width, "width", 64)
     speed = checks.positive(speed, "speed")
     columns = read_columns(Path(log), ("/world/**", "/description", "/state"))
-    about, _ = about_of(columns, Path(log))
-    layers = sorted(_layers(columns), key=lambda layer: layer.order)
+    with naming(Path(log)):
+        about, _ = about_of(columns, Path(log))
+        layers = sorted(_layers(columns), key=lambda layer: layer.order)
+        last = max(len(columns.vectors("/state")) - 1, 1) * about.dt
     if not layers:
         raise LogError(f"{log} has no scene to draw; give the Dynamics a method scene(x, u), or the plant a scene=")
     bodies = [s for one in layers if one.body for row in one.strokes for s in row]
-    last = max(len(columns.vectors("/state")) - 1, 1) * about.dt
     end = last if until is None else min(checks.positive(until, "until", "s"), last)
     moments = np.arange(0.0, end + 1e-9, speed / fps)
     steps = np.floor(moments / about.dt + 1e-6).astype(int).tolist()

@@ -224,3 +224,20 @@ def test_a_log_of_another_format_is_refused(tmp_path: Path) -> None:
         km.errors.LogError, match="the description has format 'koopmpc-log-9', this koopmpc reads 'koopmpc-log-2'"
     ):
         km.load_run(tmp_path / "new.rrd")
+
+
+def test_a_log_whose_rows_differ_in_length_is_refused_by_its_name(tmp_path: Path) -> None:
+    import rerun as rr
+    from rerun.chunk import RrdReader
+
+    path, run = tmp_path / "run.rrd", make_run()
+    km.record(run, tmp_path / "whole.rrd")
+    longer = rr.RecordingStream("longer")
+    longer.save(path)
+    for chunk in RrdReader(tmp_path / "whole.rrd").stream().to_chunks():
+        longer.send_chunks([chunk])
+    longer.set_time("step", sequence=run.steps + 1)
+    longer.log("reference", rr.Scalars(np.zeros(run.reference.shape[1] + 1)))
+    longer.disconnect()
+    with pytest.raises(km.errors.LogError, match=r"run\.rrd is damaged: reference has rows of different lengths"):
+        km.load_run(path)

@@ -238,3 +238,13 @@ def test_a_recording_that_the_user_made_global_stays_so(tmp_path: Path) -> None:
         assert kept.get_recording_id() == own.get_recording_id()
     finally:
         rr.set_global_data_recording(before)
+
+
+def test_a_log_under_another_name_than_an_rrd_is_refused(tmp_path: Path) -> None:
+    run = make_run()
+    told = r"a\.csv would be a Rerun log under another name; name it a\.rrd"
+    with pytest.raises(km.errors.LogError, match=told):
+        km.record(run, tmp_path / "a.csv")
+    with pytest.raises(km.errors.LogError, match=told), km.Recorder(tmp_path / "a.csv", **about(run)):
+        pass
+    assert list(tmp_path.iterdir()) == []

@@ -33,7 +33,7 @@ class LogFile:
     Parameters
     ----------
     path
-        The file; folders on the way to it are made.
+        The file, an .rrd; folders on the way to it are made.
     growing
         The file is to be there while it is written: in its place where nothing is there yet, else beside it as
         ``<name>.part``. What is there when a disk is full or the process dies is kept. Otherwise the file is written
@@ -42,11 +42,13 @@ class LogFile:
     Raises
     ------
     LogError
-        The path cannot be written.
+        The path is no .rrd, or cannot be written.
     """
 
     def __init__(self, path: str | Path, *, growing: bool = False) -> None:
         self.path, self.growing = disk.target(path), growing
+        if self.path.suffix.lower() != ".rrd":
+            raise LogError(f"{path} would be a Rerun log under another name; name it {self.path.stem}.rrd")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             if not growing:

@@ -14,7 +14,7 @@ from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
 from koopmpc.recording.format.columns import DRAWN, NO_SOLVER, Entity
-from koopmpc.recording.format.rrd import LogColumns, read_columns
+from koopmpc.recording.format.rrd import LogColumns, naming, read_columns
 
 
 def load_run(path: str | Path) -> Run:
@@ -29,10 +29,8 @@ def load_run(path: str | Path) -> Run:
     """
     path = path_of(path)
     log = read_columns(path, tuple(f"/{entity}" for entity in Entity if entity not in DRAWN))
-    try:
+    with naming(path):
         return _run(log, path)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise LogError(f"{path} is damaged: {error}") from error
 
 
 def _run(log: LogColumns, path: Path) -> Run:

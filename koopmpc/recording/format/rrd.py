@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import disk
-from koopmpc.errors import LogError
+from koopmpc.errors import DataError, LogError
 from koopmpc.loop.run import Plans, Run, Step, StepRows
 from koopmpc.recording.format.columns import Entity
 from koopmpc.recording.format.logfile import intact
@@ -76,7 +76,7 @@ class LogColumns:
         k, widths, values = self.rows(entity, component)
         flat = values if isinstance(values, np.ndarray) else values.to_numpy(zero_copy_only=False)
         if len(widths) and (widths != widths[0]).any():
-            raise LogError(f"{entity} has rows of different lengths; the log was not written by koopmpc")
+            raise DataError(f"{entity} has rows of different lengths")
         return k, np.array(flat).reshape(len(k), int(widths[0]) if len(widths) else 0)
 
     def vectors(self, entity: str) -> np.ndarray:
@@ -151,6 +151,21 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
         raise
     except Exception as error:  # Rerun's reader raises exceptions of many kinds
         raise LogError(f"{path} is no log, or is damaged: {error}") from error
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Raise LogError with the name of the file where its columns are not what koopmpc writes.
+
+    Raises
+    ------
+    LogError
+        The block failed on a value that it took from the columns.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, NotImplementedError, TypeError, ValueError) as error:
+        raise LogError(f"{path} is damaged: {error}") from error
 
 
 def check_log(path: Path) -> None:
