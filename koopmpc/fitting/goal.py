@@ -59,6 +59,7 @@ def goal_template(data: Episodes) -> str:
     lines = [
         "# What the controller shall do. Numbers are in the units of the names; inf is no limit.",
         "# koopmpc fit LOGS --goal this-file designs it, koopmpc check CONTROLLER says whether it keeps the goal.",
+        "# References are medians of the last rows of the logs: change them to where the plant shall rest or go.",
         "",
         f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead: {horizon * data.dt:.3g} s",
     ]
