@@ -29,12 +29,12 @@ from koopmpc.predict.predictors import LinearPredictor
 class KoopmanMPC(MPCBase):
     """Minimise the Cost over N steps of z⁺ = A z + B u + E w + d, z_0 = ψ(x), within the Limits.
 
-    The backward Riccati recursion gives one matrix; times [z, 1], or [z, u_{−1}, w, d, 1] if those matter, it is the
-    unconstrained plan. If that plan meets every limit, it is the optimum (status UNCONSTRAINED). Otherwise the
-    condensed QP is solved for the deviation from that plan. It is warm-started with the last solution, shifted by one
-    step (OPTIMAL, or SOFTENED if a limit had to give way). A failed step falls back on the last plan, then on the
-    clipped unconstrained input, then on the last input. Inputs always keep their limits. Hard limits on their changes
-    are kept, too, unless they contradict the limits of the inputs.
+    The backward Riccati recursion gives a matrix M: the unconstrained plan is M [z; 1]. The last input, a measured
+    disturbance w and an estimated one d join that vector where they are used. If the plan meets every limit, it is the
+    optimum (status UNCONSTRAINED). Otherwise the condensed QP is solved for the deviation from that plan (OPTIMAL, or
+    SOFTENED if a limit had to give way); it starts from the last solution, shifted by one step. A failed step falls
+    back on the last plan, then on the clipped unconstrained input, then on the last input. Inputs always keep their
+    limits. Hard limits on their changes are kept, too, unless they contradict the limits of the inputs.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
@@ -45,7 +45,7 @@ class KoopmanMPC(MPCBase):
     cost, limits
         What to minimise, within what.
     horizon
-        N steps of the predictor's dt.
+        N steps of the predictor's dt. The attribute of this name is N + latency, the steps of reference that are read.
     moves
         Move blocking. A number M: M inputs, the last one held to the end of the horizon. A sequence: how many steps
         each input is held; they sum to N. By default every step has its own input.
@@ -56,7 +56,7 @@ class KoopmanMPC(MPCBase):
         Steps until an input acts: 1 where it is computed during a step and applied at its end. The plan starts at
         the state that is predicted for that time. Until the first input of a run takes effect, the controller
         assumes that the `u_prev` of `reset` acts: by default zero, or the limit nearest to zero if zero is not
-        allowed. The attribute `horizon` is N + latency: how many steps ahead the reference is read.
+        allowed.
     solver
         The solver that is asked first: "osqp", an operator-splitting method, or "daqp", an active-set method. A QP that
         OSQP has not solved in 100 iterations, or in the ``max_iter`` of `settings`, is handed over to DAQP.
@@ -142,7 +142,7 @@ class KoopmanMPC(MPCBase):
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference_key: bytes | None = None
-        self._given_row, self._rows_left = 0, False  # of a u_target in rows: this step's, and whether more follow
+        self._given_row, self._rows_left = 0, False  # u_target in rows: which is this step's, and whether others follow
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
     def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:
@@ -152,7 +152,8 @@ class KoopmanMPC(MPCBase):
     def coordinates(self) -> str:
         """The variables of the QP: "plain", the inputs, or "riccati", in which the Hessian is the identity.
 
-        OSQP works on the inputs where their Hessian is well conditioned, and DAQP always in Riccati coordinates.
+        OSQP works on the inputs where their Hessian is well conditioned, else in Riccati coordinates, as DAQP always
+        does.
         """
         return self._map.maps.coordinates
 
@@ -249,7 +250,11 @@ class KoopmanMPC(MPCBase):
         return Plan(X.reshape(self._N + 1, -1), moves.reshape(-1, self.nu)[self._move_of])
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
-        """Write the reference's part of the plan into the matrix's last column: all NaN if a row is not finite."""
+        """Write the part of the plan that depends on the reference into the last column of the plan's matrix.
+
+        Where a row of the reference is not finite, the column is NaN: no limit is met then, and the step ends in
+        BAD_MEASUREMENT.
+        """
         plan, maps, found = self._map, self._map.maps, self._map.targets
         R = self._reference = checks.reference_rows(reference, self._N, len(plan.track.tracked), self._latency)
         given, column = plan.track.given, plan.matrix[:, -1]

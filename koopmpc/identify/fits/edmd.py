@@ -37,8 +37,9 @@ def fit(
     regression
         The regression.
     ridge
-        Weight of ‖[A B] S‖², S the diagonal matrix of the regressors' column norms; without a rank, the identity if
-        the regression is not `scaled`. 0: the minimum-norm solution. "gcv": chosen by generalised cross-validation.
+        Weight of ‖[A B] S‖². S holds the column norms of the regressors on its diagonal; it is the identity without a
+        rank where the regression is not `scaled`. 0: the minimum-norm solution. "gcv": chosen by generalised
+        cross-validation.
     rank
         How many left singular vectors U_r of the unscaled snapshots ψ(x) to keep; then z = U_rᵀ ψ(x). A share or
         "hard-threshold" as in `edmd`.
@@ -178,8 +179,9 @@ def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> 
 def _forward_backward(rows: RegressionRows, nz: int) -> Solution:
     """Return K = [Aᵀ; Bᵀ] of z⁺ = A z + B u with the A whose bias by noise cancels to first order.
 
-    A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]: noise shrinks both, and A_b is A⁻¹. Of the square
-    roots of A_f A_b⁻¹ the one next to A_f is taken. B is the least squares fit of z⁺ − A z by u.
+    A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]. Without noise they are A and A⁻¹. Noise shrinks both, so in
+    A_f A_b⁻¹, about A², the shrinking cancels to first order. Of its square roots the one next to A_f is taken. B is
+    the least squares fit of z⁺ − A z by u.
 
     Parameters
     ----------
@@ -258,12 +260,11 @@ def edmd(
     embedding
         Delays, e.g. ``Delay(2)``: ψ then acts on the state and its past. C still returns x alone.
     ridge
-        Tikhonov weight on the coefficients of unit-norm columns. Where the lifting holds a `Constant`, it takes up the
-        means and is not shrunk: columns are then deviations from their mean, and where the data have their zero
-        changes nothing. With 0, singular values of the unit-norm columns below eps · max(M, nz + nu) times the largest
-        are cut; ``report.route`` gives the cut. "gcv" chooses the
-        weight by generalised cross-validation, with each observable's error relative to its size; the report holds
-        the chosen value.
+        Tikhonov weight on the coefficients of unit-norm columns. Where the lifting holds a `Constant`, the ridge acts
+        on deviations from the columns' means and leaves the constant term alone: another origin of the data gives the
+        same model. With 0, singular values of the unit-norm columns below eps · max(M, nz + nu) times the largest are
+        cut; ``report.route`` gives the cut. "gcv" chooses the weight by generalised cross-validation, with each
+        observable's error relative to its size; the report holds the chosen value.
     rank
         With rank=r the predictor is reduced to z = U_rᵀ ψ(x), with A = Ã (r, r), C U_r in place of C, and the exact
         DMD modes X′ V Σ⁻¹ W, W the eigenvectors of Ã. The columns are not scaled, so the truncated SVD depends on
@@ -276,9 +277,9 @@ def edmd(
         backward, assumes nothing about the size of the noise, but the motion must be reversible in time. Both treat
         the noise as added to ψ(x).
     towards
-        The model that a large ridge leads to. "affine" is x⁺ = A x + B u + c on the states, the Constant and the
-        inputs of the regression: there the ridge counts a millionth. With "zero" a ridge also makes an unstable plant
-        look tame, and controllers that believe it lose such plants.
+        The model that a large ridge leads to. "affine" is x⁺ = A x + B u + c on the states, the Constant and the inputs
+        of the regression: a ridge counts a million times less on those than on all others. With "zero" a ridge also
+        makes an unstable plant look tame, and controllers that believe it lose such plants.
     **options
         ``weights``, ``workers``, ``scheduler``, ``progress`` of `km.moments.second_moments`: who reads the data, and
         the weight of each pair.
