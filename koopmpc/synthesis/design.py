@@ -160,16 +160,23 @@ def design(
         recipe, near, outcome = rows[place].recipe, None, outcomes[place]
         if recipe.weighted:
             near = Nearness.of(outcome.visited, test.episodes)
-        model = recipe.fit(source, near, workers=workers, scheduler=scheduler)
-        controller = recipe.controller(model, asked.cost, test.limits(outcome.band), ahead)
-        if confirmed(test, controller, outcome):
-            return controller
+        for data in sets:
+            model = recipe.fit(data, near, workers=workers, scheduler=scheduler)
+            controller = recipe.controller(model, asked.cost, test.limits(outcome.band), ahead)
+            if confirmed(test, controller, outcome):
+                if data is not source:
+                    turned.append(
+                        f"{rows[place].title} is fitted without the episodes that took no part in the choice: with "
+                        "them it does worse on the surrogates"
+                    )
+                return controller
         turned.append(
             f"passed over: {rows[place].title}, for fitted to all data it does worse than fitted to two folds"
         )
         return None
 
     turned: list[str] = []
+    sets = [source, folds.episodes] if any(len(one) < forecast + first for one in held) else [source]
     controller, best = _first(made, rows, best)
     simple, linear = (controller, best) if linear == best else _first(made, rows, linear)
     if controller is None or best is None:

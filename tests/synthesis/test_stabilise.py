@@ -118,3 +118,33 @@ def test_bad_arguments_are_refused_in_a_sentence(change, sentence):
     given = {"equilibrium": equilibrium, "reach": reach, "u_min": low, "u_max": high} | change
     with pytest.raises(km.KoopmpcError, match=sentence):
         km.stabilise(plant, **given)
+
+
+@dataclass(frozen=True)
+class ReactionWheel(km.Dynamics):
+    """A pendulum upright, held by the torque on a wheel at its end."""
+
+    states = ("tilt [rad]", "rate [rad/s]", "wheel [rad/s]")
+    inputs = ("torque [N m]",)
+
+    def rhs(self, x, u):
+        turn = (0.981 * ca.sin(x[0]) - u[0]) / 0.025
+        return ca.vertcat(x[1], turn, u[0] / 0.004 - turn)
+
+
+@pytest.mark.slow
+def test_a_design_of_short_and_long_episodes_is_as_good_as_nonlinear_mpc():
+    """The short episodes are larger motions, which no lifted model of the long ones holds; they take no part."""
+    plant = km.discretize(ReactionWheel(), 0.02)
+    data = km.stabilise(plant, ([0, 0, 0], [0]), reach=[0.4, 3, 150], u_min=-1, u_max=1).data
+    assert min(map(len, data)) < 50 < max(map(len, data))
+    cost, limits = km.Cost(Q=[10, 0.1, 1e-4], R=1.0), km.Limits(u_min=-1, u_max=1, x_max=[0.3, np.inf, 120])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", km.FitWarning)
+        design = km.design(data, cost, limits, horizon=50, reference=[0, 0, 0])
+    loop = {"x0": [0.2, 0, 0], "reference": [0, 0, 0], "steps": 300, "cost": cost, "limits": limits}
+    own, best = (
+        km.metrics(km.simulate(plant, one, **loop)).cost
+        for one in (design.controller, km.NonlinearMPC(plant, cost, limits, 50))
+    )
+    assert own < 1.02 * best

@@ -47,8 +47,8 @@ class LogFile:
 
     def __init__(self, path: str | Path, *, growing: bool = False) -> None:
         self.path, self.growing = disk.target(path), growing
-        if self.path.suffix.lower() != ".rrd":
-            raise LogError(f"{path} would be a Rerun log under another name; name it {self.path.stem}.rrd")
+        if Path(path).suffix.lower() != ".rrd":
+            raise LogError(f"{path} would be a Rerun log under another name; name it {Path(path).stem}.rrd")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             if not growing:
