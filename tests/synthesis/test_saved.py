@@ -77,7 +77,6 @@ def test_what_is_no_controller_is_refused_in_a_sentence(tmp_path):
         (cut, "cut.npz"),
         (model, "holds a LinearPredictor, not a Controller or Design"),
         (text, "text.npz"),
-        (3, "3 is no path; pass the .npz of a saved Controller or Design"),
     ):
         with pytest.raises(km.KoopmpcError, match=sentence):
             km.load_controller(path)
