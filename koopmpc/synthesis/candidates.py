@@ -1,28 +1,44 @@
-"""The candidates of a selection by default: liftings for a plant of which nothing is known but its data."""
+"""Candidate and Recipe: a model to try, and how it and its controller are made; the candidates for an unknown plant."""
 
 import re
+import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import comb
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Limits
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.fits.edmd import Towards
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Source
+from koopmpc.errors import DataError, FitWarning, ShapeError
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.identify.fits.bilinear import bilinear_edmd
+from koopmpc.identify.fits.edmd import Towards, edmd
+from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.lifting.base import Lifting, lifting_of, short
 from koopmpc.lifting.composed import Standardized, Sum
 from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
 from koopmpc.lifting.state import Constant, Monomials, State
+from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Arrays, Value, from_data, to_data
 
 MOST = 120  # observables of a lifting that is tried unasked
 _REGRESSORS = 260  # [ψ(x) u u⊗ψ(x)] of a model that is tried unasked
 _EACH = 10  # snapshot pairs for each regressor, at least
 _POINTS = 2000  # of the data that distances are taken of
+_FLOOR = 1e-3  # weight of data that are far from every visited state
+_NEAR = 0.3  # this quantile of the squared distances is the square of the weights' width
+_VISITED = 300  # visited states that distances are taken to, at most
 _ANGLE = re.compile(r"(.*[\W_\d])?(theta|phi|psi|alpha|beta|gamma|angle|roll|pitch|yaw|heading|attitude)[\W_\d]*")
 
 
@@ -47,11 +63,9 @@ class Candidate(Value):
     embedding: Delay | None = None
     bilinear: bool = False
 
-    def __reduce__(
-        self,
-    ) -> tuple[Any, ...]:  # as data, so that a lifting of the user's own crosses processes too
+    def __reduce__(self) -> tuple[Any, ...]:  # as data, so that a lifting of the user's own crosses processes too
         arrays: Arrays = {}
-        return _unpacked, (to_data(self, arrays), arrays)
+        return from_data, (to_data(self, arrays), arrays)
 
     @property
     def delays(self) -> int:
@@ -211,7 +225,7 @@ def _scaled(
         return base + Standardized(lifting, whole.mean, whole.scale)
 
     for degree in (2, 3, 4, 5):
-        if _monomials(episodes.nx, degree) <= MOST:
+        if comb(episodes.nx + degree, degree) <= MOST:
             yield f"monomials {degree}", scaled(Monomials(degree))
     half = len(points) // 2
     apart = np.sqrt(np.sum((points[:half] - points[half : 2 * half]) ** 2, axis=1))
@@ -224,18 +238,135 @@ def _scaled(
         yield f"random fourier {count}", scaled(RandomFourier(count, width, rng))
 
 
-def _monomials(nx: int, degree: int) -> int:
-    """Return how many monomials there are of degree 0 … degree."""
-    number = 1
-    for i in range(1, degree + 1):
-        number = number * (nx + i) // i
-    return number
-
-
 def _title(lifting: Lifting) -> str:
     parts = lifting.parts if isinstance(lifting, Sum) else (lifting,)
     return " + ".join(type(part).__name__ for part in parts)
 
 
-def _unpacked(tree: Any, arrays: Arrays) -> Candidate:
-    return from_data(tree, arrays)
+Designed = KoopmanMPC | BilinearMPC
+
+
+@dataclass(frozen=True, eq=False)
+class Nearness(Value):
+    """Weight 1e-3 + exp(−d²/2h²) of each step of an episode, d the distance to the nearest visited state.
+
+    Attributes
+    ----------
+    visited
+        (n, nx) visited states, divided by `scale`.
+    scale
+        (nx,) standard deviation of each state in the data.
+    width
+        h, in units of `scale`.
+    """
+
+    visited: Float[np.ndarray, "n nx"]
+    scale: Float[np.ndarray, " nx"]
+    width: float
+
+    @staticmethod
+    def of(X: Float[np.ndarray, "m nx"], data: Episodes) -> "Nearness":
+        """Return the weights around the states X for these data: h² is the 0.3-quantile of their d²."""
+        scale = np.concatenate([episode.X for episode in data]).std(axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        apart = -(-len(X) // _VISITED)
+        around = Nearness(X[::apart] / scale, scale, 1.0)
+        squares = np.concatenate([around.squares(episode) for episode in data])
+        return replace(around, width=float(np.sqrt(max(np.quantile(squares, _NEAR), 1e-12))))
+
+    def squares(self, episode: Episode) -> Float[np.ndarray, " T"]:
+        """Return d² of each step."""
+        X = episode.X[:-1, : len(self.scale)] / self.scale  # under an embedding the state comes first
+        distance, _ = KDTree(self.visited).query(X)
+        return np.asarray(distance) ** 2
+
+    def __call__(self, episode: Episode) -> Float[np.ndarray, " T"]:
+        """Return the weight of each step."""
+        return _FLOOR + np.exp(-self.squares(episode) / (2 * self.width**2))
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe(Value):
+    """How a controller is made of data.
+
+    Attributes
+    ----------
+    candidate
+        Lifting, embedding and kind of the model: a linear one gives a KoopmanMPC, a bilinear one a BilinearMPC.
+    ridge
+        Tikhonov weight as in `edmd`.
+    estimator
+        The estimator of the controller, or None.
+    tail
+        Steps of the cost's tail where the cost names neither a tail nor Q_N; None for the default, 0 is Q_N = Q.
+    weighted
+        Fit the model again with weights around the states that its closed loops visit.
+    """
+
+    candidate: Candidate
+    ridge: float
+    estimator: LiftedDisturbance | None = None
+    tail: int | None = None
+    weighted: bool = False
+
+    def __str__(self) -> str:
+        """Return kind, name and delays of the model, and what the controller has besides the default."""
+        one, estimator = self.candidate, self.estimator
+        parts = [f"{one.kind}: {one.name}"]
+        if one.delays:
+            parts.append(f"{one.delays} delay{'s' * (one.delays > 1)}")
+        if self.tail == 0:
+            parts.append("Q_N = Q")
+        if estimator is not None:
+            parts.append("offset-free" + ("" if estimator.gain is None else f" (gain {estimator.gain:g})"))
+        if self.weighted:
+            parts.append("weighted")
+        return ", ".join(parts)
+
+    def fit(
+        self,
+        data: Episodes | Source,
+        near: Nearness | None = None,
+        *,
+        workers: int | None = None,
+        scheduler: str | None = None,
+    ) -> AnyPredictor:
+        """Return the model of these data, with the weights `near`. Doubts about the fit stand in its report."""
+        one = self.candidate
+        options = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FitWarning)
+            if not one.bilinear:
+                return edmd(
+                    data, one.lifting, embedding=one.embedding, ridge=self.ridge, towards=one.towards, **options
+                )
+            return bilinear_edmd(
+                data, one.lifting, embedding=one.embedding, ridge=self.ridge, difference=True, **options
+            )
+
+    def controller(
+        self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False
+    ) -> Designed:
+        """Return the controller of a model; one that is used `briefly` compiles no machine code of the model.
+
+        Raises
+        ------
+        KoopmpcError
+            The model and the cost do not go together.
+        """
+        if self.tail is not None and cost.Q_N is None and cost.tail is None:
+            cost = replace(cost, tail=self.tail)
+        if isinstance(model, BilinearPredictor):
+            kind = BriefMPC if brief else BilinearMPC
+            return kind(model, cost, limits, horizon, estimator=self.estimator)
+        return KoopmanMPC(model, cost, limits, horizon, estimator=self.estimator)
+
+
+class BriefMPC(BilinearMPC):
+    """A BilinearMPC whose model runs in the interpreter: for some hundred steps compiling takes longer than it saves.
+
+    All that does not depend on the model is still machine code, which later controllers find in the cache. The numbers
+    are the same.
+    """
+
+    _compiles_model = False

@@ -22,13 +22,12 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.parallel import Progress, StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, outside_data, outside_limits, unweighted
-from koopmpc.synthesis.candidates import Candidate, expanded, usual
+from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
 from koopmpc.synthesis.folds import Folds, folded, only, sampled, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
-from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
 from koopmpc.synthesis.select import RIDGES
 from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
 from koopmpc.validate.text import percent

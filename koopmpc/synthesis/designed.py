@@ -15,7 +15,7 @@ from koopmpc.control.saved import SavedController
 from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.asked import Asked
-from koopmpc.synthesis.recipes import Designed, Recipe
+from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.text import labelled, percent, table, written
 from koopmpc.values import Value

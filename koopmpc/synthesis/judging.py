@@ -19,8 +19,8 @@ from koopmpc.loop.simulate import simulate
 from koopmpc.plants.step_map import SimulatedPlant, StepMap
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import Asked
+from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
 from koopmpc.synthesis.folds import only, without
-from koopmpc.synthesis.recipes import Designed, Nearness, Recipe
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.scoring import AnyPredictor, score
 

@@ -14,8 +14,8 @@ from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import Asked
+from koopmpc.synthesis.candidates import Recipe
 from koopmpc.synthesis.cross_validation import HALF, Tried
-from koopmpc.synthesis.recipes import Recipe
 from koopmpc.validate.scoring import AnyPredictor, score
 from koopmpc.validate.text import quantity
 from koopmpc.values import Value
