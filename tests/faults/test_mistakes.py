@@ -32,7 +32,7 @@ def test_lqr_says_what_is_wrong_with_its_reference_and_its_disturbance(model, ba
 
 
 def test_a_number_is_no_path_of_a_controller():
-    with pytest.raises(km.errors.KoopmpcError, match="3 is no path; pass the .npz of a saved Controller or Design"):
+    with pytest.raises(km.errors.KoopmpcError, match=r"3 is no path; pass the \.npz of a saved Controller or Design"):
         km.load_controller(3)
 
 
