@@ -38,6 +38,11 @@ SWAPPED: dict[type[Any], type[Any]] = {
 }
 NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "any": "all", "all": "any"}
 DECLARED = ("annotation", "returns", "decorator_list", "bases")  # fields that hold types
+# What nobody could notice is left out: a comparison with a tolerance or a clock is an accident at the very end of it, a
+# number that stands for "next to nothing" or "far too much" may be twice as large, and a most that is never reached one
+# more; and CasADi's common subexpressions (cse) only save time.
+TOLERANCES = ("reach", "tolerance", "slack", "good", "enough", "close", "settled", "perf_counter", "monotonic")
+TINY, VAST, MANY = 1e-5, 1e5, 10
 SKIPPED = (ast.JoinedStr, ast.Raise, ast.Import, ast.ImportFrom, ast.Assert)  # what stands in them is said, not done
 
 
@@ -45,11 +50,24 @@ def _text(node: ast.AST) -> bool:
     return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
 
 
+def _tolerance(node: ast.AST) -> bool:
+    """Return whether a tolerance or a time is part of this: a float that is no whole number, or a name of one."""
+    for each in ast.walk(node):
+        name = each.id if isinstance(each, ast.Name) else each.attr if isinstance(each, ast.Attribute) else ""
+        if name in TOLERANCES or (len(name.strip("_")) > 2 and name.isupper()):
+            return True
+        if isinstance(each, ast.Constant) and isinstance(each.value, float) and not each.value.is_integer():
+            return True
+    return False
+
+
 def _changed(node: ast.AST) -> Iterator[tuple[ast.AST, ast.AST]]:
     """Yield the nodes to replace here, each with what takes its place."""
     match node:
         case ast.Compare(left, operators, others):
             for i, operator in enumerate(operators):
+                if isinstance(operator, ast.Lt | ast.LtE | ast.Gt | ast.GtE) and _tolerance(node):
+                    continue
                 swapped = [*operators[:i], SWAPPED[type(operator)](), *operators[i + 1 :]]
                 yield node, ast.Compare(left, swapped, others)
         case ast.BoolOp(operator, values):
@@ -65,7 +83,7 @@ def _changed(node: ast.AST) -> Iterator[tuple[ast.AST, ast.AST]]:
             yield node, ast.Constant(not value)
         case ast.Constant(int(value)):
             yield node, ast.Constant(value + 1)
-        case ast.Constant(float(value)):
+        case ast.Constant(float(value)) if value == 0 or TINY < value < VAST:
             yield node, ast.Constant(2 * value or 1.0)
         case ast.Call(ast.Name(name) as function) if name in NAMES:
             yield function, ast.Name(NAMES[name])
@@ -87,6 +105,10 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
     """Yield what stands in this node and does something: no types, and nothing that is only said."""
     if isinstance(node, SKIPPED):
         return
+    if isinstance(node, ast.Dict):
+        kept = [(k, v) for k, v in zip(node.keys, node.values, strict=True) if not (k and _most(ast.unparse(k)))]
+        yield from (child for pair in kept for child in pair if child is not None)
+        return
     for name, value in ast.iter_fields(node):
         if name not in DECLARED:
             yield from (
@@ -94,12 +116,19 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
             )
 
 
+def _most(key: str) -> bool:
+    return "max_iter" in key or key.strip("'") == "cse"
+
+
 def _is_skipped(node: ast.AST) -> bool:
-    """Return whether a node is a union of types, an import for them, a warning's words, or zip's assertion."""
+    """Return whether a node is a union of types, an import for them, a warning's words, zip's assertion, or a most."""
     if isinstance(node, ast.keyword) and node.arg == "strict":
         return True
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
         return True
+    if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant) and isinstance(node.targets[0], ast.Name):
+        value = node.value.value
+        return node.targets[0].id.isupper() and type(value) is int and value >= MANY
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
         return name in ("isinstance", "warn", "cast", "Literal")
