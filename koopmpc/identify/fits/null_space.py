@@ -12,7 +12,7 @@ from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.eigenfunction import Eigenfunction, jacobians
 
-_FLAT = 1e-9  # share of the largest gradient below which a combination of observables is constant
+_FLAT = 1e-9  # share of the largest gradient, or of its terms, below which a combination of observables is constant
 _EXACT = 1e-6  # relative residual below which no observable more is taken
 _REAL = 1e-6  # share of |λ|, or of the rate of the states, below which an imaginary part is rounding
 _ZERO = 1e-7  # share of its gradient below which a function vanishes on the data
@@ -82,10 +82,11 @@ class EigenfunctionRows:
         every = np.arange(self.lifting.nz)
         least = self._solved(value, self._null(value, every, 0.0, 1)[:, 0]).residual
         null = self._null(value, every, max(_GAP * least, _EXACT * self.speed), count)
-        if value:
+        size: Float[np.ndarray, " nz"] = np.linalg.norm(self.G, axis=0)
+        if value:  # a Constant counts by its value, for x − 3 may be an eigenfunction where x is none
             null = null[:, [not self._vanishes(c) for c in null.T]]
-        size = np.sqrt(np.sum(self.G**2, axis=0))[:, None]
-        return [(value, xi) for xi in _sparsest(null * size, size)]
+            size = np.where(size > 0, size, np.linalg.norm(self.R[:, len(size) : 2 * len(size)], axis=0))
+        return [(value, xi) for xi in _sparsest(null * size[:, None], size[:, None])]
 
     def explicit(self, count: int) -> list[Eigenpair]:
         """Return the eigenpairs of least squares with the smallest residuals, one of each conjugate pair."""
@@ -95,11 +96,12 @@ class EigenfunctionRows:
         size = np.where(size > 0, size, 1.0)
         K = np.linalg.lstsq(P / size, self.R[:, :nz], rcond=1e-12)[0] / size[:, None]
         values, vectors = np.linalg.eig(K[:nz])
+        sizes = np.vstack([self.G, self.R[:, nz : 2 * nz]])
         pairs: list[tuple[float, Eigenpair]] = []
         for j, mu in enumerate(values):
             xi: Inexact[np.ndarray, " nz"] = vectors[:, j]
             steepness = float(np.linalg.norm(self.G @ xi))
-            if abs(mu) < 1e-8 or steepness < _FLAT * float(np.linalg.norm(self.G * np.abs(xi))):
+            if abs(mu) < 1e-8 or steepness < _FLAT * float(np.linalg.norm(sizes * np.abs(xi))):
                 continue
             rate = complex(np.log(mu) / self.dt if self.by == "steps" else mu)
             if abs(rate.imag) < _REAL * max(abs(rate), self.speed):
@@ -139,18 +141,16 @@ class EigenfunctionRows:
                     break
         if (rate or free) and self._vanishes(solved.c):
             return None
-        beta = self._sparse_effect(rate, solved, allowed)
-        c = _turned(solved.c)
-        largest = float(np.abs(c).max())
-        last = int(np.flatnonzero(np.abs(c) > (1 - 1e-6) * largest)[-1])
+        beta, residual = self._sparse_effect(rate, solved, allowed)
+        size = np.abs(solved.c)
+        largest = float(size.max())
+        last = int(np.flatnonzero(size > (1 - 1e-6) * largest)[-1])
         factor = abs(solved.c[last]) / solved.c[last] / largest
         c, beta = solved.c * factor, beta * factor
         whole = [c.real] if not rate.imag else [c.real, c.imag]
         drive = [beta.real] if not rate.imag else [beta.real, beta.imag]
         rates = (rate.real,) if not rate.imag else (rate.real, rate.imag)
-        return Eigenfunction(
-            self.lifting, np.array(whole), rates, np.array(drive), residual=solved.residual / self.speed
-        )
+        return Eigenfunction(self.lifting, np.array(whole), rates, np.array(drive), residual=residual / self.speed)
 
     def _refined(
         self, value: complex, support: Int[np.ndarray, " s"], xi: Inexact[np.ndarray, " nz"], allowed: float, free: bool
@@ -223,18 +223,21 @@ class EigenfunctionRows:
         residual = float(np.linalg.norm(missed + F @ beta)) if steepness > 0 else np.inf
         return _Solved(c, beta.reshape(self.nu, self.lifting.nz), residual)
 
-    def _sparse_effect(self, value: complex, solved: _Solved, allowed: float) -> Inexact[np.ndarray, "nu nz"]:
-        """Return β on the fewest terms for which the residual stays below `allowed`."""
+    def _sparse_effect(
+        self, value: complex, solved: _Solved, allowed: float
+    ) -> tuple[Inexact[np.ndarray, "nu nz"], float]:
+        """Return β on the fewest terms for which the residual stays below `allowed`, and that residual."""
         M, F = self.parts(value)
         missed, beta = M @ solved.c, solved.beta.ravel()
         weight = np.abs(beta) * np.linalg.norm(F, axis=0)
-        for n in range(int(np.sum(weight > 0)) + 1):
+        for n in range(int(np.sum(weight > 0))):
             chosen = np.argsort(-weight, kind="stable")[:n]
             few = np.zeros_like(beta)
             few[chosen] = np.linalg.lstsq(F[:, chosen], -missed, rcond=1e-10)[0]
-            if float(np.linalg.norm(missed + F @ few)) <= allowed:
-                return few.reshape(solved.beta.shape)
-        return solved.beta
+            residual = float(np.linalg.norm(missed + F @ few))
+            if residual <= allowed:
+                return few.reshape(solved.beta.shape), residual
+        return solved.beta, solved.residual
 
 
 def _chunks(episodes: Episodes, by: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
