@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import solve_discrete_are
 
 import koopmpc as km
 from koopmpc.control.cost import state_tracking
@@ -196,3 +197,100 @@ def test_with_another_model_the_last_target_goes_on_from_where_it_was_without_ip
     assert np.abs(targets(row).u - old.u).max() > 1e-4
     np.testing.assert_allclose(targets(row).u, alone.u, atol=1e-6)
     np.testing.assert_allclose(targets(row).equilibrium.x, alone.equilibrium.x, atol=1e-6)
+
+
+@pytest.mark.parametrize("each", [SWING, TANKS], ids=["swing", "tanks"])
+def test_the_slope_of_an_equilibrium_is_how_its_input_moves_with_a_disturbance(each: Equilibria) -> None:
+    row = np.array([0.3, 0.0]) if each is SWING else np.array([0.6, 0.5])
+    here = each.near(each.find(row), row, np.zeros(2))
+    slope, h = each.slope(each.linearise(here.x, here.u)), 1e-5
+    for i, step in enumerate(h * np.eye(2)):
+        ahead, back = each.near(here, row, step), each.near(here, row, -step)
+        np.testing.assert_allclose(slope[:, i], (ahead.u - back.u) / (2 * h), rtol=1e-4, atol=1e-6)
+
+
+def ends(plant: km.StepMap, cost: km.Cost, row: np.ndarray, limits: km.Limits):
+    """Return the target of a row, and what a plan that ends in x after the input u pays for its end."""
+    read = state_tracking(plant.states, plant.nu, cost, limits)
+    target = TerminalTargets(learned_map(plant), cost, read, 1000)(row)
+
+    def price(x: np.ndarray, u: np.ndarray) -> float:
+        missed = target.M @ read.tracked(x).full().ravel() + target.L @ x + target.V @ u - target.m
+        return float(missed @ missed)
+
+    return target, price
+
+
+@pytest.mark.parametrize("u_target", ["equilibrium", "zero"])
+@pytest.mark.parametrize("R_delta", [None, [0.4, 0.2]])
+def test_where_states_are_tracked_the_end_costs_the_solution_of_the_riccati_equation(R_delta, u_target) -> None:
+    """With R_delta that of the state and the last input: ‖u − u_last‖² weighs their difference."""
+    plant = two_tanks()
+    cost = km.Cost(Q=[1, 2], R=[0.3, 0.5], R_delta=R_delta, u_target=u_target)
+    limits = km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2])
+    target, price = ends(plant, cost, np.array([0.6, 0.5]), limits)
+    x, u = target.equilibrium.x, target.equilibrium.u
+    np.testing.assert_allclose(x, [0.6, 0.5], atol=1e-5)
+    np.testing.assert_allclose(plant(x, u), x, atol=1e-8)
+    np.testing.assert_array_equal(target.u, u if u_target == "equilibrium" else 0 * u)
+    local = plant.linearize(x, u)
+    Q, R = np.diag([1.0, 2.0]), np.diag([0.3, 0.5])
+    P = solve_discrete_are(local.A, local.B, Q, R)
+    if R_delta is not None:
+        D, none = np.diag(R_delta), np.zeros((2, 2))
+        A, B = np.block([[local.A, none], [none, none]]), np.vstack([local.B, np.eye(2)])
+        P = solve_discrete_are(A, B, np.block([[Q, none], [none, D]]), R + D, s=np.vstack([none, -D]))
+    rng = np.random.default_rng(0)
+    for d, p in rng.standard_normal((6, 2, 2)):
+        both = d if R_delta is None else np.concatenate([d, p])
+        assert price(x + d, target.u + p) == pytest.approx(both @ P @ both, rel=1e-5)
+
+
+def test_what_no_small_motion_changes_of_the_tracked_outputs_keeps_its_weight_at_the_end() -> None:
+    """Upright, cos θ does not change at first order: far away it costs Q, by the mean of P over that of the others."""
+    plant, cost, limits = hinge(), km.Cost(Q=[3, 2, 0.1], R=0.1, of=UPRIGHT), km.Limits(-2, 2)
+    target, price = ends(plant, cost, np.array([0.0, 1.0, 0.0]), limits)
+    local = plant.linearize(target.equilibrium.x, target.u)
+    seen = np.diag([3, 0.1])
+    P = solve_discrete_are(local.A, local.B, seen, np.array([[0.1]]))
+    mean = np.trace(P @ np.linalg.inv(seen)) / 2
+    assert mean > 1
+    for theta, omega in ((0.1, 0.2), (np.pi / 2, -0.3), (np.pi, 0.0), (4.0, 1.0)):
+        d = np.array([np.sin(theta), omega])
+        wanted = d @ P @ d + mean * 2 * (np.cos(theta) - 1) ** 2
+        assert price(np.array([theta, omega]), target.u) == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("Q_N", [None, [2.0, 5.0]])
+def test_a_disturbance_moves_the_target_to_the_equilibrium_that_it_allows(Q_N) -> None:
+    plant, e, row = two_tanks(), np.array([0.01, -0.008]), np.array([0.6, 0.5])
+    cost = km.Cost(Q=[1, 2], R=0.3, Q_N=Q_N, R_delta=None if Q_N else 0.1)
+    read = state_tracking(plant.states, plant.nu, cost, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+    targets, last = TerminalTargets(learned_map(plant), cost, read, 1000), None
+    for _ in range(4):
+        last = targets.disturbed(row, e, last)
+    x, u = last.equilibrium.x, last.equilibrium.u
+    np.testing.assert_allclose(plant(x, u) + e, x, atol=1e-9)
+    np.testing.assert_allclose(x, row, atol=1e-5)
+    np.testing.assert_array_equal(last.u, u)
+    np.testing.assert_allclose(last.M @ x + last.L @ x + last.V @ u, last.m, atol=1e-5)
+    assert np.abs(u - targets(row).u).max() > 1e-3
+
+
+def test_a_row_whose_equilibrium_is_not_found_is_aimed_at_itself_until_it_is_looked_for_again(monkeypatch) -> None:
+    plant, row = two_tanks(), np.array([0.6, 0.5])
+    for cost, weight in ((km.Cost(Q=[1, 2], R=0.3, R_delta=0.1), [1, 2]), (km.Cost(1, 0.3, Q_N=[4, 9]), [4, 9])):
+        read = state_tracking(plant.states, plant.nu, cost, km.Limits([0.1, -1], 1))
+        targets = TerminalTargets(learned_map(plant), cost, read, 1000)
+        with monkeypatch.context() as patch:
+            patch.setattr(targets.equilibria, "find", lambda *rest: None)
+            target = targets(row)
+            assert targets(row) is target
+            assert targets.disturbed(row, np.array([0.01, 0.0]), None) is target
+        assert targets(row) is target
+        for x in np.random.default_rng(0).standard_normal((3, 2)):
+            missed = target.M @ x + target.L @ x + target.V @ np.ones(2) - target.m
+            assert missed @ missed == pytest.approx((x - row) ** 2 @ weight)
+        np.testing.assert_array_equal(target.u, [0.1, 0.0])
+        targets.forget_missed()
+        np.testing.assert_allclose(targets(row).equilibrium.x, row, atol=1e-5)
