@@ -156,3 +156,16 @@ def test_an_autonomous_plant_needs_no_input() -> None:
     data = km.collect(plant, [1, 2], lambda k, y, rng: [], episodes=1, steps=2)
     assert data[0].X.tolist() == [[1, 2], [0.5, 1], [0.25, 0.5]]
     assert data[0].U.shape == (2, 0)
+
+
+def test_a_plant_that_diverges_is_told_with_the_episode_and_the_step() -> None:
+    """One of two states is enough."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    ahead = ca.vertcat(x[0], ca.if_else(x[1] > 6, ca.inf, x[1] + u[0]))
+    plant = km.StepMap(ca.Function("F", [x, u], [ahead]), 0.1)
+    for excitation in (km.Noise(1, 1), lambda k, y, rng: [1.0]):
+        with pytest.raises(km.errors.DataError, match="episode 1 is NaN or infinite from step 5 on"):
+            km.collect(plant, [[0.0, -9.0], [0.0, 3.0]], excitation, episodes=2, steps=8)
+    driven = km.plants.SimulatedPlant(plant)
+    with pytest.raises(km.errors.DataError, match="episode 1 is NaN or infinite from step 5 on"):
+        km.collect(driven, [[0.0, -9.0], [0.0, 3.0]], km.Noise(1, 1), episodes=2, steps=8)

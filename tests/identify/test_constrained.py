@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.identify.constrained.convex import violation
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 from tests.roundtrip import returned
 
@@ -70,6 +71,13 @@ CASES = {
     "combinations": (
         km.identify.Prior(combinations=[km.identify.Combination(1, 1, A=np.ones((3, 3))), km.identify.Combination(0.2, np.inf, B=np.ones((3, 1)))]),
         lambda A, B: [cp.sum(A) == 1, cp.sum(B) >= 0.2],
+    ),
+    "combinations of both": (
+        km.identify.Prior(combinations=[
+            km.identify.Combination(-np.inf, -0.5, A=np.eye(3), B=2 * np.ones((3, 1))),
+            km.identify.Combination(0.3, 0.4, B=[[1], [0], [0]]),
+        ]),
+        lambda A, B: [cp.trace(A) + 2 * cp.sum(B) <= -0.5, B[0, 0] >= 0.3, B[0, 0] <= 0.4],
     ),
     "contraction": (
         km.identify.Prior(dissipation=km.identify.Dissipation(STORE, decay=0.5), mask_A=[[1, 1, 0], [1, 1, 0], [1, 1, 1]]),
@@ -266,3 +274,54 @@ def test_a_symmetry_that_the_plain_fit_has_needs_no_program() -> None:
     model = km.identify.constrained_edmd(skewed, km.State(), prior=km.identify.Prior(symmetric=True))
     assert "Clarabel under priors" in model.report.route
     assert np.array_equal(model.A, model.A.T)
+
+
+def test_bounds_that_the_plain_fit_meets_change_nothing() -> None:
+    data = random_episodes(2, [80], 2, 1)
+    plain = km.edmd(data, km.State())
+    ends = {f"{end}_{name}": getattr(plain, name) for end in ("lower", "upper") for name in ("A", "B")}
+    for some in (ends, {"lower_A": plain.A}, {"upper_A": plain.A, "upper_B": 9.0}):
+        model = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(**some))
+        assert np.array_equal(found(model), found(plain))
+        assert "linear algebra under priors" in model.report.route
+
+
+def test_the_report_counts_what_is_known_and_what_stands_at_a_bound_and_names_what_couples() -> None:
+    data = random_episodes(3, [40, 30], 2, 1)
+    prior = km.identify.Prior(mask_A=[[1, 1], [0, 1]], upper_B=[[-5.0], [np.inf]], lower_A=-9.0)
+    changes = km.identify.constrained_edmd(data, km.State(), prior=prior).report.changes
+    assert changes[:2] == ("1 of 6 entries of [A B] are known", "1 entries stand at a bound")
+    assert len(changes) == 3
+    for some, words in (
+        ({"symmetric": True}, "A is symmetric"),
+        ({"combinations": [km.identify.Combination(-9, 9, A=np.eye(2))]}, "combinations of entries are limited"),
+        ({"dissipation": km.identify.Dissipation([9, 9])}, "energy that is stored is dissipated as the prior says"),
+    ):
+        changes = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(**some)).report.changes
+        assert changes[0] == words
+        assert len(changes) == 2
+
+
+@pytest.mark.parametrize("share", [-1e-3, 0.0, 0.5, 1.0, 1.001])
+def test_a_violation_is_how_far_a_combination_lies_outside_its_limits(share: float) -> None:
+    A, B = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0], [6.0]])
+    total = 1.0 * A[0, 1] - 2 * A[1, 0] + 3 * B[1, 0]
+    each = km.identify.Combination(total - share, total - share + 1, A=[[0, 1], [-2, 0]], B=[[0], [3]])
+    own = violation(km.identify.Prior(combinations=[each]), A, B, np.ones(3))
+    assert own == pytest.approx(max(-share, share - 1, 0.0), abs=1e-12)
+
+
+def test_a_violation_of_symmetry_and_of_dissipation_is_relative_to_what_is_there() -> None:
+    A, B = np.array([[1.0, 0.5], [0.3, 0.2]]), np.zeros((2, 1))
+    for size in (1e-6, 1.0, 1e6):
+        own = violation(km.identify.Prior(symmetric=True), size * A, B, np.ones(3))
+        assert own == pytest.approx(0.2)
+        contraction = km.identify.Prior(dissipation=km.identify.Dissipation(np.diag([2.0, 1.0]) / size**2, decay=0.9))
+        L = np.diag(np.sqrt([2.0, 1.0]))  # in units of the sizes and of the largest energy
+        M = np.block([[0.81 * L @ L / 2, (L @ A).T / np.sqrt(2)], [L @ A / np.sqrt(2), np.eye(2)]])
+        found = violation(contraction, A, B, np.array([size, size, 1.0]))
+        assert found == pytest.approx(-np.linalg.eigvalsh(M)[0], rel=1e-9)
+    assert (
+        violation(km.identify.Prior(dissipation=km.identify.Dissipation(np.eye(2))), 0.5 * np.eye(2), B, np.ones(3))
+        == 0
+    )

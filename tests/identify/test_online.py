@@ -333,3 +333,17 @@ def test_a_rival_judges_by_the_second_half_of_each_of_its_periods():
         ]
         assert any(answers) == takes_over
         assert all(k % 100 == 99 for k, yes in enumerate(answers) if yes)  # at the end of a period
+
+
+@pytest.mark.parametrize(("states", "outliers"), [(1, 1), (2, 0)])
+def test_outliers_are_not_looked_for_with_a_memory_of_less_than_four_pairs_a_regressor(states, outliers):
+    """A memory of ten pairs is more than that for a state and an input, and less for two states and an input."""
+    rng = np.random.default_rng(0)
+    A, B = np.diag([0.5, 0.7])[:states, :states], np.ones((states, 1))
+    U = rng.uniform(-1, 1, (300, 1))
+    X = moving(A, B, np.zeros(states), U)
+    online = km.OnlineEDMD(km.State(), dt=0.1, states=("a", "b")[:states], inputs=("u",), forgetting=0.9)
+    online.learn(X[:-1], U, X[1:])
+    online.learn(X[-1], [0.0], 1e6 * np.ones(states))
+    assert online.outliers == outliers
+    assert online.pairs == 301 - outliers

@@ -176,3 +176,20 @@ def test_eigenvalues_come_by_magnitude_and_of_a_pair_the_negative_frequency_firs
     pairs = [r * np.exp(s * 1j * a) for r, a in sorted(zip(sizes, angles, strict=True), reverse=True) for s in (-1, 1)]
     np.testing.assert_allclose(model.eigenvalues, [0.9, *pairs], atol=1e-9)
     np.testing.assert_allclose(model.A @ model.modes, model.modes * model.eigenvalues, atol=1e-9)
+
+
+@given(st.integers(0, 99))
+def test_a_step_of_each_continuous_eigenvalue_is_the_eigenvalue_in_its_place(seed: int) -> None:
+    model = random_predictor(seed, 5, 0)
+    np.testing.assert_allclose(np.exp(km.spectrum.continuous_eigenvalues(model) * model.dt), model.eigenvalues)
+
+
+def test_the_error_over_an_evolution_is_that_of_its_definition() -> None:
+    model = random_predictor(4, 3, 0)
+    rng = np.random.default_rng(0)
+    runs = [rng.standard_normal((steps, 3)) for steps in (4, 7)]
+    data = km.Episodes([km.Episode(X=X) for X in runs], model.dt, model.states)
+    phis = [model.eigenfunctions(X) for X in runs]
+    gaps = [phi - phi[0] * model.eigenvalues ** np.arange(len(phi))[:, None] for phi in phis]
+    missed, size = (np.linalg.norm(np.vstack(some), axis=0) for some in (gaps, phis))
+    np.testing.assert_allclose(km.spectrum.evolution_error(model, data), missed / size)

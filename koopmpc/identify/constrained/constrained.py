@@ -17,6 +17,7 @@ from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, ridge_o
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
+_AT_BOUND = 1e-8  # distance of an entry from a bound that counts as none, on columns of unit norm: the solver's
 _MET = 1e-10  # violation of a prior that counts as none, in units of the data
 
 
@@ -75,7 +76,9 @@ def constrained_edmd(
         for status in sorted(statuses - {"optimal"})
     ]
     free = np.isnan(entries.known)
-    active = free & ((entries.low >= K.T) | (entries.high <= K.T))
+    size = norms(rows.P)
+    near = _AT_BOUND * np.outer(norms(rows.T), 1 / np.where(size > 0, size, np.inf))
+    active = free & ((entries.low >= K.T - near) | (entries.high <= K.T + near))
     changes = [f"{int((~free).sum())} of {free.size} entries of [A B] are known"] * bool((~free).any())
     changes += [f"{int(active.sum())} entries stand at a bound"] * bool(active.any())
     changes += [word for word, held in _COUPLINGS.items() if getattr(prior, held)]
