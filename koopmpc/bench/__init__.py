@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from koopmpc.bench.results import RunRow as RunRow
     from koopmpc.bench.results import failures as failures
     from koopmpc.bench.results import reached as reached
+    from koopmpc.bench.results import results_table as results_table
     from koopmpc.bench.results import row_to_view as row_to_view
     from koopmpc.bench.single import FAULTS as FAULTS
     from koopmpc.bench.single import replayed as replayed
     from koopmpc.bench.store import load_rows as load_rows
-    from koopmpc.bench.table import results_table as results_table
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

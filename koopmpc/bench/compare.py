@@ -13,10 +13,10 @@ from rich.table import Table
 from koopmpc import checks
 from koopmpc.bench.results import RunRow, reached
 from koopmpc.bench.store import load_rows
-from koopmpc.bench.table import plain_table
 from koopmpc.errors import LogError
 from koopmpc.loop.metrics import metrics
 from koopmpc.recording.format.reader import load_run
+from koopmpc.validate.text import plain_table
 
 SURE = 0.05  # a regression needs a p below this where there are enough pairs to reach it
 _ENOUGH = 6  # pairs from which the signed-rank test can reach SURE
@@ -54,21 +54,11 @@ class Compared:
     @property
     def table(self) -> Table:
         """A line for each case, controller and figure."""
-        lines = plain_table("B / A")
-        lines.add_column("run")
-        for heading in ("figure", "pairs", "median B / A", "p", "lost", ""):
-            lines.add_column(heading, justify="right")
+        lines = plain_table("B / A", ("run",), ("figure", "pairs", "median B / A", "p", "lost", ""))
         for each in self.pairs:
             p = "–" if np.isnan(each.p) else f"{each.p:.2g}"
-            cells = (
-                each.figure,
-                str(each.shared),
-                f"{each.ratio:.4g}",
-                p,
-                str(each.lost),
-                "worse" if each.worse else "",
-            )
-            lines.add_row(each.what, *cells, style="red" if each.worse else None)
+            cells = (each.figure, str(each.shared), f"{each.ratio:.4g}", p, str(each.lost))
+            lines.add_row(each.what, *cells, "worse" if each.worse else "", style="red" if each.worse else None)
         return lines
 
     def __str__(self) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 from rich.table import Table
 
 from koopmpc.bench.results import reached
-from koopmpc.bench.table import plain_table
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.loop.metrics import Metrics, beyond, duration, metrics
@@ -20,6 +19,7 @@ from koopmpc.loop.run import Run
 from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.model import ModelLog, load_model_log
 from koopmpc.recording.recorder import record
+from koopmpc.validate.text import plain_table
 
 _MOST = 5  # moments of one kind that are named
 
@@ -193,7 +193,7 @@ def worst_moments(run: Run) -> tuple[Moment, ...]:
 
 def inspection_table(found: Sequence[Inspected]) -> Table:
     """Return one line for each log."""
-    lines = plain_table(f"{len(found)} logs")
+    lines = plain_table(f"{len(found)} logs", ())
     lines.add_column("log", overflow="fold")
     for heading in ("cost", "violation", "late", "fell back", "slowest", ""):
         lines.add_column(heading, justify="right", no_wrap=True)

@@ -18,14 +18,13 @@ from rich.table import Table
 from koopmpc import disk
 from koopmpc.bench.results import ORACLE, RunRow
 from koopmpc.bench.store import load_rows, manifest_of
-from koopmpc.bench.table import plain_table
 from koopmpc.control.move import Fallback, Status
 from koopmpc.figures.sweeps import attraction, profiles, svg, times, trajectories
 from koopmpc.loop.metrics import duration
 from koopmpc.loop.run import Run
 from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.format.reader import load_run
-from koopmpc.validate.text import markdown_table
+from koopmpc.validate.text import markdown_table, plain_table
 
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
@@ -156,9 +155,7 @@ def summary_table(rows: Sequence[RunRow]) -> Group:
     """Return the summaries as tables for a terminal, one for each case."""
     parts: list[Table] = []
     for case, group in groupby(summaries(rows), key=lambda each: each.case):
-        lines = plain_table(case, padding=(0, 0, 0, 1))
-        for heading in _HEADINGS:
-            lines.add_column(heading, justify="left" if heading in ("controller", "condition") else "right")
+        lines = plain_table(case, _HEADINGS[:2], _HEADINGS[2:], padding=(0, 0, 0, 1))
         for own in group:
             lines.add_row(*_cells(own), style="red" if own.failed else None)
         parts.append(lines)

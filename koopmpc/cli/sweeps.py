@@ -193,9 +193,8 @@ def _sweep(
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
     from koopmpc.bench.report import summary_table, write_report
-    from koopmpc.bench.results import row_to_view
+    from koopmpc.bench.results import results_table, row_to_view
     from koopmpc.bench.sweep import sweep
-    from koopmpc.bench.table import results_table
 
     controller_names(controllers)
     folder = new_folder(logs, what) if folder is None else folder

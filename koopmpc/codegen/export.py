@@ -22,7 +22,7 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.disk import writing
 from koopmpc.errors import DataError
-from koopmpc.estimate.filtered import Kalman
+from koopmpc.estimate.kalman_filter import KalmanFilter
 from koopmpc.plants.compiled import compiler
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -188,7 +188,8 @@ def _measured(controller: Exportable, plant: StepMap, x: ca.SX, ny: int) -> ca.S
     """Return what the controller takes as y, of the plant's state x."""
     observer = controller._initial.observer if isinstance(controller, KoopmanMPC) else None
     predictor = None if isinstance(controller, BilinearMPC) else controller.predictor
-    if isinstance(observer, Kalman) and predictor is not None and len(predictor.lifting.bound_states) == x.numel():
+    filtered = isinstance(observer, KalmanFilter)
+    if filtered and predictor is not None and len(predictor.lifting.bound_states) == x.numel():
         system = observer._system
         H = np.zeros((ny, predictor.nz))
         H[:, system.kept] = system.M[:, : len(system.kept)]

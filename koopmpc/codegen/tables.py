@@ -15,8 +15,8 @@ from koopmpc.control.lqr import LQR
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
-from koopmpc.estimate.disturbance import Filtered
-from koopmpc.estimate.filtered import Kalman
+from koopmpc.estimate.disturbance import DisturbanceObserver
+from koopmpc.estimate.kalman_filter import KalmanFilter
 from koopmpc.estimate.observer import Measured
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -89,7 +89,7 @@ def refusal(controller: object) -> DataError | None:
             "and have a Python loop or a log ask the monitor"
         )
     observer = controller._initial.observer
-    if type(observer) not in (Measured, Filtered, Kalman):
+    if type(observer) not in (Measured, DisturbanceObserver, KalmanFilter):
         return DataError(
             f"the estimator {type(controller._estimator).__name__} cannot be written in C; "
             "use LiftedDisturbance or LiftedKalman"
@@ -138,7 +138,7 @@ def model_tables(
 def add_observer(tables: Tables, observer: object, predictor: LinearPredictor | None, latency: int) -> None:
     """Write the filter, and the linear model where it is advanced."""
     plan, sizes = tables.observer, tables.sizes
-    if isinstance(observer, Kalman):
+    if isinstance(observer, KalmanFilter):
         system, P, R = observer._system, observer._P, observer._R
         S = system.M @ P @ system.M.T + R
         unit = np.sqrt(S.diagonal())
@@ -164,10 +164,10 @@ def add_observer(tables: Tables, observer: object, predictor: LinearPredictor | 
             "filter_d": columns(system.to_d),
             "kept": np.asarray(system.kept, dtype=np.intc),
         }
-    elif isinstance(observer, Filtered):
+    elif isinstance(observer, DisturbanceObserver):
         sizes["ESTIMATOR"] = 1
         tables.reals["GAIN"] = observer.gain
-    if predictor is not None and (isinstance(observer, Filtered) or latency):
+    if predictor is not None and (isinstance(observer, DisturbanceObserver) or latency):
         plan["C"] = columns(predictor.C)
         plan |= {"A": columns(predictor.A), "B": columns(predictor.B), "E": columns(predictor.E)}
 

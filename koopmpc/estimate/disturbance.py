@@ -72,12 +72,12 @@ class LiftedDisturbance(Value):
         if self.gain is not None and checks.positive(self.gain, "gain") > 1:
             raise DataError(f"gain is {self.gain:g}; it must be in (0, 1], and 1 is deadbeat")
 
-    def start(self, model: LinearPredictor | StateModel, horizon: int) -> "Filtered":
+    def start(self, model: LinearPredictor | StateModel, horizon: int) -> "DisturbanceObserver":
         """Return the observer of one controller with plans of this many steps."""
-        return Filtered(model, max(1 - exp(-4 / horizon), GAIN) if self.gain is None else self.gain)
+        return DisturbanceObserver(model, max(1 - exp(-4 / horizon), GAIN) if self.gain is None else self.gain)
 
 
-class Filtered(Viewing, Measured):
+class DisturbanceObserver(Viewing, Measured):
     """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is.
 
     The Constant and the past of a state have no disturbances. A step is one product,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.disturbance import GAIN
-from koopmpc.estimate.filtered import Augmented, FilterModel, Kalman
+from koopmpc.estimate.kalman_filter import Augmented, FilterModel, KalmanFilter
 from koopmpc.estimate.observer import StateModel
 from koopmpc.lifting.base import Lifting, short
 from koopmpc.predict.predictors import LinearPredictor
@@ -125,7 +125,7 @@ class LiftedKalman(Value):
         checks.count(self.delay, "delay", 0)
         checks.count(self.patience, "patience", 0)
 
-    def start(self, model: LinearPredictor | StateModel, horizon: int) -> Kalman:
+    def start(self, model: LinearPredictor | StateModel, horizon: int) -> KalmanFilter:
         """Return the observer of one controller with plans of this many steps.
 
         Raises
@@ -140,7 +140,7 @@ class LiftedKalman(Value):
                 "LiftedKalman filters the lifted state of a linear predictor, and this controller plans in the state "
                 "itself; pass a LiftedDisturbance"
             )
-        return Kalman(partial(self._model, min(horizon / 4, SLOWEST)), model, self.delay, self.patience)
+        return KalmanFilter(partial(self._model, min(horizon / 4, SLOWEST)), model, self.delay, self.patience)
 
     def _model(self, settling: float, predictor: LinearPredictor) -> FilterModel:
         """Return the filter's matrices for a predictor, or say why there are none; `settling` in steps."""

@@ -22,17 +22,17 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from rich.table import Table
 
-from koopmpc.bench.table import plain_table
 from koopmpc.checks import nearest
 from koopmpc.errors import FitWarning, ProblemError
 from koopmpc.figures.plots import Plot, plots
 from koopmpc.parallel import map_tasks
-from koopmpc.recording.page import Page
-from koopmpc.recording.views.curves import record_curves
+from koopmpc.recording.page import Page, record_curves
+from koopmpc.validate.text import plain_table
 
 PAPERS = ("snyder", "brunton", "proctor", "williams", "korda", "dictionary", "kaiser", "kic", "kernel")
-_HOME = {"kic": "proctor", "kernel": "williams"}  # papers that stand in the file of an earlier one of their authors
+_HOME = {"brunton": "proctor", "kic": "proctor", "kernel": "williams"}  # papers in a file with others of their authors
 
+_VERDICTS = ("where", "the paper", "verdict", "ours, or why")
 _ROUNDING = 1e-10
 _HUGE = 100.0  # a relative error beyond it has no digits worth reading
 Tell = Callable[[str], None]  # is called with what runs now
@@ -104,9 +104,7 @@ def unwarned() -> Generator[None]:
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
     """Return a table with one line for each claim."""
-    lines = plain_table(title, padding=(0, 1, 0, 0))
-    for heading in ("where", "the paper", "verdict", "ours, or why"):
-        lines.add_column(heading)
+    lines = plain_table(title, _VERDICTS, padding=(0, 1, 0, 0))
     for claim in claims:
         lines.add_row(claim.where, claim.says, claim.verdict.value, claim.why)
     return lines
@@ -114,10 +112,7 @@ def verdict_table(title: str, claims: Sequence[Claim]) -> Table:
 
 def verdicts(page: Page, claims: Sequence[Claim]) -> None:
     """Add the same table to a page."""
-    page.table(
-        ("where", "the paper", "verdict", "ours, or why"),
-        [(c.where, c.says, f"**{c.verdict.value}**", c.why) for c in claims],
-    )
+    page.table(_VERDICTS, [(c.where, c.says, f"**{c.verdict.value}**", c.why) for c in claims])
 
 
 def summary(claims: Sequence[Claim]) -> str:
@@ -281,9 +276,7 @@ def counts(claims: Sequence[Claim]) -> tuple[int, ...]:
 
 def summary_table(found: Sequence[TimedReproduction]) -> Table:
     """Return a table with one line for each paper, and its time."""
-    lines = plain_table("Papers", padding=(0, 1, 0, 0))
-    for heading in (*SUMMARY, "required", "missed", "time [s]"):
-        lines.add_column(heading)
+    lines = plain_table("Papers", (*SUMMARY, "required", "missed", "time [s]"), padding=(0, 1, 0, 0))
     for each in found:
         claims, failed = each.outcome.claims, each.outcome.failed
         required = sum(claim.required for claim in claims)

@@ -18,8 +18,7 @@ from koopmpc.figures.plane import Axes, Plane, plane_through
 from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.description import drawable, written_with
-from koopmpc.recording.format.columns import Entity
-from koopmpc.recording.format.rrd import naming, read_columns
+from koopmpc.recording.format.rrd import Entity, naming, read_columns
 from koopmpc.recording.format.writer import file_recording, times
 from koopmpc.recording.views.blueprint import color, framed, shared_time
 from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view

@@ -15,8 +15,7 @@ from koopmpc.figures.animation import Stroke, draw_frames, project, save_video
 from koopmpc.recording.description import title_of
 from koopmpc.recording.format.reader import about_of
 from koopmpc.recording.format.rrd import LogColumns, naming, read_columns
-from koopmpc.recording.views.scenes import BACKGROUND
-from koopmpc.recording.views.shapes import faces
+from koopmpc.recording.views.scenes import BACKGROUND, faces
 from koopmpc.scene import Color
 
 

@@ -3,10 +3,11 @@
 import re
 from collections.abc import Iterable, Sequence
 from io import StringIO
+from typing import Any
 
 from rich import box
 from rich.console import Console, RenderableType
-from rich.table import Table
+from rich.table import Column, Table
 
 WIDTH = 100  # columns of a report
 _WIDEST = 200  # columns of its tables, at most
@@ -44,6 +45,12 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1)
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = (), **settings: Any) -> Table:
+    """Return an empty table with its title at the left, one rule below the headings, and numbers to the right."""
+    headers = [*words, *(Column(heading, justify="right") for heading in numbers)]
+    return Table(*headers, title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, **settings)
 
 
 def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -11,8 +11,7 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.bench.results import RunRow, write_results
-from koopmpc.recording.page import Page
-from koopmpc.recording.views.curves import Curves, record_curves
+from koopmpc.recording.page import Curves, Page, record_curves
 from tests.recording.runs import make_run
 
 

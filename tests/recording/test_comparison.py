@@ -9,9 +9,9 @@ import pytest
 import koopmpc as km
 from koopmpc.loop.metrics import running_cost
 from koopmpc.recording.format.rrd import read_columns
+from koopmpc.recording.page import Curves, record_curves
 from koopmpc.recording.video import export_video
 from koopmpc.recording.views.comparison import record_comparison
-from koopmpc.recording.views.curves import Curves, record_curves
 from tests.recording.runs import make_run
 
 

@@ -13,8 +13,7 @@ from koopmpc.disk import path_of
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run
 from koopmpc.recording.description import from_json
-from koopmpc.recording.format.columns import DRAWN, NO_SOLVER, Entity
-from koopmpc.recording.format.rrd import LogColumns, naming, read_columns
+from koopmpc.recording.format.rrd import DRAWN, NO_SOLVER, Entity, LogColumns, naming, read_columns
 
 
 def load_run(path: str | Path) -> Run:

@@ -26,9 +26,8 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
-from koopmpc.recording.format.columns import NO_SOLVER, Entity
 from koopmpc.recording.format.logfile import CHECK, LogFile
-from koopmpc.recording.format.rrd import LogBlock, blocks
+from koopmpc.recording.format.rrd import NO_SOLVER, Entity, LogBlock, blocks
 from koopmpc.recording.views.blueprint import (
     LOG_TIME,
     SEPARATE,

@@ -56,7 +56,7 @@ class FilterModel(NamedTuple):
     R: Float[np.ndarray, "ny ny"]
 
 
-class Kalman(Viewing):
+class KalmanFilter(Viewing):
     """The observer of a `LiftedKalman`: s ← s + K (y − M s − h), the gain K from the stationary covariance P.
 
     Entries of y that are NaN are left out of the correction; where all are NaN, s is only predicted. Where no entry is
