@@ -5,6 +5,7 @@ With KOOPMPC_TESTS=bare nothing is checked: tests/speed measures what users run.
 """
 
 import os
+from pathlib import Path
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
@@ -18,6 +19,32 @@ import tests.typecheck  # noqa: F401  # the hook looks it up by name
 MODE = os.environ.get("KOOPMPC_TESTS", "")
 if MODE == "typed":
     install_import_hook("koopmpc", "tests.typecheck.beartyped")
+
+LONGEST = [
+    "fitting/test_fit.py",
+    "synthesis/test_design.py",
+    "validate/logs/test_audit.py",
+    "faults/test_sweeps.py",
+    "test_parallel.py",
+    "bench/test_problems.py",
+    "codegen/test_export.py",
+    "codegen/test_bilinear.py",
+    "bench/test_sweep.py",
+    "bench/test_store.py",
+    "bench/test_shipped.py",
+    "faults/test_logs.py",
+    "test_first_edition.py",
+    "test_cli.py",
+    "identify/test_moments_sources.py",
+    "control/test_koopman_mpc.py",
+]  # files that take a process 8 s and more
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files: at the end no process waits long for another."""
+    place = {Path(__file__).parent / file: i for i, file in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
+
 
 settings.register_profile("default", deadline=None, max_examples=30, derandomize=True)
 settings.load_profile("default")

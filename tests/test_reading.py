@@ -64,7 +64,7 @@ MOST = {  # files, returns
 
 @pytest.fixture(scope="module")
 def followed():
-    lines = (line.split() for line in shown(FOLLOWED))
+    lines = (line.split() for line in shown(FOLLOWED, fresh=True))
     return {name: (int(files), int(returns)) for name, files, returns in lines}
 
 

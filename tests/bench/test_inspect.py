@@ -13,9 +13,9 @@ from tests.bench.tiny import write
 def swept(tmp_path_factory):
     folder = tmp_path_factory.mktemp("inspected")
     problem = km.load_problem(write(folder))
-    return km.sweep(
-        [problem], ["lqr", "koopman-mpc"], folder=folder / "logs", faults=True, starts=2, log_starts=2
-    ), folder
+    names, logs = ["lqr", "koopman-mpc"], folder / "logs"
+    rows = km.sweep([problem], names, folder=logs / "starts", starts=2, log_starts=2)
+    return [*rows, *km.sweep([problem.select("near")], names, folder=logs / "faults", faults=True)], folder
 
 
 def test_a_log_says_what_ran_and_its_metrics_by_itself(swept):

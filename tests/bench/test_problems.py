@@ -3,6 +3,7 @@
 import ast
 import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,15 @@ STEPS = 4
 @pytest.fixture(params=sorted(FILES))
 def path(request: pytest.FixtureRequest) -> Path:
     return FILES[request.param]
+
+
+@cache
+def few(path: Path) -> Prepared:
+    """Return the parts of the problem in this file, with little data to learn from."""
+    problem = km.load_problem(path)
+    training = problem.training
+    x0 = training.x0 if isinstance(training.x0, km.Uniform) else np.asarray(training.x0)[:40]
+    return Prepared(replace(problem, training=replace(training, x0=x0, episodes=40, steps=min(training.steps, 25))))
 
 
 def test_the_library_holds_what_its_page_lists():
@@ -56,10 +66,9 @@ def test_a_problem_is_one_short_file_that_imports_numpy_casadi_and_koopmpc_alone
 
 
 def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Path):
-    problem = km.load_problem(path)
-    training, large = problem.training, problem.dynamics.nx > 20
-    few = training.x0 if isinstance(training.x0, km.Uniform) else np.asarray(training.x0)[:40]
-    parts = Prepared(replace(problem, training=replace(training, x0=few, episodes=40, steps=min(training.steps, 25))))
+    parts = few(path)
+    problem = parts.problem
+    large = problem.dynamics.nx > 20
     first = next(iter(problem.cases))
     for name, case in problem.cases.items():
         limits = problem.limits_of(name)
@@ -87,7 +96,7 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
 
 
 def test_each_problem_draws_the_same_shapes_wherever_it_is(path: Path):
-    problem = km.load_problem(path)
+    problem = few(path).problem
     scene = problem.scene or problem.dynamics.scene
     rng = np.random.default_rng(0)
     low, high = problem.limits.inputs(problem.dynamics.nu)
@@ -105,10 +114,11 @@ def test_each_problem_draws_the_same_shapes_wherever_it_is(path: Path):
 
 
 def test_each_problem_says_where_it_is_from_and_rests_where_it_says(path: Path):
-    problem = km.load_problem(path)
+    parts = few(path)
+    problem = parts.problem
     assert problem.title.count(":") == 1
     x, u = (np.asarray(part) for part in problem.equilibrium)
-    x_next = Prepared(problem).step_map(x, u)
+    x_next = parts.step_map(x, u)
     np.testing.assert_allclose(x_next, x, atol=1e-3 * (1 + np.abs(x).max()))
 
 

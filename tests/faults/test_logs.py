@@ -70,7 +70,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("share", [0.1, 0.9])
 def test_a_log_cut_before_its_description_is_refused(written: Path, tmp_path: Path, share: float) -> None:
     whole = written.read_bytes()
     (tmp_path / "cut.rrd").write_bytes(whole[: int(share * whole.find(b"koopmpc-log-2"))])
@@ -78,7 +78,7 @@ def test_a_log_cut_before_its_description_is_refused(written: Path, tmp_path: Pa
         km.load_run(tmp_path / "cut.rrd")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 0.999, 1.0])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4, 0.7, 0.999, 1.0])
 def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(written: Path, tmp_path: Path, share: float) -> None:
     path, whole = tmp_path / "cut.rrd", written.read_bytes()
     run = make_run(T=60)
@@ -133,7 +133,7 @@ def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> No
     km.record(run, whole)
     data = whole.read_bytes()
     found = []
-    for share in (*np.linspace(0.0, 1.0, 12, endpoint=False), 1 - 1 / len(data)):
+    for share in (*np.linspace(0.1, 1.0, 6, endpoint=False), 1 - 1 / len(data)):
         path.write_bytes(data[: int(share * len(data))])
         read, said = outcome(path)
         steps = 0 if read is None else read.steps
@@ -148,7 +148,7 @@ def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> No
     assert found[-1] == 450
 
 
-@pytest.mark.parametrize("count", [6, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("grown", [False, True], ids=["record", "Recorder"])
 def test_a_log_cut_at_a_random_byte_is_read_and_repaired_or_refused(
     written: Path, tmp_path: Path, grown: bool, count: int

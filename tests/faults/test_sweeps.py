@@ -12,9 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from tests.bench.test_store import GRID, TWO, figures
+from tests.bench.test_store import TWO, figures
 from tests.bench.tiny import write
 from tests.cluster import two_workers
+
+GRID = {"starts": 4, "seeds": 2, "noise": [0.0, 0.05]}
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +42,15 @@ def script_of(problem, folder, grid, more=""):
     return script
 
 
-def killed_and_resumed(problem, folder, moments, grid):
-    """Start the sweep in a process of its own, kill it at each moment [s], and end it in peace."""
+def killed_and_resumed(problem, folder, moments, grid, most=10**9):
+    """Start the sweep in a process of its own, kill it at each moment [s] or once it has `most` lines, and end it in peace."""
     script = script_of(problem, folder, grid)
     for moment in moments:
         before = {row.key for row in km.bench.load_rows(folder)} if (folder / "sweep.json").exists() else set()
         process = subprocess.Popen([sys.executable, script], start_new_session=True)
-        time.sleep(moment)
+        ends = time.monotonic() + moment
+        while time.monotonic() < ends and once_each(folder) < most:
+            time.sleep(0.02)
         process.kill()
         process.wait()
         if (folder / "sweep.json").exists():
@@ -79,7 +83,7 @@ def once_each(folder):
 
 
 def test_a_sweep_that_was_killed_goes_on_where_it_was(problem, peace, tmp_path):
-    rows = killed_and_resumed(problem, tmp_path / "killed", [4.0], GRID)
+    rows = killed_and_resumed(problem, tmp_path / "killed", [60.0], GRID, most=5)
     assert figures(rows) == figures(peace)
     assert once_each(tmp_path / "killed") == len(rows)
 

@@ -78,7 +78,7 @@ def fitted(tmp_path_factory):
     result = subprocess.run(command, cwd=place, capture_output=True, encoding="utf8", check=False)
     assert result.returncode == 0, result.stderr
     (folder,) = (place / "logs").iterdir()
-    return folder, result, cart_pole(20, steps=60, rng=1)
+    return folder, result, cart_pole(12, steps=60, rng=1)
 
 
 def test_csv_logs_of_an_unknown_plant_give_a_predictor_without_any_option(fitted):
@@ -126,7 +126,7 @@ def test_the_model_is_read_in_a_process_that_never_saw_its_lifting(fitted):
     assert int(done.stdout) > 5, done.stderr
 
 
-@pytest.mark.usefixtures("few")
+@pytest.mark.usefixtures("quick")
 def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
     rng, made = np.random.default_rng(0), []
     for _ in range(20):
@@ -245,6 +245,7 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
         raise RuntimeError("no ink")
 
     monkeypatch.setattr(koopmpc.fitting.fit, "record_model", fails)
+    monkeypatch.setattr(koopmpc.fitting.fit, "_ROLLOUTS", 0)
     monkeypatch.setattr(koopmpc.fitting.fit, "spectrum", fails)
     write_csv(cart_pole(16), tmp_path / "csv")
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,5 @@
 """Moments of files, streams, processes and a cluster are the same to the bit; weights count pairs twice."""
 
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from tests.cluster import two_workers
 from tests.identify.plants import brute_force, random_episodes
-from tests.tasks import by_first_state, dying_reader
+from tests.tasks import always_dying, by_first_state, dying_reader
 
 LIFTING = km.Constant() + km.State() + km.Monomials(2)
 USERS = km.State() + km.Expressions(lambda x: [x[0] * x[1]], ["x0 x1"])  # a lambda, which does not pickle
@@ -76,14 +75,6 @@ def test_a_worker_that_dies_while_it_reads_changes_nothing(folder: Path, schedul
     (folder / "1.died").unlink()
     assert km.moments.second_moments(source, LIFTING, route="gram", scheduler=scheduler) == here
     assert (folder / "1.died").exists()
-
-
-def always_dying(path: Path) -> km.Episodes:
-    import os
-
-    if path.name == "1.npz":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return dying_reader(path)
 
 
 def test_a_file_that_kills_each_worker_is_named(folder: Path) -> None:

@@ -23,8 +23,10 @@ def test_it_is_silent_on_logs_of_a_sound_plant(seed):
 
 @pytest.mark.parametrize("kind", list(FAULTS))
 def test_each_kind_of_fault_is_found_in_two_of_three_logs_that_have_it(kind):
-    reports = [km.validate.audit(faulty(kind, seed)[1]) for seed in range(3)]
-    assert sum(kind in report.kinds for report in reports) >= 2, "\n".join(map(str, reports))
+    reports = []
+    while len(reports) < 3 and sum(kind in report.kinds for report in reports) < 2:
+        reports.append(km.validate.audit(faulty(kind, len(reports))[1]))
+    assert sum(kind in report.kinds for report in reports) == 2, "\n".join(map(str, reports))
 
 
 @pytest.mark.slow
