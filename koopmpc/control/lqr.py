@@ -176,11 +176,8 @@ class LQR(FeedbackLaw):
         return np.where(np.abs(row) < HUGE, row, np.nan)
 
     def _aim(self, reference: Float[np.ndarray, "..."], w: Float[np.ndarray, " nw"] | None) -> None:
-        """Set the feedforward of a reference and a disturbance."""
+        """Set the feedforward of a reference and a disturbance, NaN where one of them is NaN."""
         row = checks.reference_rows(reference, 0, self._nr)
-        if not np.isfinite(row).all() or (w is not None and not np.isfinite(w).all()):
-            self._feedforward = np.full(self.nu, np.nan)
-            return
         found = self._targets
         if self._given_rows is not None:
             u_r = self._given_rows[self._row]
