@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.control.monitor import _bounds
 from tests.bare import shown
 from tests.example_plants import Pendulum
 
@@ -241,3 +242,13 @@ def test_errors_near_rounding_count_as_a_billionth_of_the_states():
     expected = np.linalg.inv(E.T @ E / len(E) + np.diag((1e-9 * rms) ** 2))
     got = monitor.band.T @ monitor.band
     np.testing.assert_allclose(got / np.trace(got), expected / np.trace(expected), rtol=1e-6)
+
+
+def test_where_the_data_have_no_width_they_count_as_a_billionth_of_their_widest_direction():
+    """Rows (a, a) in units of their size: along (1, 1) the second moment is 2, along (1, −1) it is 2e-9 in place of 0."""
+    a = np.random.default_rng(0).standard_normal(50)
+    G = _bounds(np.column_stack([a, 3 * a]), 0.0, np.ones((1, 2)), 40)
+    size = np.sqrt(np.mean(a**2))
+    inside = np.sort((a / size) ** 2)[39]  # (a, a) in units of the size, by the width along it
+    across = np.array([1.0, -3.0]) * size
+    assert (G @ across) @ (G @ across) == pytest.approx(2 / 2e-9 / inside, rel=1e-4)

@@ -4,7 +4,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.limits import Softness
-from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
 from koopmpc.control.solvers.qp import QP
 from tests.bare import shown
 from tests.control.solvers.random_qps import exactness, random_qp
@@ -167,7 +167,7 @@ def test_settings_that_daqp_would_swallow():
         """
 from koopmpc.control.solvers.qp import QP
 from koopmpc.control.limits import Softness
-from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
 one = np.ones(1)
 show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5}))
 """
@@ -203,3 +203,40 @@ def test_the_metric_of_hard_rows_is_as_large_as_the_cost():
         solver = DAQP(QP(P, ONE, A, none - 1, none + 1, Softness(np.array(linear), none + 1, none)))
         gram = rows.T @ rows
         np.testing.assert_allclose(solver._metric(), gram * 10.0 / np.trace(gram), rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4])
+def test_an_answer_is_accurate_to_a_share_of_the_size_of_its_terms(size):
+    """½‖v − 3 s‖² with v₀ ≤ s hard and v₁ ≤ s for 1 s ε + ½ ε²: v = (1, 1.5) s, λ = (2, 1.5) s; v₂ has no limit near."""
+    prices = Softness(np.array([np.inf, size, size]), np.array([0, 0.5, 0.5]), np.zeros(3))
+    far = np.full(3, -100 * size)
+    solver = DAQP(QP(np.eye(3), np.full(3, -3 * size), np.eye(3), far, np.array([size, size, 100 * size]), prices))
+    found = solved(solver, 3, 3)
+    v, y = size * np.array([1, 1.5, 3]), size * np.array([2, 1.5, 0])
+    np.testing.assert_allclose(found.v, v, rtol=1e-9)
+    np.testing.assert_allclose(found.y, y, rtol=1e-9, atol=1e-12)
+    solver._send(None)
+    little, much = 0.2 * _ACCURACY * size, 12 * _ACCURACY * size
+    assert solver._accurate(v, y)
+    for i, row in enumerate(np.eye(3)):
+        for sign in (1, -1):
+            assert solver._accurate(v + sign * little * row, y)  # H v + f + Mᵀλ is nearly 0
+            assert not solver._accurate(v + sign * much * row, y)
+            assert solver._accurate(v + sign * little * row, y - sign * little * row)
+            if i < 2:  # at the end that it pushes to, and for its price
+                assert not solver._accurate(v + sign * much * row, y - sign * much * row)
+    beyond = 30 * size
+    assert not solver._accurate(v + beyond * np.eye(3)[2] * 4, y - beyond * np.eye(3)[2] * 4)
+
+
+def test_hard_rows_alone_are_accurate_where_they_are_met():
+    for size in (1.0, 1e4):
+        solver = DAQP(QP(np.eye(2), np.full(2, -3 * size), np.ones((2, 2)) + EYE, -size * ONE, size * ONE))
+        found = solved(solver)
+        solver._send(None)
+        multipliers = found.y / solver._multipliers
+        x = found.v / solver._columns
+        assert solver._accurate(x, multipliers)
+        assert not solver._accurate(x + 1e-3 * size, multipliers)
+        across = np.linalg.solve((np.ones((2, 2)) + EYE).T * solver._rows, np.full(2, -1e-3 * size))
+        assert not solver._accurate(x + 1e-3 * size, multipliers + across)  # stationary, but beyond its limits

@@ -157,3 +157,23 @@ def test_reset_forgets_the_step_size():
     np.testing.assert_array_equal(first.v, second.v)
     np.testing.assert_array_equal(first.y, second.y)
     assert first.iterations == second.iterations
+
+
+def test_a_second_solve_has_what_the_first_one_has_left_of_the_time(monkeypatch):
+    """Of an INFEASIBLE without a proof; on a clock that moves by a second when it is read."""
+    now, limits = iter(range(100)), []
+    monkeypatch.setattr("koopmpc.control.solvers.osqp.perf_counter", lambda: float(next(now)))
+    solver, own = box(), OSQP._run
+    never = lambda self, v, y, limit: limits.append(limit) or replaced(own(self, v, y, limit))  # noqa: E731
+    monkeypatch.setattr(OSQP, "_run", never)
+    found = solver.solve(np.zeros(3), np.zeros(3), 10.0)
+    assert limits == [10.0, 9.0]
+    assert found.status is km.Status.MAX_ITERATIONS  # neither has a certificate
+    limits.clear()
+    solver.solve(np.zeros(3), np.zeros(3), 0.5)
+    assert limits == [0.5, 1e-6]
+
+
+def replaced(solution):
+    solution.status = km.Status.INFEASIBLE
+    return solution
