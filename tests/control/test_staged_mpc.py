@@ -75,6 +75,19 @@ def test_on_a_linear_plant_all_features_are_koopman_mpc(kind, mix):
         x = model.A @ x + model.B @ u
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("horizon", [1, 2, 3])
+@pytest.mark.parametrize("cost", [PLAIN, R_DELTA])
+def test_a_short_horizon_is_that_of_koopman_mpc(kind, horizon, cost):
+    limits = km.Limits(**BOX, x_max=[0.45, np.inf, 0.3], slack=(20.0, 10.0))
+    ours = built(kind, linear(), cost, limits, horizon)
+    theirs = km.KoopmanMPC(linear(), cost, limits, horizon, solver="daqp")
+    for x in ([0.5, -0.4, 0.3], [-0.2, 0.1, 0.0]):
+        rows = [[0.1, 0, 0], [0.0, 0.1, 0], [0.2, 0, 0.1], [0, 0.1, 0.2]][: horizon + 1]
+        np.testing.assert_allclose(ours(x, rows).u, theirs(x, rows).u, atol=1e-6)
+        np.testing.assert_allclose(ours.plan().X, theirs.plan().X, atol=2e-5)
+
+
 @pytest.mark.parametrize("most", [100, 0])
 def test_the_program_with_rates_is_that_of_cvxpy(most, monkeypatch):
     """By interior points, and by the active-set method that finishes what they do not."""

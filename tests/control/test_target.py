@@ -82,3 +82,71 @@ def test_where_no_equilibrium_meets_the_state_limits_the_inputs_still_hold():
     alpha = found.coordinates(np.array([[4.5]]))[0]
     np.testing.assert_allclose(found.z0 + found.Z @ alpha, [2.0], atol=1e-6)
     np.testing.assert_allclose(found.u0 + found.W @ alpha, [1.0], atol=1e-6)
+
+
+def test_where_no_equilibrium_meets_the_input_limits_the_target_is_the_first_one():
+    """x⁺ = x + u + 0.5 rests at u = −0.5 alone, which 0 ≤ u ≤ 1 does not allow."""
+    A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[1.0], [0.0]])
+    none = Interval(np.zeros(0), np.zeros(0))
+    found = targets(
+        A, B, np.eye(1, 2), np.eye(1), Interval(np.zeros(1), np.ones(1)), np.zeros((0, 2)), none, 1, hold=True
+    )
+    for r in (4.5, -3.0):
+        alpha = found.coordinates(np.array([[r], [2 * r]]))
+        assert alpha.shape == (2, found.Z.shape[1])
+        assert not alpha.any()
+
+
+@given(seed=SEEDS, nz=st.integers(1, 4), nu=st.integers(1, 2), size=st.sampled_from([0.1, 1.0, 30.0]))
+def test_a_disturbance_is_a_constant_of_the_model(seed, nz, nu, size):
+    """The equilibria of A z + B u + e are those of the model whose Constant adds e, inside the limits and without."""
+    rng, A, B, C, Q, _ = system(seed, nz, nu, constant=False)
+    e, root = 0.1 * rng.normal(size=nz), np.linalg.cholesky(Q).T
+    G, R_root = rng.normal(size=(1, nz)), np.diag(rng.uniform(0.2, 5, nu))
+    inputs, outputs = Interval(-2 * np.ones(nu), np.ones(nu)), Interval(np.full(1, -np.inf), np.full(1, 2.0))
+    whole = np.block([[A, e[:, None]], [np.zeros((1, nz)), np.ones((1, 1))]])
+    pushed = targets(A, B, C, root, inputs, G, outputs, None, hold=True, R_root=R_root)
+    own = targets(
+        whole,
+        np.vstack([B, np.zeros((1, nu))]),
+        np.hstack([C, np.zeros((len(C), 1))]),
+        root,
+        inputs,
+        np.hstack([G, np.zeros((1, 1))]),
+        outputs,
+        nz,
+        hold=True,
+        R_root=R_root,
+    )
+    R = size * rng.normal(size=(3, len(C)))
+    for found, wanted in zip(pushed.coordinates(R, e), own.coordinates(R), strict=True):
+        z = pushed.z0 + pushed.z_disturbance @ e + pushed.Z @ found
+        u = pushed.u0 + pushed.u_disturbance @ e + pushed.W @ found
+        scale = 1 + np.abs(z).max() + np.abs(u).max()
+        np.testing.assert_allclose(A @ z + B @ u + e, z, atol=1e-7 * scale)
+        other_z, other_u = own.z0 + own.Z @ wanted, own.u0 + own.W @ wanted
+        assert np.linalg.norm(root @ C @ (z - other_z[:nz])) <= 1e-4 * (1 + np.linalg.norm(root @ C @ z))
+        if np.abs(u - other_u).max() > 1e-4 * scale:  # as near, and u costs as much
+            assert np.linalg.norm(R_root @ u) <= np.linalg.norm(R_root @ other_u) * (1 + 1e-3) + 1e-3
+
+
+@given(seed=SEEDS, nz=st.integers(1, 3))
+def test_of_all_equilibria_as_near_the_one_that_costs_least_is_taken(seed, nz):
+    """Two inputs more than tracked outputs: ‖u‖_R is least among all that hold r, by the equations of Lagrange."""
+    rng = np.random.default_rng(seed)
+    nu = nz + 1
+    A, B, C = 0.5 * rng.normal(size=(nz, nz)), rng.normal(size=(nz, nu)), rng.normal(size=(1, nz))
+    R = np.diag(rng.uniform(0.2, 5, nu))
+    none, free = Interval(np.zeros(0), np.zeros(0)), Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
+    found = targets(A, B, C, np.eye(1), free, np.zeros((0, nz)), none, None, hold=True, R_root=np.sqrt(R))
+    r, e = rng.normal(size=1), 0.3 * rng.normal(size=nz)
+    alpha = found.coordinates(r[None], e)[0]
+    u = found.u0 + found.u_disturbance @ e + found.W @ alpha
+    z = found.z0 + found.z_disturbance @ e + found.Z @ alpha
+    E = np.block([[A - np.eye(nz), B], [C, np.zeros((1, nu))]])
+    H = np.zeros((nz + nu, nz + nu))
+    H[nz:, nz:] = R
+    K = np.block([[H, E.T], [E, np.zeros((nz + 1, nz + 1))]])
+    exact = np.linalg.lstsq(K, np.concatenate([np.zeros(nz + nu), -e, r]), rcond=None)[0]
+    np.testing.assert_allclose(u, exact[nz : nz + nu], atol=1e-6 * (1 + np.abs(u).max()))
+    np.testing.assert_allclose(C @ z, r, atol=1e-7 * (1 + np.abs(z).max()))
