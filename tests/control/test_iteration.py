@@ -12,7 +12,10 @@ from koopmpc.control.nonlinear.problem import StageTargets
 from koopmpc.control.nonlinear.stagewise import linearisation
 from tests.control.test_stagewise import PROBLEMS, Plan, slope
 
-SOLVED = {kind: RealTimeIteration(problem, compiles_model=False) for kind, problem in PROBLEMS.items()}
+with pytest.MonkeyPatch.context() as no_compiler:
+    no_compiler.delenv("CC", raising=False)
+    no_compiler.setenv("PATH", "")
+    SOLVED = {kind: RealTimeIteration(problem, compiles_model=False) for kind, problem in PROBLEMS.items()}
 
 
 def begun(kind: str, seed: int, pull: float = 1.0) -> tuple[RealTimeIteration, Plan, StageTargets, np.ndarray]:
@@ -163,3 +166,19 @@ def test_a_step_without_time_is_late_and_one_without_limits_is_not_asked():
     assert late.iterations == 0
     free, _, targets, x = begun("free", 3, 10.0)
     assert free.step(x, targets, -np.inf).status is km.Status.UNCONSTRAINED
+
+
+def test_other_targets_count_from_the_step_at_which_they_are_given():
+    each, _, targets, x = begun("free", 0)
+    first = each.step(x, targets, np.inf).U.copy()
+    each.step(x, targets._replace(R=targets.R + 1, U=targets.U - 1, m=targets.m + 1), np.inf)
+    np.testing.assert_allclose(each.step(x, targets, np.inf).U, first, atol=1e-12)
+    changed = targets._replace(R=targets.R.copy())
+    changed.R[0] += 0.5
+    assert np.abs(each.step(x, changed, np.inf).U - first).max() > 1e-3
+
+
+def test_a_disturbance_that_is_no_number_is_a_failure():
+    each, _, targets, x = begun("plain", 0)
+    each.e[2, 0] = np.nan
+    assert each.step(x, targets, np.inf).status is km.Status.FAILED

@@ -1,0 +1,184 @@
+"""Where a BilinearMPC starts, which of several plans it takes, and when its iterations end: against written-down ones."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.control.nonlinear import bilinear_mpc
+from koopmpc.control.nonlinear.iteration import RealTimeIteration, StageStep
+from tests.control.test_bilinear_mpc import CIRCLE
+from tests.control.test_nonlinear_mpc import pendulum
+from tests.control.test_staged_mpc import TRACKED
+from tests.control.test_staged_mpc import pendulum as learned
+
+OPTIMAL, FAILED, LATE = km.Status.OPTIMAL, km.Status.FAILED, km.Status.TIME_LIMIT
+N = 5
+
+
+@pytest.fixture(autouse=True)
+def no_compiler(monkeypatch):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", "")
+
+
+def made(cost=CIRCLE, limits=None, model=None, **options):
+    return km.BilinearMPC(model or pendulum(), cost, limits or km.Limits(-1, 1), N, **options)
+
+
+@pytest.mark.parametrize("rated", [False, True])
+def test_it_starts_from_rest_the_line_to_the_equilibrium_and_the_free_motion(rated):
+    mpc = made(TRACKED if rated else CIRCLE)
+    mpc([0.3, 0.1], [0.2, 0.0] if rated else [0, 1, 0])
+    end, x, u = mpc._preview.target.equilibrium.x, np.array([0.7, -0.2]), np.array([0.4 if rated else 0.0])
+    (rest, U), (line, V), (motion, W) = mpc._starts(x, np.array([0.4]))
+    for inputs in (U, V, W):
+        np.testing.assert_array_equal(inputs, np.tile(u, (N, 1)))
+    np.testing.assert_array_equal(rest, np.tile(x, (N + 1, 1)))
+    np.testing.assert_allclose(line, [x + k / N * (end - x) for k in range(N + 1)], atol=1e-12)
+    wanted = [x]
+    for _ in range(N):
+        wanted.append(mpc.step_map(wanted[-1], u))
+    np.testing.assert_allclose(motion, wanted, atol=1e-12)
+    model = made(model=learned())
+    model([0.3, 0.1], [0, 1, 0])
+    assert len(list(model._starts(x, u))) == 2  # a learned model may invent a motion
+
+
+@pytest.mark.parametrize("moves", [None, 3])
+def test_the_next_step_starts_from_the_plan_moved_on_by_one_step_of_the_model(moves):
+    mpc = made(TRACKED, estimator=km.LiftedDisturbance(0.5), moves=moves)
+    for x in ([0.3, 0.1], [0.32, 0.08], [0.3, 0.12]):
+        mpc(x, [0.2, 0.0])
+    before, e = mpc.plan(), mpc._e[-1].copy()
+    assert np.abs(e).max() > 1e-3
+    mpc._shift(before.U[0])
+    X, U = mpc._trajectory(mpc._iteration.X, mpc._iteration.U)
+    wanted = np.vstack([before.U[1:], before.U[-1:]])[mpc._problem.held_from]
+    np.testing.assert_allclose(U, wanted, atol=1e-12)
+    np.testing.assert_allclose(X[:-1], before.X[1:], atol=1e-12)
+    np.testing.assert_allclose(X[-1], mpc.step_map(before.X[-1], before.U[-1]) + e, atol=1e-12)
+
+
+# status, gap and cost of the plans to which three starts lead; how the best one ends once it is improved; what is taken
+CHOICES = [
+    ([(OPTIMAL, 0.0, 5.0), (OPTIMAL, 0.01, 3.0), (OPTIMAL, 0.0, 4.0)], OPTIMAL, 1, OPTIMAL),
+    ([(OPTIMAL, 0.03, 1.0), (OPTIMAL, 0.019, 9.0), (OPTIMAL, 0.021, 2.0)], OPTIMAL, 1, OPTIMAL),
+    ([(OPTIMAL, 0.3, 1.0), (OPTIMAL, 0.2, 9.0), (OPTIMAL, 0.25, 0.0)], OPTIMAL, 1, OPTIMAL),
+    ([(FAILED, 0.0, 0.0), (FAILED, 0.0, 0.0), (km.Status.SOFTENED, 0.5, 9.0)], OPTIMAL, 2, OPTIMAL),
+    ([(OPTIMAL, 0.0, 2.0), (OPTIMAL, 0.0, 2.0), (FAILED, 0.0, 0.0)], FAILED, 0, OPTIMAL),
+    ([(km.Status.SOFTENED, 0.0, 2.0), (OPTIMAL, 0.0, 3.0), (FAILED, 0.0, 0.0)], FAILED, 0, km.Status.SOFTENED),
+    ([(FAILED, 0.0, 0.0), (km.Status.INFEASIBLE, 0.0, 0.0), (FAILED, 0.0, 0.0)], OPTIMAL, 0, FAILED),
+]
+
+
+@pytest.mark.parametrize(("ends", "polished", "taken", "status"), CHOICES)
+def test_of_the_plans_that_follow_the_model_the_cheapest_is_taken(monkeypatch, ends, polished, taken, status):
+    mpc, now, asked = made(), {}, []
+    monkeypatch.setattr(RealTimeIteration, "gap", property(lambda _: now["gap"]))
+    monkeypatch.setattr(RealTimeIteration, "cost", lambda _: now["cost"])
+    monkeypatch.setattr(mpc, "_starts", lambda x, u: [(i, i) for i in range(3)])
+
+    def improve(s, u_prev, most, deadline, settled=bilinear_mpc.SETTLED, begin=None):
+        asked.append((most, settled, begin))
+        if begin is None:
+            now["before"] = mpc._iteration.X[0, 0]
+            mpc._iteration.X[:] = 9.0
+            return polished, 100
+        found, now["gap"], now["cost"] = ends[begin[0]]
+        mpc._iteration.X[:], mpc._iteration.U[:], mpc._iteration.slack = begin[0], begin[0], float(begin[0])
+        return found, 1
+
+    monkeypatch.setattr(mpc, "_improve", improve)
+    found, iterations = mpc._begin_anew(np.zeros(2), np.zeros(1), np.inf)
+    good = any(end[0] not in (FAILED, km.Status.INFEASIBLE) for end in ends)
+    assert [each[0] for each in asked] == [12, 12, 12] + [10] * good
+    assert {each[1] for each in asked[:3]} == {bilinear_mpc.NEARLY}
+    assert found is status
+    assert iterations == (103 if good else 3)
+    if good:
+        assert now["before"] == taken
+        assert mpc._iteration.X[0, 0] == (9.0 if polished is OPTIMAL else taken)
+        assert polished is OPTIMAL or (taken == mpc._iteration.U).all()
+        assert mpc._iteration.slack == taken
+    asked.clear()
+    found, iterations = mpc._begin_anew(np.zeros(2), np.zeros(1), -np.inf)  # no time for more than one
+    assert len(asked) == 1
+    assert found is ends[0][0]
+    assert iterations == 1
+
+
+class Steps:
+    """Iterations with the status, length, gap and slack that are written down."""
+
+    def __init__(self, *script, rests=99):
+        self.script, self.rested = script, rests
+        self.X, self.U, self.count, self.asked = np.zeros((N + 1, 2)), np.zeros((N, 1)), 0, []
+
+    def step(self, s, targets, deadline):
+        status, self.length, self.gap, self.slack = self.script[self.count]
+        self.count += 1
+        return StageStep(self.X[1:], self.U, np.zeros((N, 0)), status, self.count)
+
+    def take(self, s, found):
+        self.X += 1.0
+
+    def rests(self, found, settled):
+        self.asked.append(settled)
+        return self.count >= self.rested
+
+
+GOOD, HARD = (OPTIMAL, 1.0, 0.0, 0.0), (OPTIMAL, 1.0, 0.0, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("script", "rests", "status", "taken"),
+    [
+        ([GOOD, GOOD, GOOD], 99, OPTIMAL, 3),
+        ([GOOD, GOOD, GOOD], 2, OPTIMAL, 2),
+        ([GOOD, GOOD, HARD], 99, km.Status.SOFTENED, 3),
+        ([HARD, HARD, GOOD], 99, OPTIMAL, 3),
+        ([(LATE, 1.0, 0.0, 0.0)], 99, LATE, 1),
+        ([HARD, (LATE, 1.0, 0.0, 0.0)], 99, km.Status.SOFTENED, 2),
+        ([GOOD, (FAILED, 1.0, 0.0, 0.0)], 99, FAILED, 2),
+        ([GOOD, (OPTIMAL, 0.0, 0.19, 0.0)], 99, OPTIMAL, 2),
+        ([(OPTIMAL, 0.0, 0.21, 0.0)], 99, FAILED, 1),
+    ],
+)
+def test_iterations_end_where_the_plan_rests_or_one_of_them_has_no_good_end(script, rests, status, taken):
+    mpc = made(sqp_iterations=2)
+    mpc([0.1, 0.0], [0, 1, 0])
+    mpc._iteration = steps = Steps(*script, rests=rests)
+    found, iterations = mpc._improve(np.zeros(2), np.zeros(1), 3, np.inf, 0.5)
+    assert found is status
+    assert steps.count == taken
+    assert iterations == sum(range(1, taken + 1))
+    assert set(steps.asked) <= {0.5}
+    assert len(steps.asked) == (min(taken, 2) if status is OPTIMAL and len(script) == 3 else len(steps.asked))
+
+
+def test_iterations_end_at_the_deadline_with_the_plan_so_far():
+    mpc = made()
+    mpc([0.1, 0.0], [0, 1, 0])
+    mpc._iteration = steps = Steps(GOOD, GOOD)
+    begin = np.full((N + 1, 2), 5.0), np.zeros((N, 1))
+    found, _ = mpc._improve(np.zeros(2), np.zeros(1), 2, -np.inf, begin=begin)
+    assert found is OPTIMAL
+    assert steps.count == 1
+    assert (steps.X == 6.0).all()
+
+
+def test_a_state_far_from_the_expected_one_begins_anew_and_the_last_plan_goes_on_elsewhere(monkeypatch):
+    mpc, anew = made(limits=km.Limits(-1, 1, x_min=[-4, -2], x_max=[4, 2])), []
+    own = mpc._begin_anew
+    monkeypatch.setattr(mpc, "_begin_anew", lambda *rest: anew.append(1) or own(*rest))
+    mpc([0.1, 0.0], [0, 1, 0])
+    assert len(anew) == 1  # there is no plan
+    sizes = mpc._problem.sizes
+    np.testing.assert_array_equal(sizes, [4, 2])
+    for share, times in ((2.9, 1), (3.1, 2)):
+        expected = mpc.plan().X[1].copy()
+        mpc(expected + np.array([0.0, share * sizes[1]]), [0, 1, 0])
+        assert len(anew) == times
+        mpc.reset()
+        mpc([0.1, 0.0], [0, 1, 0])
+        anew.pop()
