@@ -350,3 +350,79 @@ def test_the_gain_of_what_has_come_is_that_of_its_own_noise(lost):
     s = s + K @ (y[came] - M @ s - rest._system.h[came])
     observer.observe(y, np.zeros(1), NO_W)
     np.testing.assert_allclose(observer.z, rest._system.to_z @ s + rest._system.one, atol=1e-9)
+
+
+def noises(observer):
+    """Return the covariances of a step of [z; d] and of y that a stationary filter is made with."""
+    F, M, P, R = observer._system.F, observer._system.M, observer._P, observer._R
+    return P - F @ (P - P @ M.T @ np.linalg.solve(M @ P @ M.T + R, M @ P)) @ F.T, R
+
+
+def left_of(observer, steps):
+    """Return the share of an error of each d that is left after so many steps."""
+    F, M, P = observer._system.F, observer._system.M, observer._P
+    K = P @ M.T @ np.linalg.inv(M @ P @ M.T + observer._R)
+    nd = len(M)
+    return np.abs(np.linalg.matrix_power(F - F @ K @ M, steps).diagonal()[-nd:])
+
+
+@pytest.mark.parametrize("horizon", [10, 40, 1000])
+def test_the_default_drift_is_the_least_of_a_decade_with_which_d_settles_in_time(horizon):
+    A, B = np.diag([0.9, 0.5]), np.array([[3.0], [4.0]])
+    model = linear(A, B)
+    observer = km.LiftedKalman("x0").start(model, horizon)
+    Q, R = noises(observer)
+    np.testing.assert_allclose(Q[:2, :2], 1e-4 * np.eye(2), atol=1e-10)
+    np.testing.assert_allclose(R, [[1e-4]])
+    steps = min(horizon / 4, 1 / -np.log(0.9))
+    count = int(np.ceil(4 * steps))
+    share = Q[2, 2] * 25  # a disturbance of the input has the unit in which it moves z by one
+    assert np.log10(share) == pytest.approx(round(np.log10(share)), abs=1e-3)
+    assert left_of(observer, count)[0] <= np.exp(-count / steps)
+    if share > 1e-8:
+        less = km.LiftedKalman("x0", drift=Q[2, 2] / 10).start(model, horizon)
+        assert left_of(less, count)[0] > np.exp(-count / steps)
+
+
+@pytest.mark.parametrize("outputs", ["x1", [[2.0, 1.0, 0.0]]])
+@pytest.mark.parametrize("disturbance", ["input", "output"])
+def test_the_default_noises_of_a_learned_model_are_shares_of_its_data_and_the_residuals_of_its_fit(
+    outputs, disturbance
+):
+    rng = np.random.default_rng(0)
+    A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[1.0], [30.0]])
+    X, U = [np.zeros(2)], rng.normal(size=(200, 1))
+    for u in U:
+        X.append(A @ X[-1] + B @ u + [0.3, -0.2])
+    X = np.array(X) + [0.05, 0.4] * rng.normal(size=(201, 2))
+    model = km.edmd(km.Episodes([km.Episode(X=X, U=U)], 0.1, ("x0", "x1"), ("u0",)), km.State() + km.Constant())
+    observer = km.LiftedKalman(outputs, disturbance).start(model, 20)
+    Q, R = noises(observer)
+    sizes = np.sqrt((X[:-1] ** 2).mean(axis=0))
+    np.testing.assert_allclose(Q[:2, :2], 1e-4 * np.diag(sizes**2), rtol=1e-5, atol=1e-9)
+    if outputs == "x1":
+        expected = model.report.residual[1] ** 2
+        y = sizes[1]
+    else:
+        y = np.sqrt(((X[:-1] @ [2.0, 1.0]) ** 2).mean())
+        expected = 1e-4 * y**2
+    assert R[0, 0] == pytest.approx(expected, rel=1e-6)
+    moved = np.linalg.norm(model.B[:2, 0] / sizes)
+    share = Q[2, 2] / (y**2 if disturbance == "output" else moved**-2)
+    assert np.log10(share) == pytest.approx(round(np.log10(share)), abs=1e-3)
+
+
+@pytest.mark.parametrize("disturbance", ["input", "output"])
+def test_units_of_a_given_model_do_not_decide_its_drift(disturbance):
+    """x′ = S x with noises that follow: the same estimates in other units, though the drift is found."""
+    rng = np.random.default_rng(2)
+    A, B = stable(rng, 2, 1)
+    S = np.diag([2.0**12, 2.0**-9])
+    Y, U, found = rng.normal(size=(40, 2)), rng.normal(size=(40, 1)), []
+    for T in (np.eye(2), S):
+        rule = km.LiftedKalman(("x0", "x1"), disturbance, process=T @ T * 1e-4, noise=T @ T * 1e-3)
+        observer = rule.start(linear(T @ A @ np.linalg.inv(T), T @ B), 20)
+        for y, u in zip(Y, U, strict=True):
+            observer.observe(T @ y, u, NO_W)
+        found.append(np.linalg.solve(T, np.column_stack([observer.z, observer.d])))
+    np.testing.assert_allclose(found[1], found[0], atol=0.01)  # rows and columns are alike up to factors of two
