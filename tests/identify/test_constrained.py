@@ -292,6 +292,9 @@ def test_the_report_counts_what_is_known_and_what_stands_at_a_bound_and_names_wh
     changes = km.identify.constrained_edmd(data, km.State(), prior=prior).report.changes
     assert changes[:2] == ("1 of 6 entries of [A B] are known", "1 entries stand at a bound")
     assert len(changes) == 3
+    prior = km.identify.Prior(lower_B=[[5.0], [0.0]], upper_A=9.0, lower_A=[[-9.0, 2.0], [-9.0, -9.0]])
+    changes = km.identify.constrained_edmd(data, km.State(), prior=prior).report.changes
+    assert changes[0] == f"{2 + int(km.edmd(data, km.State()).B[1, 0] < 0)} entries stand at a bound"
     for some, words in (
         ({"symmetric": True}, "A is symmetric"),
         ({"combinations": [km.identify.Combination(-9, 9, A=np.eye(2))]}, "combinations of entries are limited"),

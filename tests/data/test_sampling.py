@@ -1,0 +1,249 @@
+"""Rows of a table and their times: gaps, restarts, resampling, counted by hand."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.data.files.tables import Told, _numbered, _plausible, label, roles
+from koopmpc.errors import ColumnWarning
+
+
+def signals(time, X=None, U=None, first=1):
+    rows = np.arange(len(X if time is None else time)) + first
+    X = np.asarray(rows if X is None else X, dtype=float)
+    U = 10 * X if U is None else np.asarray(U, dtype=float)
+    return Signals(None if time is None else np.asarray(time, dtype=float), X[:, None], U[:, None], U[:, None], rows)
+
+
+def said(action):
+    """Return what it returns, and the sentences that it warns with."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = action()
+    return found, [str(warning.message) for warning in caught]
+
+
+def test_the_sample_time_is_the_median_of_steps_ahead_to_six_digits():
+    assert sample_time([np.array([0, 1, 2, 10.0]), np.array([5.0, 4.0, np.nan, 7.0, 8.0])], "f") == 1.0
+    assert sample_time([np.array([0, 0.1234567891])], "f") == 0.123457
+    assert sample_time([np.array([0, 0, 0, 3.0])], "f") == 3.0  # time that stands is no step
+    for times in ([], [np.zeros(0)], [np.array([1.0])], [np.array([2.0, 2.0, 1.0])]):
+        with pytest.raises(km.errors.DataError, match="f: time does not advance in any two rows; pass dt="):
+            sample_time(times, "f")
+
+
+def test_a_step_back_in_time_begins_a_part_and_one_to_another_time_than_the_first_is_told():
+    time = [0, 1, 2, 0.5, 1.5, 0, 1, 2, 3]
+    parts, words = said(lambda: restarts(signals(time), "f"))
+    assert [part.rows.tolist() for part in parts] == [[1, 2, 3], [4, 5], [6, 7, 8, 9]]
+    assert not words  # a start anew is within twice the usual step of the first time
+    parts, words = said(
+        lambda: restarts(signals([0, 1, 2, 3, 4, 5, 2.1, 3.1, 4.1, 1.9, 2.9, 3.9, 2.5, 9, 3, 9, 2.2]), "f")
+    )
+    assert len(parts) == 6
+    assert words == ["f: the clock is set back 4 times, before row 7, 13, 15, …; an episode ends there"]
+    parts, words = said(lambda: restarts(signals([0, 1, 2, 3, 4, 5, 2.1, 3, 2.2, 3, 2.3, 3]), "f"))
+    assert words == ["f: the clock is set back 3 times, before row 7, 9, 11; an episode ends there"]
+    whole = signals(None, X=[1, 2, 3])
+    assert restarts(whole, "f") == [whole]
+    assert [part.rows.tolist() for part in restarts(signals([4.0]), "f")] == [[1]]
+    assert [part.rows.tolist() for part in restarts(signals([4.0, 4.0, 5.0]), "f")] == [[1, 2, 3]]
+
+
+def test_states_are_interpolated_and_inputs_held_on_a_grid_from_the_first_time():
+    (part,) = resampled(signals([3, 4, 4, 5, 6], X=[0, 10, 99, 30, 40], U=[1, 2, 3, 4, 5]), 0.5)
+    np.testing.assert_allclose(part.time, np.arange(3, 6.1, 0.5))
+    np.testing.assert_allclose(part.X[:, 0], [0, 5, 10, 20, 30, 35, 40])
+    np.testing.assert_array_equal(part.U[:, 0], [1, 1, 2, 2, 4, 4, 5])  # of rows at one time the first counts
+    np.testing.assert_array_equal(part.W, part.U)
+    np.testing.assert_array_equal(part.rows, [1, 1, 2, 2, 4, 4, 5])
+    (part,) = resampled(signals([0, 1, 2]), 0.75)
+    np.testing.assert_allclose(part.time, [0, 0.75, 1.5])
+
+
+def test_resampling_leaves_missing_rows_out_and_cuts_at_gaps():
+    """A gap is more than 1.5 times the median step, and more than 1.5 times dt."""
+    time = np.array([0, 1, 2, 3.4, 4.4, 6.0, 7.0, 8.0, 20.0, 30.0, 31.0])
+    found = resampled(signals(time), 0.5)
+    assert [part.rows.tolist()[0] for part in found] == [1, 6, 10]
+    assert [part.rows.tolist()[-1] for part in found] == [4, 8, 11]  # a row alone is no part
+    assert [part.rows.tolist()[0] for part in resampled(signals(time), 1.2)] == [1, 10]
+    holes = signals([0, 1, 2, 3, 4], X=[0, 1, np.nan, 3, 4])
+    (part,) = resampled(holes, 2.0)  # 2 is no gap for a dt of 2
+    np.testing.assert_allclose(part.X[:, 0], [0, 2, 4])
+    late = signals([0, 1, np.nan, 3, 4])
+    assert [part.rows.tolist()[-1] for part in resampled(late, 1.0)] == [2, 5]
+    assert resampled(signals([1.0]), 1.0) == []
+    assert resampled(signals([1.0, 2.0], X=[np.nan, 1.0]), 1.0) == []
+
+
+def test_episodes_end_at_gaps_and_what_is_lost_is_counted():
+    x = [0, 1, np.nan, 3, 4, 5, np.nan, 7, np.nan, 9, 10]
+    found, words = said(lambda: episodes_from([signals(None, X=x, U=np.arange(11), first=5)], 1.0, "f"))
+    assert [e.X[:, 0].tolist() for e in found] == [[0, 1], [3, 4, 5], [9, 10]]
+    assert [e.U[:, 0].tolist() for e in found] == [[0], [3, 4], [9]]
+    assert [e.W[:, 0].tolist() for e in found] == [[0], [3, 4], [9]]
+    assert words == ["f: 2 gaps (after row 6, 10) cut 1 episodes into 3; 4 of 11 rows are lost"]
+    u = [0, 1, 2, np.nan, 4, 5, 6]  # the input of row 4 is unknown: it leads nowhere, and ends an episode
+    found, words = said(lambda: episodes_from([signals(None, X=np.arange(7), U=u)], 1.0, "f"))
+    assert [e.X[:, 0].tolist() for e in found] == [[0, 1, 2, 3], [4, 5, 6]]
+    assert words == ["f: 1 gaps (after row 4) cut 1 episodes into 2; 0 of 7 rows are lost"]
+    many = [signals(None, X=[0, 1, np.nan] * 4 + [0, 1])]
+    assert (
+        "4 gaps (after row 2, 5, 8, …) cut 1 episodes into 5; 4 of 14 rows"
+        in said(lambda: episodes_from(many, 1, "f"))[1][0]
+    )
+    found, words = said(lambda: episodes_from([signals(None, X=[1, 2]), signals(None, X=[3])], 1.0, "f"))
+    assert words == ["f: 0 gaps cut 2 episodes into 1; 1 of 3 rows are lost"]
+    assert not said(lambda: episodes_from([signals(None, X=[1, 2]), signals(None, X=[3, 4])], 1.0, "f"))[1]
+    with pytest.raises(km.errors.DataError, match="f: no two rows in sequence hold all states and inputs"):
+        episodes_from([signals(None, X=[1, np.nan, 2])], 1.0, "f")
+
+
+@pytest.mark.parametrize(("step", "what"), [(1.019, "even"), (0.981, "even"), (1.021, "uneven"), (0.979, "uneven"), (1.49, "uneven"), (1.51, "gap")])  # fmt: skip
+def test_a_step_may_be_off_by_two_percent_and_beyond_one_and_a_half_it_is_a_gap(step, what):
+    time = np.concatenate([[0, 1, 2], 2 + step + np.arange(3)])
+    if what == "uneven":
+        with pytest.raises(
+            km.errors.DataError, match=rf"1 of 5 steps differ from dt = 1 s .* at row 3, where it is {step:g} s"
+        ):
+            episodes_from([signals(time)], 1.0, "f")
+    else:
+        found, words = said(lambda: episodes_from([signals(time)], 1.0, "f"))
+        assert len(found) == len(words) + 1 == (2 if what == "gap" else 1)
+
+
+NAMES = {
+    "time": ("t", "time [s]", "Timestamp", "sim_time (ms)", "elapsed", "seconds"),
+    "episode": ("episode", "Run", "trial", "trajectory"),
+    "inputs": ("u", "u0", "u_left", "force [N]", "Voltage", "command", "cmd_vel", "action 3", "steer_cmd", "duty.x", "torque1"),
+    "disturbances": ("w", "w2", "w_wind", "disturbance", "disturbance load"),
+    "states": ("theta", "user", "weight", "forced", "time_constant", "steps", "speed [m/s]", "tt", "running"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("role", "name"), [(role, name) for role, names in NAMES.items() for name in names])
+def test_a_name_says_what_a_column_is(role, name):
+    names = ["x", name]
+    found = roles(names, names, Told(), "f")
+    held = getattr(found, role)
+    assert held == name if role in ("time", "episode") else name in held
+    others = {other for other in NAMES if other != role}
+    assert not any(name == getattr(found, other) or name in (getattr(found, other) or ()) for other in others)
+    assert label(name) == (role in ("time", "episode"))
+    assert found.guessed
+    assert found.values == found.states + found.inputs + found.disturbances
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("µs", 1e-6), ("ns", 1e-9), ("min", 60.0)]
+)
+def test_a_unit_of_time_is_a_number_of_seconds(unit, scale):
+    for name in (f"time [{unit}]", f"time( {unit} )"):
+        assert roles(["x", name], ["x", name], Told(), "f").scale == scale
+
+
+def test_the_first_of_two_columns_of_time_counts_and_what_is_told_is_not_guessed():
+    names = ["time", "t", "run", "trial", "x", "u", "w", "step", "note"]
+    numbers = names[:-1]
+    found = roles(names, numbers, Told(), "f")
+    assert (found.time, found.episode, found.step) == ("time", "run", "step")
+    assert (found.states, found.inputs, found.disturbances) == (("t", "trial", "x"), ("u",), ("w",))
+    found = roles(names, numbers, Told(states=["x"], inputs=["u"]), "f")
+    assert (found.states, found.inputs, found.disturbances, found.guessed) == (("x",), ("u",), (), False)
+    found = roles(names, numbers, Told(states=["time", "step", "run"]), "f")
+    assert (found.time, found.episode, found.step) == ("t", "trial", None)
+    assert (found.states, found.inputs, found.guessed) == (("time", "step", "run"), ("u",), True)
+    found = roles(names, numbers, Told(inputs=["w"]), "f")
+    assert (found.inputs, found.disturbances) == (("w",), ())
+    assert found.states == ("t", "trial", "x", "u")
+    found = roles(names, numbers, Told(disturbances=["u"], inputs=[]), "f")
+    assert (found.inputs, found.disturbances, "u" in found.states) == ((), ("u",), False)
+
+
+def test_two_columns_of_one_name_are_refused_where_they_would_be_guessed_from():
+    names = ["x", "x", "v", "u"]
+    with pytest.raises(km.errors.DataError, match="f has two columns 'x'; rename one"):
+        roles(names, names, Told(), "f")
+    with pytest.raises(km.errors.DataError, match="f has two columns 'x'; its columns are x, x, v, u"):
+        roles(names, names, Told(states=["x"], inputs=["u"]), "f")
+    assert roles(names, names, Told(states=["v"], inputs=["u"]), "f").states == ("v",)
+    with pytest.raises(km.errors.DataError, match="f has two columns 'x'; rename one"):
+        roles(names, names, Told(states=["v"]), "f")
+
+
+def test_what_a_caller_knows_is_nothing_only_where_all_of_it_is():
+    assert Told().nothing
+    assert not Told(dt=0.1).nothing
+    assert Told(states=["a"], inputs=["b"], disturbances=["c"]).columns == {"a", "b", "c"}
+    for name in ("dt", "resample"):
+        with pytest.raises(km.errors.DataError, match=f"{name} is -1 s"):
+            Told(**{name: -1.0})
+
+
+@pytest.mark.parametrize(
+    ("count", "largest", "refused"),
+    [(100, 0.99e6, False), (100, -1.01e6, True), (99, 1.01e6, False), (200, 1.01e6, True)],
+)
+def test_a_cell_a_million_times_larger_than_usual_is_refused_with_its_row(count, largest, refused):
+    column = np.ones(count)
+    column[1::2] = -1.0
+    column[17], column[3] = largest, np.nan
+    column = np.append(column, 1.0)
+    if refused:
+        with pytest.raises(
+            km.errors.DataError,
+            match=re.escape(f"f: 'x' is {largest:g} in row 18, where 99 % of its cells are within 1; repair"),
+        ):
+            _plausible(column, "x", "f")
+    else:
+        _plausible(column, "x", "f")
+
+
+def test_a_column_that_is_mostly_zero_or_empty_is_plausible_and_one_that_nobody_could_compute_with_is_not():
+    _plausible(np.append(np.zeros(200), 1e9), "x", "f")
+    _plausible(np.full(200, np.nan), "x", "f")
+    with pytest.raises(km.errors.DataError, match=r"f: 'x' is 1e\+31 in row 201"):
+        _plausible(np.append(np.zeros(200), 1e31), "x", "f")
+    with pytest.raises(km.errors.DataError, match=r"in row 1, where"):
+        _plausible(np.full(200, 1e31), "x", "f")
+
+
+def test_episodes_are_numbered_in_the_order_in_which_they_first_come(tmp_path):
+    file = tmp_path / "f"
+    assert _numbered(np.array(["b", "a", "b", "c"], dtype=object), file).tolist() == [0, 1, 0, 2]
+    assert _numbered(np.array([7.0, 3.0, 3.0, 9.0, 7.0]), file).tolist() == [0, 1, 1, 2, 0]
+    for bad in (np.array([1.0, np.nan]), np.array(["a", None], dtype=object)):
+        with pytest.raises(km.errors.DataError, match="has rows whose episode is null"):
+            _numbered(bad, file)
+
+
+def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, monkeypatch):
+    (tmp_path / "log.csv").write_text("t,x,u\n0,1,1\n1,2,3\n9,3,2\n10,4,1\n0,5,6\n1,7,7\n")
+    needed = 16 * 2 * (10 + 1) / 0.01  # bytes of two columns over eleven seconds
+    for free, fits in ((1.01 * needed, True), (0.99 * needed, False), (None, True)):
+        monkeypatch.setattr("koopmpc.disk.memory", lambda free=free: free)
+        if fits:
+            assert len(km.load_episodes(tmp_path / "log.csv", resample=0.01)) == 3
+        else:
+            with pytest.raises(
+                km.errors.DataError, match=r"resample=0.01 makes 1.1e\+03 rows of 2 columns, 3.52e-05 GB"
+            ):
+                km.load_episodes(tmp_path / "log.csv", resample=0.01)
+
+
+def test_a_column_is_doubted_once_where_it_is_constant_or_repeats_an_earlier_one(tmp_path):
+    (tmp_path / "log.csv").write_text("t,x,y,z,c,u\n0,1,1,1,,1\n1,2,2,2,4,3\n2,5,5,5,4,2\n")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        km.load_episodes(tmp_path / "log.csv", resample=1.0)
+    words = [str(w.message).split(": ", 1)[1].split(";")[0] for w in caught if issubclass(w.category, ColumnWarning)]
+    assert words == ["'y' repeats 'x'", "'z' repeats 'x'", "'z' repeats 'y'", "'c' is 4 throughout"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ColumnWarning)
+        with pytest.warns(km.FitWarning, match="gaps"):
+            km.load_episodes(tmp_path / "log.csv", states=["x", "y", "c"], inputs=["u"])  # told, not guessed
