@@ -225,3 +225,23 @@ def test_a_forecast_that_turns_nan_is_no_plan(kind):
             assert np.isfinite(plan.U).all()
             assert np.abs(plan.X[1:, 0] - plan.X[:-1, 0] - 0.2 * (plan.U[:, 0] - np.sqrt(plan.X[:-1, 0]))).max() < 0.05
     assert move.fallback is km.control.Fallback.NONE  # a level from which there is a forecast again
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 5])
+@pytest.mark.parametrize("limits", [km.Limits(-1, 1), km.Limits(-1, 1, x_max=[1.0, 2.0])])
+def test_the_next_step_starts_from_the_solution_moved_on_by_one_step_multipliers_included(horizon, limits):
+    """Constraints are gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N: each takes its place of the stage behind."""
+    mpc = km.NonlinearMPC(pendulum(), km.Cost(Q=[1, 0.1], R=0.1), limits, horizon)
+    npath = 0 if limits.x_max is None else 4  # two soft limits: g − ε and g + ε
+    labels = []
+    for k in range(1, horizon + 2):
+        labels += [("gap", k, i) for i in range(2) if k <= horizon]
+        labels += [("path", k - 1, i) for i in range(npath) if k > 1]
+    moved = [labels[i] for i in mpc._shooting._next_g]
+    assert moved == [(kind, min(k + 1, horizon), i) for kind, k, i in labels]
+    mpc._aim(np.zeros(2))
+    start = mpc._shooting.at(np.zeros((horizon, 2)), np.zeros((horizon, 1)))
+    solution = mpc._shooting.solve(np.array([0.5, 0.0]), mpc._targets, mpc._e, start, mpc._problem.inputs)
+    whole = np.hstack([solution.U, solution.X, solution.slacks]) / mpc._shooting._sizes
+    wanted = np.vstack([whole[1:], whole[-1:]])
+    np.testing.assert_allclose(solution.start.v.reshape(horizon, -1), wanted, atol=1e-12)

@@ -331,3 +331,29 @@ def test_a_disturbance_that_is_told_ahead_costs_less():
         )
         costs.append(km.metrics(result).cost)
     assert costs[2] < costs[1] < costs[0]
+
+
+class Ending(Outside):
+    """It ends the run at its third step, and says so again afterwards."""
+
+    ended, count = "", 0
+
+    def step(self, u):
+        self.count += 1
+        self.ended = "" if self.count < 3 else "it fell"
+        return super().step(u)
+
+
+@pytest.mark.parametrize("steps", [3, 8])
+def test_a_run_is_as_long_as_the_plant_goes_on(steps):
+    observed = []
+    if steps == 3:  # it ends with the run itself
+        run = km.simulate(Ending(), Recorded(), x0=[0.5, 0], reference=[0, 0], steps=3, observers=[observed.append])
+        assert "ended" not in run.metadata
+    else:
+        with pytest.warns(UserWarning, match="the plant ended the run after 3 of 8 steps: it fell"):
+            run = km.simulate(Ending(), Recorded(), x0=[0.5, 0], reference=[0, 0], steps=8, observers=[observed.append])
+        assert run.metadata["ended"] == "it fell"
+    assert run.steps == len(observed) == 3
+    assert len(run.X) == len(run.Y) == len(run.reference) == 4
+    assert len(run.U) == len(run.status) == len(run.solve_time) == len(run.slack) == len(run.known) == 3
