@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.control.cost import data_ranges, state_tracking
 from tests.bare import shown
 
 
@@ -136,3 +137,58 @@ show(lambda: km.metrics([1, 2]))
         "LinearPredictor.local",
         "DataError run is a list, expected a Run; simulate returns one",
     ]
+
+
+def sizes_of(cost, limits, ranges=None):
+    return state_tracking(("a", "b", "c"), 2, cost, limits, None, ranges).sizes
+
+
+def test_sizes_are_those_of_two_limits_then_of_the_data_then_of_the_cost_then_of_one_limit():
+    cost = km.Cost(Q=[4, 9, 0], R=[2, 0])
+    limits = km.Limits([-3, -np.inf], [1, 5], x_min=[-1, -np.inf, -7], x_max=[3, 8, np.inf])
+    found = sizes_of(cost, limits)
+    price = 4 * 2.0**2  # of a, the one tracked state of known size: half the width of its limits
+    assert found.scale == max(price, 2 * 2.0**2)
+    np.testing.assert_allclose(found.states, [2, np.sqrt(price / 9), 7])  # b as dear as a; c costs nothing: |limit|
+    np.testing.assert_allclose(found.inputs, [2, 1])  # the second has neither two limits nor a price
+    seen = sizes_of(cost, limits, {"a": 0.1, "b": 0.5, "c": 0.25})  # of the data, unless two limits say more
+    np.testing.assert_allclose(seen.states, [2, 0.5, 0.25])
+    assert seen.scale == 16.0
+    dear = sizes_of(km.Cost(Q=[4, 9, 0], R=[2, 3]), km.Limits(x_min=-2, x_max=2))
+    assert dear.scale == 36.0
+    np.testing.assert_allclose(dear.inputs, np.sqrt([18, 12]))
+    np.testing.assert_array_equal(dear.states, [2, 2, 2])
+
+
+def test_the_mean_price_of_what_is_known_gives_the_size_of_what_is_not():
+    found = sizes_of(km.Cost(Q=[4, 1, 25], R=1), km.Limits(x_min=[-1, -3, -np.inf], x_max=[1, 3, np.inf]))
+    assert found.scale == 9.0
+    np.testing.assert_allclose(found.states, [1, 3, np.sqrt((4 + 9) / 2 / 25)])
+    np.testing.assert_allclose(found.inputs, [3, 3])
+
+
+def test_where_no_width_is_known_one_limit_or_the_weights_say_how_large_costs_are():
+    one = sizes_of(km.Cost(Q=[4, 1, 0], R=0), km.Limits(x_max=[3, -5, 2]))
+    assert one.scale == 36.0
+    np.testing.assert_allclose(one.states, [3, 6, 2])  # of equal price, and the limit where there is no price
+    np.testing.assert_array_equal(one.inputs, [1, 1])
+    none = sizes_of(km.Cost(Q=[4, 1, 0], R=[9, 1]), km.Limits())
+    assert none.scale == 9.0
+    np.testing.assert_allclose(none.states, [1.5, 3, 1])
+    np.testing.assert_allclose(none.inputs, [1, 3])
+    nothing = sizes_of(km.Cost(Q=0, R=0), km.Limits())
+    assert nothing.scale == 1.0
+    np.testing.assert_array_equal([*nothing.states, *nothing.inputs], np.ones(5))
+
+
+def test_the_range_of_the_data_is_that_of_uniform_data_about_their_mean():
+    rng = np.random.default_rng(0)
+    X = rng.uniform([-1, 5, 2], [3, 6, 2], (4001, 3))
+    data = km.Episodes([km.Episode(X=X, U=rng.uniform(-1, 1, (4000, 1)))], 0.1, ("a", "b", "c"), ("u",))
+    lifting = km.State() + km.Constant() + km.Expressions(lambda x: [x[0] * x[1]], ["ab"])
+    with pytest.warns(km.FitWarning, match="'c' of '1'"):
+        found = data_ranges(km.edmd(data, lifting))
+    product = X[:-1, 0] * X[:-1, 1]
+    assert set(found) == {"a", "b", "ab"}  # c and the Constant do not move
+    np.testing.assert_allclose([found["a"], found["b"]], [2, 0.5], rtol=0.05)
+    assert found["ab"] == pytest.approx(np.sqrt(3) * product.std(), rel=1e-3)
