@@ -75,7 +75,7 @@ def matrices(value, data, velocities, by, constant=False):
 
 @pytest.mark.parametrize("a", [0.0, 1e-5, 9.99e-4, 1.001e-3, 0.3, -0.7, 3e-4 + 5e-4j, 0.2 + 3j])
 def test_the_weights_of_an_effect_are_those_of_quadrature(a):
-    np.testing.assert_allclose(weights(a / DT, DT), shares(a / DT), rtol=1e-8)
+    np.testing.assert_allclose(weights(a / DT, DT), shares(a / DT), rtol=2e-9)
 
 
 @pytest.mark.parametrize("by", ["steps", "derivatives"])

@@ -68,6 +68,17 @@ def test_a_window_is_the_fit_of_its_pairs(seed: int, window: int, extra: int) ->
     assert online.predictor().report.samples == window
 
 
+def test_a_window_over_rows_that_are_wider_than_a_block() -> None:
+    data = random_episodes(2, [90], 17, 1)  # 35 columns
+    for count in (34, 35, 64, 70, 89, 90):
+        part = km.Episodes([km.Episode(X=data[0].X[: count + 1], U=data[0].U[:count])], data.dt)
+        online = km.OnlineEDMD.start(part, km.State(), window=30)
+        R, weight = online._memory.factor(online._rows[: online._waiting])
+        D = brute_force(part, km.State().bind(part.states))[-30:]
+        assert weight == 30
+        assert np.allclose(R.T @ R, D.T @ D, rtol=0, atol=1e-10)
+
+
 @pytest.mark.parametrize("window", [1, 15, 31, 32, 33, 64, 65, 97])
 def test_every_moment_of_a_window(window: int) -> None:
     data = random_episodes(1, [230], 1, 0)

@@ -210,3 +210,10 @@ def test_where_nothing_can_be_told_the_ridge_is_the_largest_and_where_all_is_exa
     assert cross_validated(np.zeros(2), none, np.ones(1), 40, 1e-12) == 0.0
     lost = np.array([[1.0], [1e-3]])  # what lies along a direction that is rounding is not reached
     assert cross_validated(np.array([1.0, 1e-15]), lost, np.zeros(1), 40, 1e-12) > 0.0
+
+
+def test_a_ridge_is_looked_for_far_below_the_smallest_direction() -> None:
+    """Both directions are told exactly, the second with a singular value of 1e-13: any ridge that counts there is bad."""
+    s = np.array([1.0, 1e-13])
+    ridge = cross_validated(s, np.ones((2, 1)), np.full(1, 1e-6), 40, 1e-16)
+    assert 0 < ridge < 1e-6 * s[1] ** 2

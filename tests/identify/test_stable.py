@@ -313,6 +313,10 @@ def test_a_step_of_the_descent_goes_against_the_gradient_and_lowers_the_misfit()
     gradient = approx_fprime(np.concatenate([S.ravel(), X.ravel()]), value, 1e-7)
     moved = np.concatenate([(S - run._S).ravel(), (X - run._X).ravel()]) / 1e-9
     assert np.allclose(moved, gradient, rtol=0, atol=1e-4 * np.abs(gradient).max())
+    far = _Descent(misfit, 50.0, S, X)
+    far._step = 1e3  # too far: it is halved until the misfit falls
+    assert far._advance()
+    assert far.value < run.value
     limited = _Descent(misfit, 0.5, S, X)
     values = [limited.value]
     for _ in range(50):

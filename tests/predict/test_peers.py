@@ -104,3 +104,97 @@ def test_dmd_and_dmdc_of_pydmd_are_models_in_one_line():
 def test_what_is_no_model_is_told():
     with pytest.raises(km.errors.DataError, match="a dict is no fitted DMD of PyDMD nor a fitted KoopmanPipeline"):
         km.from_peer({}, dt=0.1)
+
+
+class Fitted:
+    """What `from_peer` reads of a fitted object of another package."""
+
+    def __init__(self, **fields: object) -> None:
+        self.__dict__.update(fields)
+
+
+def pipeline(**changes: object) -> Fitted:
+    """A pipeline with z = [b, a, a b] of two states and two inputs, as pykoop names its parts."""
+    rng = np.random.default_rng(0)
+    fields = {
+        "n_states_in_": 2, "n_inputs_in_": 2, "n_states_out_": 3, "n_inputs_out_": 2, "min_samples_": 1,
+        "regressor_": Fitted(coef_=rng.normal(size=(5, 3))),
+        "lift_state": lambda X, episode_feature: np.column_stack([X[:, 1], X[:, 0], X[:, 0] * X[:, 1]]),
+    }  # fmt: skip
+    return Fitted(**fields | changes)
+
+
+def test_of_a_pipeline_the_matrices_are_taken_and_the_states_are_found_among_its_observables():
+    fitted = pipeline()
+    model = km.from_peer(fitted, dt=0.2)
+    np.testing.assert_array_equal(np.hstack([model.A, model.B]), fitted.regressor_.coef_.T)
+    np.testing.assert_array_equal(model.C, [[0, 1, 0], [1, 0, 0]])
+    assert (model.dt, model.states, model.inputs, model.lifting.names) == (0.2, ("x0", "x1"), ("u0", "u1"), ("z0", "z1", "z2"))  # fmt: skip
+    np.testing.assert_array_equal(model.lift([2.0, 3.0]), [3, 2, 6])
+    named = km.from_peer(fitted, dt=0.2, states=["a", "b"], inputs=["u", "v"])
+    assert (named.states, named.inputs) == (("a", "b"), ("u", "v"))
+    own = km.Expressions(lambda x: [x[1], x[0], x[0] * x[1]], ["b", "a", "ab"])
+    assert km.from_peer(fitted, dt=0.2, lifting=own).lifting.names == ("b", "a", "ab")
+    near = km.Expressions(lambda x: [x[1], x[0], x[0] * x[1] + 1e-6], ["b", "a", "ab"])
+    for wrong in (near, km.State()):
+        with pytest.raises(
+            km.errors.DataError, match="lifting has other observables than the pipeline, or another order"
+        ):
+            km.from_peer(fitted, dt=0.2, lifting=wrong)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"min_samples_": 2}, "the pipeline has delays"),
+        ({"n_inputs_out_": 4}, "the pipeline makes 4 inputs of 2: it lifts them"),
+        ({"lift_state": lambda X, episode_feature: np.column_stack([X[:, 0], X[:, 1] + 1e-6, X[:, 1] ** 2])}, "does not hold x1"),
+    ],
+)  # fmt: skip
+def test_a_pipeline_that_is_no_linear_model_of_the_states_is_refused(changes, text):
+    with pytest.raises(km.errors.DataError, match=text):
+        km.from_peer(pipeline(**changes), dt=0.2)
+
+
+def test_of_a_dynamic_mode_decomposition_modes_and_eigenvalues_make_the_matrix():
+    A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.5]])
+    eigenvalues, modes = np.linalg.eig(A)
+    free = km.from_peer(Fitted(modes=modes, eigs=eigenvalues), dt=0.1)
+    np.testing.assert_allclose(free.A, A, atol=1e-12)
+    assert (free.nu, free.states) == (0, ("x0", "x1", "x2"))
+    np.testing.assert_array_equal(free.C, np.eye(3))
+    B = np.arange(6.0).reshape(3, 2)
+    driven = km.from_peer(Fitted(modes=modes, eigs=eigenvalues, B=B), dt=0.1, inputs=["u", "v"])
+    np.testing.assert_array_equal(driven.B, B)
+    assert driven.inputs == ("u", "v")
+    few = km.from_peer(Fitted(modes=modes[:, :2], eigs=eigenvalues[:2]), dt=0.1)  # two of three: a projection
+    exact = (modes[:, :2] * eigenvalues[:2]) @ np.linalg.pinv(modes[:, :2])
+    np.testing.assert_allclose(few.A, exact.real, atol=1e-12)
+    with pytest.raises(km.errors.DataError, match="its operator Φ Λ Φ⁺ is not real; fit it to real snapshots"):
+        km.from_peer(Fitted(modes=np.eye(2), eigs=np.array([1.0, 0.5 + 1e-6j])), dt=0.1)
+    km.from_peer(Fitted(modes=np.eye(2), eigs=np.array([1.0, 0.5 + 1e-12j])), dt=0.1)
+
+
+def test_what_is_not_fitted_is_told():
+    class Unfitted:
+        eigs = property(lambda self: (_ for _ in ()).throw(ValueError("not fitted")))
+        modes = None
+
+    with pytest.raises((km.errors.DataError, ValueError), match="not fitted"):
+        km.from_peer(Unfitted(), dt=0.1)
+    for other in (Fitted(modes=1), Fitted(eigs=1), Fitted(regressor_=1), Fitted(lift_state=1)):
+        with pytest.raises(
+            km.errors.DataError, match="a Fitted is no fitted DMD of PyDMD nor a fitted KoopmanPipeline"
+        ):
+            km.from_peer(other, dt=0.1)
+
+
+def test_one_measured_state_is_lifted_by_the_function_and_is_nan_where_it_is_far_off():
+    from koopmpc.predict.peers import Numeric
+
+    psi = Numeric(lambda X: np.column_stack([X[:, 0], X[:, 0] * X[:, 1]]), ("a", "ab")).bind(["a", "b"])
+    measured = psi.measured()
+    np.testing.assert_array_equal(np.array(measured([2.0, 3.0])).ravel(), [2, 6])
+    for bad in ([np.nan, 1.0], [1.0, 2e30], [-2e30, 1.0]):
+        assert np.isnan(np.array(measured(bad))).all()
+    assert np.isfinite(np.array(measured([1.0, 0.5e30]))).all()

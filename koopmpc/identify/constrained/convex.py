@@ -132,7 +132,7 @@ def _dissipation(dissipation: Dissipation, A, B, size, force, block):
     z and u are taken in units of their sizes, V in units of its largest diagonal entry there.
     """
     values, vectors = np.linalg.eigh(dissipation.P)
-    held = values > 1e-12 * max(values[-1], 0.0)
+    held = values > 1e-12 * values[-1]
     L = np.sqrt(values[held])[:, None] * vectors[:, held].T
     unit = max(float((dissipation.P.diagonal() * size**2).max()), 1e-300) ** -0.5
     z, u = np.diag(size * unit), np.diag(force * unit)

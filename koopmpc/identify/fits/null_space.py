@@ -262,8 +262,8 @@ def weights(value: complex, dt: float) -> tuple[complex, complex]:
     """Return w₀ and w₁ of ∫ e^{λ(dt − s)} β(s) ds / dt = w₀ β(0) + w₁ β(dt), exact where β is linear in time."""
     a = value * dt
     if abs(a) < 1e-3:
-        after = 1 / 2 + a / 6 + a**2 / 24 + a**3 / 120
-        return 1 + a / 2 + a**2 / 6 + a**3 / 24 - after, after
+        after = 1 / 2 + a / 6 + a**2 / 24
+        return 1 + a / 2 + a**2 / 6 - after, after
     after = (np.exp(a) - 1 - a) / a**2
     return (np.exp(a) - 1) / a - after, after
 

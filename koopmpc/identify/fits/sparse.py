@@ -60,8 +60,6 @@ def lasso(
     O'Donoghue & Candès, Found. Comput. Math. 15, 2015; groups: Yuan & Lin, J. R. Stat. Soc. B 68, 2006.
     """
     K = np.zeros_like(H)
-    if not H.size:
-        return Sparse(K, 0.0)
     step = 1.0 / max(float(np.linalg.eigvalsh(G)[-1]), 1e-300)
     enough = tolerance * max(float(np.abs(H).max()), 1e-300)
     ahead, momentum, missed = K, 1.0, np.inf
