@@ -42,7 +42,7 @@ DECLARED = ("annotation", "returns", "decorator_list", "bases")  # fields that h
 # number that stands for "next to nothing" or "far too much" may be twice as large, and a most that is never reached one
 # more; and CasADi's common subexpressions (cse) only save time.
 TOLERANCES = ("reach", "tolerance", "slack", "good", "enough", "close", "settled", "perf_counter", "monotonic")
-TINY, VAST, MANY = 1e-5, 1e5, 10
+TINY, SMALL, VAST, MANY = 1e-5, 0.01, 1e5, 10
 SKIPPED = (ast.JoinedStr, ast.Raise, ast.Import, ast.ImportFrom, ast.Assert)  # what stands in them is said, not done
 
 
@@ -51,12 +51,12 @@ def _text(node: ast.AST) -> bool:
 
 
 def _tolerance(node: ast.AST) -> bool:
-    """Return whether a tolerance or a time is part of this: a float that is no whole number, or a name of one."""
+    """Return whether a tolerance or a time is part of this: a small float, or a name of one."""
     for each in ast.walk(node):
         name = each.id if isinstance(each, ast.Name) else each.attr if isinstance(each, ast.Attribute) else ""
         if name in TOLERANCES or (len(name.strip("_")) > 2 and name.isupper()):
             return True
-        if isinstance(each, ast.Constant) and isinstance(each.value, float) and not each.value.is_integer():
+        if isinstance(each, ast.Constant) and isinstance(each.value, float) and 0 < each.value < SMALL:
             return True
     return False
 
