@@ -294,3 +294,39 @@ def test_a_row_whose_equilibrium_is_not_found_is_aimed_at_itself_until_it_is_loo
         np.testing.assert_array_equal(target.u, [0.1, 0.0])
         targets.forget_missed()
         np.testing.assert_allclose(targets(row).equilibrium.x, row, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("row", "active"),
+    [
+        ([0.6, 0.5], [0, 0, 0, 0]),
+        ([3.0, 0.5], [1, 0, 0, 0]),
+        ([0.6, -3.0], [0, -1, 0, 0]),
+        ([0.8, 9.0], [0, 0, 0, 1]),
+        ([-0.5, 0.3], [-1, 0, 0, 0]),
+    ],
+)
+def test_what_is_at_its_limit_is_known_of_an_equilibrium_that_is_found(row, active) -> None:
+    """[u_1, u_2, x_1, x_2] at their lower (−1) and upper (1) limits, by ipopt and by steps from another equilibrium."""
+    each = equilibria(two_tanks(), km.Limits(0, [1.0, 1.9], x_max=[1.5, 1.2]))
+    found = each.find(np.array(row))
+    assert found.active.tolist() == active
+    np.testing.assert_allclose(two_tanks()(found.x, found.u), found.x, atol=1e-6)
+    near = each.near(each.find(np.array([0.6, 0.5])), np.array(row), np.zeros(2))
+    if near is not None:
+        assert near.active.tolist() == active
+        np.testing.assert_allclose(near.x, found.x, atol=1e-4)
+
+
+def test_of_all_equilibria_that_hold_a_reference_the_least_is_found() -> None:
+    """Two inputs do the same: each does half of it."""
+    x, u = ca.SX.sym("x", 1), ca.SX.sym("u", 2)
+    plant = km.StepMap(ca.Function("F", [x, u], [0.5 * x + u[0] + u[1]]), 0.1)
+    each = equilibria(plant, km.Limits(-4, 4), km.Cost(1, 0.1))
+    found = each.find(np.array([2.0]))
+    near = each.near(found, np.array([3.0]), np.zeros(1))
+    np.testing.assert_allclose(found.u, [0.5, 0.5], atol=1e-3)
+    np.testing.assert_allclose(near.u, [0.75, 0.75], atol=1e-6)
+    np.testing.assert_allclose(each.slope(each.linearise(near.x, near.u)), [[-0.5], [-0.5]], atol=1e-6)
+    followed = each.follow(near, np.array([3.001]), np.array([1e-3]))
+    np.testing.assert_allclose(followed.u, [0.75 - 0.00025, 0.75 - 0.00025], atol=1e-6)
