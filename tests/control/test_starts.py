@@ -182,3 +182,54 @@ def test_a_state_far_from_the_expected_one_begins_anew_and_the_last_plan_goes_on
         mpc.reset()
         mpc([0.1, 0.0], [0, 1, 0])
         anew.pop()
+
+
+@pytest.mark.parametrize("R_delta", [None, 0.02])
+@pytest.mark.parametrize("latency", [0, 2])
+@pytest.mark.parametrize("u_target", ["equilibrium", "zero", [[0.1], [-0.2], [0.3]]])
+@pytest.mark.parametrize("ahead", [True, False])
+def test_what_a_plan_costs_is_the_cost_of_its_states_and_inputs(R_delta, latency, u_target, ahead):
+    """Row k of the reference, and of given inputs, belongs to step k from now; the last of both is held."""
+    cost = km.Cost(Q=[10, 1], R=0.1, R_delta=R_delta, u_target=u_target)
+    mpc = made(cost, km.Limits(-5, 5), latency=latency)
+    rows = np.array([[0.1 * k, 0.0] for k in range(N + 1 + latency)]) if ahead else np.tile([0.2, 0.0], (9, 1))
+    mpc.reset(u_prev=[0.4])
+    for step in range(3):
+        last = 0.4 if step == 0 else mpc._given[0]
+        move = mpc([0.3, -0.1 + 0.05 * step], rows)
+        before = last if not latency else mpc._iteration.X[0, 2] if R_delta else 0.0
+        plan, R = mpc.plan(), rows[latency : latency + N + 1]
+        if isinstance(u_target, str):
+            u_r = np.array([mpc._terminal(row).u for row in R])
+        else:
+            u_r = np.array([u_target[min(k + step + latency, 2)] for k in range(N + 1)])
+        total = 0.0
+        for k in range(N):
+            total += 0.1 * float(((plan.U[k] - u_r[k]) ** 2).sum())
+            change = plan.U[k, 0] - (plan.U[k - 1, 0] if k else before)
+            total += (R_delta or 0.0) * change**2
+            if k:
+                total += float((plan.X[k] - R[k]) ** 2 @ [10, 1])
+        end, x = mpc._terminal(R[-1]), plan.X[N]
+        if ahead and not isinstance(u_target, str):  # a trajectory goes on to no equilibrium: the state alone counts
+            total += float((x - R[-1]) ** 2 @ [10, 1])
+        else:
+            m = end.m if isinstance(u_target, str) else end.m + end.V @ u_r[-1]
+            total += float(((end.M @ x + end.L @ x + end.V @ plan.U[-1] - m) ** 2).sum())
+        assert mpc._iteration.cost() == pytest.approx(total, rel=1e-9)
+        assert (move.u == plan.U[0]).all()
+
+
+@pytest.mark.parametrize("moves", [None, 2])
+@pytest.mark.parametrize("rated", [False, True])
+def test_a_plan_is_the_same_in_stages_but_for_inputs_that_are_held_or_beyond_their_limits(moves, rated):
+    mpc, rng = made(TRACKED if rated else CIRCLE, km.Limits(-1, 1), moves=moves), np.random.default_rng(0)
+    X, U, last = rng.standard_normal((N + 1, 2)), rng.standard_normal((N, 1)), np.array([0.3])
+    back, inputs = mpc._trajectory(*mpc._stages(X, U, last))
+    np.testing.assert_array_equal(back, X)
+    held = [0, 1, 2, 3, 4] if moves is None else [0, 1, 1, 1, 1]
+    np.testing.assert_allclose(inputs, np.clip(U, -1, 1)[held], atol=1e-12)
+    if rated or moves:
+        S, V = mpc._stages(X, U, last)
+        np.testing.assert_allclose(S[:, 2], [0.3, *inputs[:, 0]], atol=1e-12)
+        np.testing.assert_allclose(V[:, 0], np.diff([0.3, *inputs[:, 0]]), atol=1e-12)
