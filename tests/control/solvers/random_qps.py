@@ -85,11 +85,12 @@ def _scaled(rng, qp, kind):
     return QP(P, cost * qp.q * column, qp.A * column * row[:, None], qp.low * row, qp.high * row)
 
 
-def exactness(qp, v, y):
+def exactness(qp, v, y, least=1e-300):
     """Return the largest violation of the KKT conditions, relative, in the units of the cost.
 
     Stationarity P v + q + Aᵀy = 0 by the size of its terms; low ≤ A v ≤ high, and A v at the end that y pushes
-    to, by the limit and ‖aᵢ‖ times ‖v‖ and the ‖P⁻¹q‖ of no limits, the variables measured in 1/√Pⱼⱼ.
+    to, by the limit and ‖aᵢ‖ times ‖v‖ and the ‖P⁻¹q‖ of no limits, the variables measured in 1/√Pⱼⱼ. `least` is the
+    smallest size of a row.
     """
     if not (np.isfinite(v).all() and np.isfinite(y).all()):
         return np.inf
@@ -102,7 +103,7 @@ def exactness(qp, v, y):
     Av = qp.A @ v
     near = np.clip(Av, qp.low, qp.high)
     rows = np.linalg.norm(qp.A * units, axis=1)
-    size = rows * (np.linalg.norm(v / units) + np.linalg.norm(qp.q * units)) + np.abs(near) + 1e-300
+    size = rows * (np.linalg.norm(v / units) + np.linalg.norm(qp.q * units)) + np.abs(near) + least
     push = rows * np.abs(y)
     end = np.where(y > 0, qp.high, np.where(y < 0, qp.low, Av))
     away = np.where(push > 1e-9 * (terms * units).max(), np.abs(Av - end), np.abs(Av - near)) / size

@@ -29,11 +29,15 @@ def start(qp):
 
 
 def held(name, qp, solution):
-    """Assert the KKT conditions to the tolerance that the solver promises: OSQP's 1e-5, DAQP's 1e-6 of each row."""
+    """Assert the KKT conditions to the tolerance that the solver promises.
+
+    That of OSQP is 1e-5. That of DAQP is 1e-6 of each row, by norms that are within a factor of two of those here, and
+    1e-8 of rows that are smaller than 0.01: one of 10⁵ random QPs has a limit of 0, and a row and a solution so small.
+    """
     if name == "osqp":
         meets_kkt(qp, solution, 1e-5, 1e-5)
     else:
-        assert exactness(qp, solution.v, solution.y) < 1e-6
+        assert exactness(qp, solution.v, solution.y, least=0.01) < 2e-6
 
 
 def answers(name, rng, count):
