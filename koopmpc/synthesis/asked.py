@@ -20,6 +20,8 @@ from koopmpc.values import Value
 RUN = 3  # horizons that a run lasts
 STARTS = 4  # episodes whose first states are the default starts
 ROOM = 0.5  # share of the data's range by which a run may leave the data
+FAR = 1.0  # widths of the others' box by which an episode leaves it that is left out
+MOST = 0.9  # share of the episodes that this box holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +164,63 @@ def asked_of(
     )
 
 
+def margin_room(asked: Asked, data: Episodes) -> Float[np.ndarray, " nx"]:
+    """Return the largest margin of each state (nx,): half of the way from the reference to the nearest limit.
+
+    Errors of a poor model ask for margins that exclude the reference itself, where the loop shall rest. A reference
+    that lies on or beyond a limit, or that has no weight, caps nothing.
+    """
+    low, high = asked.limits.states(data.nx)
+    room = np.full(data.nx, np.inf)
+    for i, aims in _aims(asked, data).items():
+        way = min(aims.min() - low[i], high[i] - aims.max())
+        if way > 0:
+            room[i] = way / 2
+    return room
+
+
+def strays(data: Episodes, asked: Asked) -> dict[int, str]:
+    """Return the episodes that went far away with ordinary inputs, each with a sentence that says how far.
+
+    A sensor that jumped, or a plant that fell over, once in many episodes: its squares outweigh all others in fits and
+    in errors. Such an episode goes beyond the box that holds nine tenths of the episodes, the starts, the reference and
+    the limits by more than that box's width, where every run would count as lost; and its inputs stay within half a
+    width of those of the others. Stronger inputs are an experiment, which is worth more than the others.
+    """
+    low, high = asked.limits.states(data.nx)
+    low, high = np.where(np.isfinite(low), low, np.inf), np.where(np.isfinite(high), high, -np.inf)
+    low, high = np.minimum(low, asked.starts.min(axis=0)), np.maximum(high, asked.starts.max(axis=0))
+    for i, aims in _aims(asked, data).items():
+        low[i], high[i] = min(low[i], aims.min()), max(high[i], aims.max())
+    X, U = [episode.X for episode in data], [episode.U for episode in data]
+    x_far, x_low, x_high = _beyond(X, low, high)
+    u_far, _, _ = _beyond(U, np.full(data.nu, np.inf), np.full(data.nu, -np.inf))
+    found: dict[int, str] = {}
+    for k in np.flatnonzero((x_far.max(axis=1) > FAR) & (u_far.max(axis=1) <= ROOM)).tolist():
+        i = int(x_far[k].argmax())
+        furthest = X[k][np.abs(X[k][:, i] - (x_low[i] + x_high[i]) / 2).argmax(), i]
+        found[k] = (
+            f"episode {k} of 0 … {len(data) - 1} is left out: it goes to "
+            f"{quantity(data.states[i], f'= {furthest:.4g}')}, and nine in ten stay between {x_low[i]:.4g} and "
+            f"{x_high[i]:.4g} under such inputs; look at it: a sensor may have jumped, or the plant have fallen over"
+        )
+    return found
+
+
+def _beyond(
+    rows: Sequence[Float[np.ndarray, "_ n"]], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "e n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return how far each episode leaves the box of nine tenths of them, in widths (episodes, n), and the box.
+
+    The box is widened to hold `low` and `high`.
+    """
+    least, most = np.array([one.min(axis=0) for one in rows]), np.array([one.max(axis=0) for one in rows])
+    low = np.minimum(np.quantile(least, 1 - MOST, axis=0), low)
+    high = np.maximum(np.quantile(most, MOST, axis=0), high)
+    width = np.maximum(high - low, 1e-300)
+    return np.maximum(low - least, most - high) / width, low, high
+
+
 def outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
     """Return a sentence for each state whose start or reference lies outside the data, where no model was fitted."""
     said: list[str] = []
@@ -212,8 +271,7 @@ def unweighted(asked: Asked, data: Episodes) -> list[str]:
     of = asked.cost.of.bind(data.states)
     if not isinstance(of, State):
         return []
-    Q, _ = asked.cost.matrices(of.nz, data.nu)
-    weighed = {i for column, i in enumerate(of.chosen) if Q[column, column] > 0}
+    weighed = _aims(asked, data)
     box = asked.limits.states(data.nx)
     idle = [i for i in range(data.nx) if i not in weighed and (np.isfinite(box.low[i]) or np.isfinite(box.high[i]))]
     if not idle:
@@ -223,6 +281,15 @@ def unweighted(asked: Asked, data: Episodes) -> list[str]:
         f"{names} {'has' if len(idle) == 1 else 'have'} limits and no weight in Q: only the limit itself keeps the "
         "loop away from it; a small weight would make it keep a distance"
     ]
+
+
+def _aims(asked: Asked, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
+    """Return the reference rows of each state that the cost weighs; none for a cost on other observables."""
+    of = asked.cost.of.bind(data.states)
+    if not isinstance(of, State):
+        return {}
+    Q, _ = asked.cost.matrices(of.nz, data.nu)
+    return {int(i): asked.reference[:, column] for column, i in enumerate(of.chosen) if Q[column, column] > 0}
 
 
 def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:

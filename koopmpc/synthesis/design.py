@@ -21,7 +21,7 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.parallel import Progress, StageProgress, Workers
-from koopmpc.synthesis.asked import Asked, asked_of, outside_data, outside_limits, unweighted
+from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
 from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
@@ -62,9 +62,10 @@ def design(
 ) -> Design:
     """Choose model and controller by closed loop on learned stand-ins of the plant, and fit them to all data.
 
-    1. The episodes are cut into three folds. Every candidate model is fitted to two of them and forecasts the third
-       over the horizon, a bilinear one lifted anew at every step, as its controller does. This chooses ridges, the
-       five models of each kind that go on, and the two that stand in for the plant.
+    1. Episodes that went far away under ordinary inputs are left out, the others are cut into three folds. Every
+       candidate model is fitted to two of them and forecasts the third over the horizon, a bilinear one lifted anew at
+       every step, as its controller does. This chooses ridges, the five models of each kind that go on, and the two
+       that stand in for the plant.
     2. Surrogates: the bilinear model of the least error and the best one of another family of observables, each
        fitted to every two folds. Their measurements have the noise that their one-step errors show.
     3. Controllers: each model, fitted to two folds, controls surrogates that know the third fold, for three
@@ -100,7 +101,8 @@ def design(
     bilinear
         Try bilinear models too, where there are no measured disturbances; the surrogates are then bilinear.
     tighten
-        Give every controller limits that are `tightened` by its model's errors on the fold that it does not know.
+        Give every controller limits that are `tightened` by its model's errors on the fold that it does not know, by at
+        most half of the way from the reference to the limit.
     sample
         Snapshot pairs to judge on, about.
     workers, scheduler
@@ -122,7 +124,8 @@ def design(
     Warns
     -----
     FitWarning
-        No input inside the limits holds the reference; the reference or a start lies outside the data.
+        No input inside the limits holds the reference; the reference or a start lies outside the data; an episode is
+        left out.
     """
     ahead, draw = checks.count(horizon, "horizon"), checks.generator(rng)
     source = source_of(data)
@@ -130,6 +133,13 @@ def design(
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
     held, notes = sampled(source, checks.count(sample, "sample"))
     asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
+    left = strays(held, asked)
+    if left:
+        held = held.with_episodes([episode for k, episode in enumerate(held) if k not in left])
+        asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
+        source = held
+        if notes:
+            notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)
@@ -149,6 +159,7 @@ def design(
         results = pool.map(tried, trials, _stage(progress, "models"), size=lambda trial: trial.candidate.size)
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
         test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, pool)
+        doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
         rows, outcomes = _rounds(test, _screened(results, floor), pool, progress)
@@ -273,7 +284,8 @@ def _test(
     of = asked.cost.of.bind(data.states)
     tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
     low, high = asked.hull(free, tracked)
-    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, tighten)
+    room = margin_room(asked, data) if tighten else None
+    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, room)
     unreachable = unheld(surrogates[0], asked)
     holds = not asked.moves and not unreachable
     return test, [*unreachable, *outside_limits(asked, data), *outside_data(asked, data, tracked, free)], holds

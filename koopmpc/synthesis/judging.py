@@ -13,6 +13,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
+from koopmpc.lifting.base import short
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
@@ -66,7 +67,8 @@ class Condition:
 class LoopTest:
     """The task, the data in folds, the surrogates and the conditions, which all runs share.
 
-    A run that leaves the box from `low` to `high` is lost. With `tighten` controllers have margins to the limits.
+    A run that leaves the box from `low` to `high` is lost. Controllers have margins to the limits, of at most `room`
+    (nx,); None for no margins.
     """
 
     asked: Asked
@@ -76,14 +78,20 @@ class LoopTest:
     conditions: tuple[Condition, ...]
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
-    tighten: bool
+    room: Float[np.ndarray, " nx"] | None
 
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
         """Return the limits that a controller gets if its model has these errors."""
-        if not self.tighten:
+        if self.room is None:
             return self.asked.limits
         width = np.where(np.isfinite(band), band, self.asked.high - self.asked.low)
-        return self.asked.limits.tightened(width, states=self.episodes.states)
+        limits = self.asked.limits.tightened(np.minimum(width, self.room), states=self.episodes.states)
+        said = tuple(
+            f"{short(self.episodes.states[i])}: the margin is {self.room[i]:.4g}, half way from the reference to the "
+            f"limit, though the errors ask for up to {width[:, i].max():.4g}"
+            for i in np.flatnonzero((np.asarray(limits.margin) == self.room).any(axis=0))
+        )
+        return replace(limits, capped=(*limits.capped, *said))
 
     @property
     def nominal(self) -> tuple[int, ...]:

@@ -263,6 +263,35 @@ def test_a_margin_that_is_capped_is_advice():
     assert said.startswith("x1: from step 1 on the margin is 0.2, 20 % of the range")
 
 
+def test_no_margin_excludes_a_reference_inside_the_limits_and_advice_says_what_was_capped():
+    found = designed(noisy(data(), 0.3), reference=[0.0, 0.45])
+    margin = np.asarray(found.controller.limits.margin)[:, 1]
+    assert (margin > 0).all()
+    assert (0.45 + margin < 0.5).all()
+    assert any(sentence.startswith("x1: the margin is 0.025, half way") for sentence in found.advice)
+
+
+def far_away(kick, push=1.0):
+    """The data, and one episode more whose sensor jumps by `kick` and whose inputs are `push` times as large."""
+    last = data(12)[11]
+    X = np.array(last.X)
+    X[10, 1] += kick
+    return data(12).with_episodes([*list(data(12))[:11], km.Episode(X=X, U=push * np.asarray(last.U))])
+
+
+def test_an_episode_that_goes_far_away_under_ordinary_inputs_changes_no_design():
+    alone = designed(data(12).with_episodes(list(data(12))[:11]))
+    found = designed(far_away(50.0))
+    assert found.best == alone.best
+    assert np.array_equal(found.controller.predictor.A, alone.controller.predictor.A)
+    said = next(sentence for sentence in found.advice if "is left out" in sentence)
+    assert said.startswith("episode 11 of 0 … 11 is left out: it goes to x1 = ")
+
+
+def test_an_experiment_with_stronger_inputs_is_kept():
+    assert not any("is left out" in sentence for sentence in designed(far_away(50.0, push=4.0)).advice)
+
+
 def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(monkeypatch):
     confirmed, seen = room.confirmed, []
 
