@@ -169,3 +169,27 @@ def test_a_plant_that_diverges_is_told_with_the_episode_and_the_step() -> None:
     driven = km.plants.SimulatedPlant(plant)
     with pytest.raises(km.errors.DataError, match="episode 1 is NaN or infinite from step 5 on"):
         km.collect(driven, [[0.0, -9.0], [0.0, 3.0]], km.Noise(1, 1), episodes=2, steps=8)
+
+
+def test_a_step_map_needs_a_start_and_a_plant_that_ends_is_cut() -> None:
+    with pytest.raises(km.errors.DataError, match="a step map has no state of its own to begin in; pass x0"):
+        km.collect(PENDULUM, None, km.Noise(-8, 8), episodes=1, steps=2)
+
+    class Short(Unseen):
+        """It ends after its second step."""
+
+        ended = ""
+
+        def reset(self, x0, rng):
+            self.taken, self.ended = 0, ""
+            return super().reset(x0, rng)
+
+        def step(self, u):
+            self.taken += 1
+            self.ended = "done" if self.taken == 2 else ""
+            return super().step(u)
+
+    data = km.collect(Short(), [3.0], km.Noise(1, 1), episodes=2, steps=5)
+    assert [len(run) for run in data] == [2, 2]
+    assert [run.X.ravel().tolist() for run in data] == [[6, 8, 10]] * 2
+    assert [run.U.ravel().tolist() for run in data] == [[1, 1]] * 2

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.data.files.parquet import row_groups
-from koopmpc.data.source import Changed, source_of
+from koopmpc.data.source import Changed, Part, Subset, source_of
 from tests.bare import shown
 from tests.example_plants import brute_force, random_episodes
 
@@ -283,3 +283,55 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     a.write_bytes(b"")
     with pytest.raises(km.errors.LogError, match=r"a\.parquet \(rows 0 to 50\) holds no episodes that can be read"):
         parts[0].load()
+
+
+def test_a_subset_of_a_source_holds_its_parts_in_the_order_of_the_source() -> None:
+    data = random_episodes(0, [3] * 4, 2, 1)
+
+    class Four(km.data.source.Source):
+        def parts(self, history: int = 0) -> list[Part]:
+            return [Part(f"part {i}, {history} rows earlier", partial(data.with_episodes, [data[i]])) for i in range(4)]
+
+    some = Subset(Four(data.dt, data.states, data.inputs, ()), [3, 1])
+    assert [part.place for part in some.parts(2)] == ["part 1, 2 rows earlier", "part 3, 2 rows earlier"]
+    assert read(some) == [data[1], data[3]]
+    assert (some.dt, some.states, some.inputs, some.replayable) == (data.dt, data.states, data.inputs, True)
+
+
+@pytest.mark.parametrize("share", [0.9e-6, -0.9e-6, 1.1e-6, -1.1e-6])
+def test_sample_times_agree_to_a_millionth(share: float) -> None:
+    one = random_episodes(0, [5], 2, 1)
+    other = km.Episodes(list(one), one.dt * (1 + share), one.states, one.inputs)
+    if abs(share) < 1e-6:
+        assert len(read(km.Stream([one, other]))) == 2
+    else:
+        with pytest.raises(km.errors.DataError, match=r"has dt = .*; resample one of them"):
+            read(km.Stream([one, other]))
+
+
+def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each block of rows has its own checksum, and the last one may hold fewer rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    monkeypatch.setattr("koopmpc.data.files.parquet._GROUP", 8 * 5 * 16)  # sixteen rows of five columns
+    data = random_episodes(0, [20, 7, 12, 10], 2, 1)  # 53 rows: three blocks and five rows
+    data.save(tmp_path / "whole.parquet")
+    table = pq.read_table(tmp_path / "whole.parquet")
+    assert km.load_episodes(tmp_path / "whole.parquet") == data
+    for row in (0, 15, 16, 47, 48, 52):
+        for name in (data.states[0], data.states[1], data.inputs[0]):
+            column = table[name].to_numpy().copy()
+            if np.isnan(column[row]):
+                continue  # the input of the last row of an episode
+            column[row] += 1e-9
+            place = table.column_names.index(name)
+            changed = table.set_column(place, table.schema.field(name), pa.array(column, mask=np.isnan(column)))
+            pq.write_table(changed, tmp_path / "changed.parquet", row_group_size=16)
+            with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
+                km.load_episodes(tmp_path / "changed.parquet")
+            parts = row_groups(tmp_path / "changed.parquet", 0, None)
+            with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
+                parts[row // 16].load()

@@ -426,3 +426,18 @@ def test_units_of_a_given_model_do_not_decide_its_drift(disturbance):
             observer.observe(T @ y, u, NO_W)
         found.append(np.linalg.solve(T, np.column_stack([observer.z, observer.d])))
     np.testing.assert_allclose(found[1], found[0], atol=0.01)  # rows and columns are alike up to factors of two
+
+
+def test_a_model_that_is_not_lifted_and_a_filter_that_does_not_exist_are_refused(monkeypatch):
+    plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
+    with pytest.raises(
+        km.errors.DataError, match=r"filters the lifted state of a linear predictor.*pass a LiftedDisturbance"
+    ):
+        km.NonlinearMPC(plant, km.Cost(Q=[1, 1], R=1), horizon=5, estimator=km.LiftedKalman("theta"))
+
+    def none(*arguments):
+        raise np.linalg.LinAlgError("no solution")
+
+    monkeypatch.setattr("scipy.linalg.solve_discrete_are", none)
+    with pytest.raises(km.errors.DataError, match=r"no stationary filter was found \(no solution\)"):
+        km.LiftedKalman("x0").start(INTEGRATOR, 20)

@@ -99,3 +99,8 @@ def test_what_it_cannot_take_is_told():
     still = km.Episodes([km.Episode(X=np.ones((5, 2)))], 0.1)
     with pytest.raises(km.errors.DataError, match="all one state"):
         km.kernel_edmd(still)
+
+
+def test_a_stream_is_refused_because_it_is_read_twice(data: km.Episodes) -> None:
+    with pytest.raises(km.errors.DataError, match="a stream is read once, and kernel_edmd needs it for its landmarks"):
+        km.kernel_edmd(km.Stream(iter([data])), landmarks=5)
