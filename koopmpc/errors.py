@@ -1,5 +1,8 @@
 """The errors of koopmpc: one root, and each class is also the builtin that it refines."""
 
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -52,3 +55,11 @@ class FitWarning(UserWarning):
 
 class ColumnWarning(FitWarning):
     """A column of a table says nothing: it is constant in it, or repeats another."""
+
+
+@contextmanager
+def unwarned() -> Generator[None]:
+    """Show no FitWarning in this block, whose caller says elsewhere what is doubtful."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)
+        yield

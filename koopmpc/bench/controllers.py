@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import time
-import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -31,7 +30,7 @@ from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, FitWarning, ProblemError
+from koopmpc.errors import DataError, ProblemError, unwarned
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
@@ -233,8 +232,7 @@ class Prepared:
             return known
         problem = self.problem
         cases = list(problem.cases.values())
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FitWarning)  # of cases that ask for what the data do not hold
+        with unwarned():  # of cases that ask for what the data do not hold
             found = design(
                 self.data,
                 problem.cost,

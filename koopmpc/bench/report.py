@@ -228,10 +228,7 @@ def _pictures(own: Sequence[RunRow], usual: Sequence[RunRow], folder: Path) -> I
         states: list[str] = [*named, *(f"state {k}" for k in range(len(named), len(spread)))]
         reached = {name: np.array([row.reached for row in measured[name]]) for name in starts}
         mapped = {name: (values[:, [i, j]], reached[name]) for name, values in starts.items()}
-        yield (
-            svg(attraction(mapped, [states[i], states[j]])),
-            "Initial states that reach their reference, and not.",
-        )
+        yield (svg(attraction(mapped, [states[i], states[j]])), "Initial states that reach their reference, and not.")
     if runs:
         yield svg(trajectories(runs)), "The case's own start."
 

@@ -4,7 +4,7 @@ import shlex
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -14,9 +14,6 @@ from koopmpc.cli import sweeps
 from koopmpc.cli.console import bar, console, folder_of, friendly, new_file, new_folder, program, say_page, split
 from koopmpc.cli.sweeps import Logs
 from koopmpc.errors import DataError, KoopmpcError, ProblemError
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer(name="koopmpc", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -59,9 +56,7 @@ def list_() -> None:
 
 
 @app.command()
-def new(
-    name: Annotated[str, typer.Argument(help="Name of the problem; the file <name>.py is written here.")],
-) -> None:
+def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file <name>.py is written here.")]) -> None:
     """Write a commented problem file that runs, to be changed into your own."""
     from koopmpc.bench.library import new_problem
 
@@ -117,38 +112,23 @@ def fit(
         again = [*program(), "fit", *map(str, data), "--goal", str(path)]
         out.print(Text(f"then: {shlex.join(again)}"), soft_wrap=True)
         return
+
+    def say(text: str) -> None:
+        out.print(Text(text + "\n"), soft_wrap=True)
+
+    how: dict[str, Any] = {"bilinear": not linear, "workers": workers, "scheduler": scheduler, "say": say, **reading}
     if goal is not None:
         with friendly():
             if horizon is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-            designed = design_data(
-                source,
-                goal,
-                folder,
-                bilinear=not linear,
-                workers=workers,
-                scheduler=scheduler,
-                say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
-                progress=progress,
-                **reading,
-            )
+            designed = design_data(source, goal, folder, progress=progress, **how)
         out.print(Text(f"controller: {designed.controller}, report: {designed.page}"), soft_wrap=True)
         checked = shlex.join([*program(), "check", str(designed.controller)])
         out.print(Text(f"check it: {checked}\nuse it:\n{designed.usage}"), soft_wrap=True)
         return
     with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-        done = fit_data(
-            source,
-            folder,
-            horizon=horizon,
-            bilinear=not linear,
-            workers=workers,
-            scheduler=scheduler,
-            say=lambda text: out.print(Text(text + "\n"), soft_wrap=True),
-            progress=progress,
-            **reading,
-        )
+        done = fit_data(source, folder, horizon=horizon, progress=progress, **how)
     for failure in done.failures:
         err.print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
     out.print(Text(f"model, report and pictures: {folder}"), soft_wrap=True)

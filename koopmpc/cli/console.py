@@ -47,24 +47,15 @@ def bar(first: str, *, rate: bool = False) -> Generator[Callable[[str, int, int 
 
     With `rate` it shows how many are done in a second, and how long the rest takes at that rate.
     """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
-    class Rate(ProgressColumn):
-        def render(self, task: Task) -> Text:
+    class Rate(progress.ProgressColumn):
+        def render(self, task: progress.Task) -> Text:
             return Text("" if task.speed is None else f"{task.speed:.3g}/s")
 
-    more = (Rate(), TimeRemainingColumn()) if rate else ()
-    columns = (TextColumn("{task.description:40}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), *more)
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+    columns = [progress.TextColumn("{task.description:40}"), progress.BarColumn(), progress.MofNCompleteColumn()]
+    columns += [progress.TimeElapsedColumn(), *((Rate(), progress.TimeRemainingColumn()) if rate else ())]
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task(first, total=None)
         yield lambda what, done, total: shown.update(task, description=what[:40], completed=done, total=total)
 

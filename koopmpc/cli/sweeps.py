@@ -78,7 +78,7 @@ def bench(
     from koopmpc.bench.store import manifest_of
 
     with friendly(), _page(live):
-        where = {"workers": workers, "scheduler": scheduler, "live": live, "paced": paced}
+        where: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "live": live, "paced": paced}
         if resume is not None:
             asked: dict[str, Any] = manifest_of(resume)["asked"]
             loaded = [
@@ -88,15 +88,9 @@ def bench(
             _sweep(loaded, asked.pop("controllers"), resume, logs, "bench", **asked, **where)
             return
         loaded = [load_problem(problem) for problem in (shipped() if every else problems or DEFAULT)]
-        grid = {
-            "starts": starts,
-            "seeds": seeds,
-            "noise": _shares(noise, "--noise"),
-            "wrong": _shares(wrong, "--wrong"),
-        }
-        _sweep(
-            loaded, controller, None, logs, "bench", **grid, faults=faults, monitor=monitor, compiled=compiled, **where
-        )
+        where |= {"noise": _shares(noise, "--noise"), "wrong": _shares(wrong, "--wrong"), "starts": starts}
+        where |= {"seeds": seeds, "faults": faults, "monitor": monitor, "compiled": compiled}
+        _sweep(loaded, controller, None, logs, "bench", **where)
 
 
 def report(folder: Annotated[Path, typer.Argument(help="The folder of a sweep.")]) -> None:

@@ -13,16 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
-from koopmpc.codegen.machine import (
-    CRows,
-    Frame,
-    Precision,
-    SingleFrame,
-    built_of,
-    first_error,
-    plant_text,
-    whole_call,
-)
+from koopmpc.codegen.machine import CRows, Frame, Precision, SingleFrame, built_of, first_error, plant_text, whole_call
 from koopmpc.codegen.staged import target_rows
 from koopmpc.codegen.tables import Exportable, refusal
 from koopmpc.control.linear.plan import planned_states
@@ -185,11 +176,7 @@ class Compiled:
             )
 
     def __call__(
-        self,
-        y: ArrayLike,
-        reference: ArrayLike,
-        applied: ArrayLike | None = None,
-        w: ArrayLike | None = None,
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
     ) -> Move:
         """Return the next input for measurement y; the arguments are those of the original."""
         try:

@@ -18,17 +18,11 @@ _ZERO_ROW = 1e-11  # squared length below which DAQP leaves a row as it is
 
 # DAQP's tolerances in single precision: its own are below the rounding of a float.
 _SINGLE = {
-    "primal_tol": 1e-5,
-    "dual_tol": 1e-6,
-    "zero_tol": 1e-6,
-    "pivot_tol": 1e-4,
-    "progress_tol": 1e-7,
-    "sing_tol": 1e-6,
-    "refactor_tol": 1e-5,
-}
-_REALS = ("primal_tol", "dual_tol", "zero_tol", "pivot_tol", "progress_tol", "sing_tol", "refactor_tol", "fval_bound")
+    "primal_tol": 1e-5, "dual_tol": 1e-6, "zero_tol": 1e-6, "pivot_tol": 1e-4,
+    "progress_tol": 1e-7, "sing_tol": 1e-6, "refactor_tol": 1e-5,
+}  # fmt: skip
 _OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
-_C_SETTINGS = (*_REALS, *_OTHERS)
+_C_SETTINGS = (*_SINGLE, "fval_bound", *_OTHERS)
 
 
 def lqr_tables(controller: LQR, *, single: bool) -> Tables:

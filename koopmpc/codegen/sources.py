@@ -38,11 +38,9 @@ def tables_of(
         raise error
     if isinstance(controller, BilinearMPC):
         return bilinear_tables(controller, references, single=single)
-    return (
-        lqr_tables(controller, single=single)
-        if isinstance(controller, LQR)
-        else koopman_tables(controller, single=single)
-    )
+    if isinstance(controller, LQR):
+        return lqr_tables(controller, single=single)
+    return koopman_tables(controller, single=single)
 
 
 def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
@@ -51,12 +49,8 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
     if tables.is_staged:
         own = (*OWN, *_RECEDING, *_STAGED, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
     else:
-        own = (
-            *OWN,
-            *_QP,
-            "koopmpc_target.c",
-            *(("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")),
-        )
+        law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
+        own = (*OWN, *_QP, "koopmpc_target.c", *law)
     result = {name: shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _sizes(tables, single=single)
     result["koopmpc_solver.h"] = _solver(tables, language)

@@ -122,10 +122,8 @@ def model_tables(
     zeta = ca.SX.sym("zeta", sizes["NZETA"])
     graph = traced(ca.Function("lifting", [zeta], [ca.densify(lift(zeta))], {"cse": True}), "the lifting")
     kinds = {"IS_LQR": 0, "IS_STAGED": 0}
-    past = {
-        "DELAYS": 0 if embedding is None else embedding.steps,
-        "DELAYED_INPUTS": 0 if embedding is None else int(embedding.inputs),
-    }
+    steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
+    past = {"DELAYS": steps, "DELAYED_INPUTS": inputs_too}
     tables = Tables(
         model,
         kinds | past | {"NW1": max(1, sizes["NW"])} | sizes,

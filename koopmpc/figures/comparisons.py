@@ -167,9 +167,7 @@ def _loops(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
 
 @styled
 def reconstruction(
-    cases: Mapping[str, tuple[ArrayLike, Mapping[str, ArrayLike]]],
-    dt: float,
-    states: Sequence[str],
+    cases: Mapping[str, tuple[ArrayLike, Mapping[str, ArrayLike]]], dt: float, states: Sequence[str]
 ) -> "Figure":
     """Draw each state over time with its reconstructions, and below ‖x̂_k − x_k‖ / max ‖x‖ on a logarithmic axis.
 

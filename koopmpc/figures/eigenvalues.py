@@ -13,10 +13,7 @@ from koopmpc.validate.scoring import AnyPredictor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LEAST, _MOST = (
-    1e-12,
-    1e3,
-)  # residuals below the first are rounding; those above the second are drawn as if they were it
+_LEAST, _MOST = 1e-12, 1e3  # residuals below are rounding; those above are drawn as if they were the second
 _CROWDED = 0.35  # share of the picture below which the eigenvalues get a closer picture
 
 
@@ -90,9 +87,8 @@ def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
     low, high = min(float(shown.min()), known.tolerance / 10), max(float(shown.max()), known.tolerance * 10)
     norm = LogNorm(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
     sizes = 12.0 + 40.0 * (1.0 - np.asarray(norm(shown)))
-    shades = ListedColormap(
-        mpl.colormaps[SEQUENTIAL](np.linspace(0, 0.85, 256))
-    )  # the light end of the scale is too light for points
+    darker = np.linspace(0, 0.85, 256)  # the light end of the scale is too light for points
+    shades = ListedColormap(mpl.colormaps[SEQUENTIAL](darker))
     points = None
     for chosen, marker in ((~known.spurious, "o"), (known.spurious, "x")):
         look: dict[str, Any] = {"edgecolors": "black"} if marker == "o" else {}

@@ -188,10 +188,7 @@ def eigenfunctions(
     drawn = axes.flat[: len(cells)]
     for panel, (k, kind) in zip(drawn, cells, strict=True):
         _draw(made, panel, grid, phi[k], values[k], f"φ{_subscript(chosen[k])}", kind)
-    for empty in (
-        *axes.flat[len(cells) :],
-        *(p for p, (_, kind) in zip(drawn, cells, strict=True) if kind == "empty"),
-    ):
+    for empty in (*axes.flat[len(cells) :], *(p for p, (_, kind) in zip(drawn, cells, strict=True) if kind == "empty")):
         empty.remove()
     return made
 
@@ -229,14 +226,7 @@ def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) ->
     from matplotlib.patheffects import withStroke
 
     mesh = axes.pcolormesh(
-        plane.across,
-        plane.up,
-        phase,
-        cmap=CYCLIC,
-        vmin=-np.pi,
-        vmax=np.pi,
-        shading="nearest",
-        rasterized=True,
+        plane.across, plane.up, phase, cmap=CYCLIC, vmin=-np.pi, vmax=np.pi, shading="nearest", rasterized=True
     )
     bar = made.colorbar(mesh, ax=axes, label=label)
     bar.set_ticks([-np.pi, *_QUARTERS, np.pi], labels=["−π", *_QUARTERS.values(), "π"])

@@ -82,14 +82,7 @@ def styled(plot: Callable[P, T]) -> Callable[P, T]:
     return within
 
 
-def figure(
-    rows: int,
-    columns: int = 1,
-    *,
-    width: Width,
-    height: float,
-    **more: Any,
-) -> "tuple[Figure, np.ndarray]":
+def figure(rows: int, columns: int = 1, *, width: Width, height: float, **more: Any) -> "tuple[Figure, np.ndarray]":
     """Return a figure and its (rows, columns) axes, an array of objects.
 
     Parameters

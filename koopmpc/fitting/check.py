@@ -113,20 +113,13 @@ class Checked:
         """Return the verdict and a line for each kind of run."""
         verdict = "the goal is kept" if self.kept else "THE GOAL IS NOT KEPT"
         rows = [_row(one) for one in self.figures]
-        times = (
-            f"a step takes {duration(self.hot)} (99 %), the first one {duration(self.cold)}; dt is {duration(self.dt)}"
-        )
+        hot, cold, dt = map(duration, (self.hot, self.cold, self.dt))
+        times = f"a step takes {hot} (99 %), the first one {cold}; dt is {dt}"
         return written(verdict, *(f"- {reason}" for reason in self.reasons), "", table(_HEADINGS, rows), "", times)
 
 
-_HEADINGS = (
-    "kind of run",
-    "lost",
-    "median\ncost",
-    "worst\nviolation",
-    "error\nat the end",
-    "steps without\na good status",
-)
+_NUMBERS = ("lost", "median\ncost", "worst\nviolation", "error\nat the end", "steps without\na good status")
+_HEADINGS = ("kind of run", *_NUMBERS)
 
 
 def _row(one: Figures) -> list[str]:
@@ -183,11 +176,8 @@ def check_controller(
     start = perf_counter()
     controller(asked.starts[0], asked.reference[: controller.horizon + 1])
     cold = perf_counter() - start
-    every, times, figures = (
-        kinds(asked.horizon, bounded=bool(np.isfinite(asked.limits.inputs(controller.nu)).all())),
-        list[float](),
-        list[Figures](),
-    )
+    every = kinds(asked.horizon, bounded=bool(np.isfinite(asked.limits.inputs(controller.nu)).all()))
+    times, figures = list[float](), list[Figures]()
     done, total = 0, runs * len(every)
     picked = draw.integers(len(asked.first_states), size=runs)
     for kind in every:
@@ -195,9 +185,8 @@ def check_controller(
         for j in range(runs):
             one = evidence.surrogates[j % len(evidence.surrogates)]
             plant = Fenced(one.plant(kind.gain), evidence.low, evidence.high)
-            outcomes.append(
-                _driven(evidence, controller, kind, plant, one.start(asked.first_states[picked[j]]), j, times)
-            )
+            begin = one.start(asked.first_states[picked[j]])
+            outcomes.append(_driven(evidence, controller, kind, plant, begin, j, times))
             done += 1
             if progress is not None:
                 progress(kind.name, done, total)
@@ -343,19 +332,15 @@ def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -
         f"{len(saved.evidence.surrogates)} models that were learned from its logs. They are no plant: what all of them "
         "have learned wrongly shows in none of these runs."
     )
-    page.table(["kind of run", *(heading.replace("\n", " ") for heading in _HEADINGS[1:])], map(_row, result.figures))
+    page.table(["kind of run", *(heading.replace("\n", " ") for heading in _NUMBERS)], map(_row, result.figures))
     page.text("## Statuses")
     page.table(
         ["kind of run", "steps"],
         [[f.kind.name, ", ".join(f"{count} {name}" for name, count in f.statuses)] for f in result.figures],
     )
     page.text("## Times")
-    page.items(
-        [
-            f"the first step of a fresh controller: {duration(result.cold)}",
-            f"99 % of all others: at most {duration(result.hot)}",
-        ]
-    )
+    cold, hot = duration(result.cold), duration(result.hot)
+    page.items([f"the first step of a fresh controller: {cold}", f"99 % of all others: at most {hot}"])
     page.text("## What was expected at its design")
     page.code(str(saved.evidence.expected))
     page.write(result.page.name)

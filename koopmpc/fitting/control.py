@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks, disk
-from koopmpc.data.episodes import Episodes
 from koopmpc.fitting.audited import Data, evenly
 from koopmpc.fitting.fit import Say, guessed, logs_of, silent, understood
 from koopmpc.fitting.goal import Goal, goal_template, read_goal
@@ -124,11 +123,7 @@ def design_data(
 def template_of(data: Data, *, memory: int = IN_MEMORY, **reading: Any) -> str:
     """Return the text of a goal file for the plant of some logs, with the ranges found."""
     split, _ = _read(data, memory, checks.generator(0), reading)
-    return goal_template(_whole(split))
-
-
-def _whole(split: Divided) -> Episodes:
-    return split.seen.with_episodes([*split.seen, *split.held_out])
+    return goal_template(split.seen.with_episodes([*split.seen, *split.held_out]))
 
 
 def _read(data: Data, memory: int, draw: np.random.Generator, reading: dict[str, Any]) -> tuple[Divided, list[str]]:

@@ -279,13 +279,8 @@ def understood(split: Divided, notes: list[str]) -> str:
         if not names and what == "inputs":
             pairs.append(("inputs", "none"))
     steps = sum(map(len, split.held_out))
-    pairs.append(
-        (
-            "held out",
-            f"{len(split.held_out)} episodes, {steps} steps; horizon {split.horizon} steps = "
-            f"{split.horizon * seen.dt:.3g} s",
-        )
-    )
+    ahead = f"horizon {split.horizon} steps = {split.horizon * seen.dt:.3g} s"
+    pairs.append(("held out", f"{len(split.held_out)} episodes, {steps} steps; {ahead}"))
     return "\n".join([written(labelled(pairs)), *(f"! {note}" for note in (*notes, *split.notes))])
 
 

@@ -16,12 +16,13 @@ import casadi as ca
 import numpy as np
 
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import unwarned
 from koopmpc.figures.plots import Plot, plots
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.radial import Gaussian
 from koopmpc.lifting.state import Constant, State
-from koopmpc.papers.registry import Claim, Tell, judged, percent, short, unwarned
+from koopmpc.papers.registry import Claim, Tell, judged, percent, short
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor

@@ -25,6 +25,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.nonlinear.eigenfunction_lqr import EigenfunctionLQR
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import unwarned
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.eigenfunctions import eigenfunctions
 from koopmpc.lifting.base import Lifting
@@ -32,7 +33,7 @@ from koopmpc.lifting.eigenfunction import Eigenfunction
 from koopmpc.lifting.state import Constant, Expressions, Monomials, State
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.plants import closed_loop, trajectories
-from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, short, show, unwarned
+from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, short, show
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize

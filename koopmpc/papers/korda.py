@@ -32,13 +32,14 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.move import Status
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import unwarned
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import Expressions, State
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.korda_motor import motor
-from koopmpc.papers.registry import Claim, Tell, judged, percent, relative, short, show, unwarned
+from koopmpc.papers.registry import Claim, Tell, judged, percent, relative, short, show
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page

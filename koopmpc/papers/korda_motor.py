@@ -14,10 +14,11 @@ from koopmpc.control.linear.linear_mpc import LinearMPC
 from koopmpc.control.move import Status
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import unwarned
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import State
-from koopmpc.papers.registry import Claim, Tell, compared, judged, show, unwarned
+from koopmpc.papers.registry import Claim, Tell, compared, judged, show
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page

@@ -14,13 +14,13 @@ from koopmpc.control.lqr import lqr
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
-from koopmpc.errors import FitWarning
+from koopmpc.errors import FitWarning, unwarned
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kic import InputPredictor, kic
 from koopmpc.lifting.state import Expressions, State
 from koopmpc.papers.plants import closed_loop
-from koopmpc.papers.registry import Claim, Tell, compared, judged, short, show, unwarned, written
+from koopmpc.papers.registry import Claim, Tell, compared, judged, short, show, written
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize
 from koopmpc.recording.page import Page

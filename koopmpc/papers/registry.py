@@ -4,10 +4,8 @@ A paper is a `Paper` in the module, or the folder, of its name. docs/papers/ hol
 `koopmpc reproduce` writes: copy both after a change.
 """
 
-import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
@@ -23,7 +21,7 @@ from numpy.typing import ArrayLike
 from rich.table import Table
 
 from koopmpc.checks import nearest
-from koopmpc.errors import FitWarning, ProblemError
+from koopmpc.errors import ProblemError
 from koopmpc.figures.plots import Plot, plots
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.page import Page, record_curves
@@ -92,14 +90,6 @@ def percent(error: float) -> str:
         return "diverges"
     value = 100 * error
     return f"{value:.3g}" if value == 0 or value >= 1e-3 else f"{value:.1e}"
-
-
-@contextmanager
-def unwarned() -> Generator[None]:
-    """Show no FitWarning, because the tables hold the rank, the condition and the warnings of each fit."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FitWarning)
-        yield
 
 
 def verdict_table(title: str, claims: Sequence[Claim]) -> Table:

@@ -9,13 +9,14 @@ from koopmpc.bench.library import load_problem
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
+from koopmpc.errors import unwarned
 from koopmpc.figures.plane import eigenfunctions
 from koopmpc.figures.plots import Plot, plots
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kernel import kernel_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.papers.registry import Claim, Tell, judged, percent, short, unwarned
+from koopmpc.papers.registry import Claim, Tell, judged, percent, short
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor

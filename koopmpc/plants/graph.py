@@ -165,11 +165,7 @@ class Graph(Value):
         scalar = _scalar(function)
         starts = np.cumsum([0] + [scalar.numel_in(i) for i in range(scalar.n_in())]).tolist()
         for k in range(scalar.n_instructions()):
-            code, read, written = (
-                scalar.instruction_id(k),
-                scalar.instruction_input(k),
-                scalar.instruction_output(k),
-            )
+            code, read, written = (scalar.instruction_id(k), scalar.instruction_input(k), scalar.instruction_output(k))
             if code not in _NAMES:
                 raise DataError(
                     f"{function.name()} uses the operation {_refused(code)!r}, which cannot be written as data; "

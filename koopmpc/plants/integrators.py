@@ -129,11 +129,7 @@ def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
     K = unknown * ca.repmat(scale, 1, stages)
     rows = [unknown[:, i] - dt * f(x + K @ ca.DM(a[i]), u) / scale for i in range(stages)]
     residual = ca.Function("residual", [ca.vec(unknown), x, u], [ca.vertcat(*rows)])
-    options = {
-        "max_iter": 50,
-        "abstol": 1e-15,
-        "abstolStep": 1e-11,
-    }  # Newton squares its error in the last step
+    options = {"max_iter": 50, "abstol": 1e-15, "abstolStep": 1e-11}  # Newton squares its error in the last step
     newton = ca.rootfinder("newton", "fast_newton", residual, options)
     start = ca.Function("start", [x, u], [ca.repmat(slope / scale, stages, 1), scale])
     X, U = ca.MX.sym("x", nx), ca.MX.sym("u", u.size1())

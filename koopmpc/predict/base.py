@@ -262,9 +262,7 @@ class Predictor(Value):
         return x
 
 
-def eigen(
-    A: Float[np.ndarray, "nz nz"],
-) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
+def eigen(A: Float[np.ndarray, "nz nz"]) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
     """Return eigenvalues of A, the largest magnitude first, and its right eigenvectors, one a column."""
     result = np.linalg.eig(A)
     values, vectors = np.asarray(result.eigenvalues, complex), np.asarray(result.eigenvectors, complex)

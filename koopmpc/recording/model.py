@@ -253,9 +253,7 @@ def _blueprint(
         rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
     return framed(
         rrb.Horizontal(
-            left,
-            rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]),
-            column_shares=[1.0, 1.2],
+            left, rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]), column_shares=[1.0, 1.2]
         )
     )
 

@@ -241,23 +241,15 @@ class Recorder:
         return BackgroundWriter(self._about, writer)
 
 
+_ARRAYS = ("y", "u", "reference", "x", "x_next", "y_next", "reference_next", "u_reference")
+
+
 def _copied(step: Step) -> Step:
     """Return `step` with arrays of its own: a loop may write into its arrays again."""
     plan = step.plan
     kept = None if plan is None else Plan(_floats(plan.X), _floats(plan.U))
-    return Step(
-        k=step.k,
-        y=_floats(step.y),
-        u=_floats(step.u),
-        reference=_floats(step.reference),
-        move=step.move,
-        x=_floats(step.x),
-        x_next=_floats(step.x_next),
-        y_next=_floats(step.y_next),
-        reference_next=_floats(step.reference_next),
-        u_reference=_floats(step.u_reference),
-        look_ahead=None if kept is None else lambda: kept,
-    )
+    own = {name: _floats(getattr(step, name)) for name in _ARRAYS}
+    return Step(k=step.k, move=step.move, **own, look_ahead=None if kept is None else lambda: kept)
 
 
 def _floats(values: Any) -> Any:

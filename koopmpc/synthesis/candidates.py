@@ -1,7 +1,6 @@
 """Candidate and Recipe: a model to try, and how it and its controller are made; the candidates for an unknown plant."""
 
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import comb
@@ -18,7 +17,7 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import DataError, FitWarning, ShapeError
+from koopmpc.errors import DataError, ShapeError, unwarned
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
@@ -334,8 +333,7 @@ class Recipe(Value):
         """Return the model of these data, with the weights `near`. Doubts about the fit stand in its report."""
         one = self.candidate
         options = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FitWarning)
+        with unwarned():
             if not one.bilinear:
                 return edmd(
                     data, one.lifting, embedding=one.embedding, ridge=self.ridge, towards=one.towards, **options

@@ -1,6 +1,5 @@
 """train: centres, widths and frequencies of a lifting, by variable projection on the error over a horizon."""
 
-import warnings
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -12,7 +11,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, FitWarning
+from koopmpc.errors import DataError, unwarned
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.variable_projection import Tuning, VariableProjection, Windows
 from koopmpc.lifting.base import Lifting, lifting_of
@@ -126,8 +125,7 @@ def _held(
     data: Episodes | Source, lifting: Lifting, judge: Episodes, horizon: int, embedding: Delay | None, ridge: float
 ) -> float:
     """Return the relative error over the horizon, on other episodes, of the fit to these data."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FitWarning)  # that of the result is the one to read
+    with unwarned():  # that of the result is the one to read
         model = edmd(data, lifting, embedding=embedding, ridge=ridge)
     return score(model, judge, horizon).total
 

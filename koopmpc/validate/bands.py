@@ -107,13 +107,7 @@ class ConformalBand(Value):
 
 
 def conformal(
-    predictor: AnyPredictor,
-    episodes: Episodes,
-    horizon: int,
-    *,
-    level: float = 0.9,
-    relift: bool = False,
-    rng: Rng = 0,
+    predictor: AnyPredictor, episodes: Episodes, horizon: int, *, level: float = 0.9, relift: bool = False, rng: Rng = 0
 ) -> ConformalBand:
     """Return the band x̂_{k+h} ± q s_h that holds a whole forecast with probability ≥ level, whatever the law.
 

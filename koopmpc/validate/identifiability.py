@@ -100,10 +100,7 @@ def persistency(episodes: Episodes, order: int) -> Persistency:
 
 
 def feedback_share(
-    episodes: Episodes | Source,
-    lifting: Lifting | AnyPredictor,
-    *,
-    embedding: Delay | None = None,
+    episodes: Episodes | Source, lifting: Lifting | AnyPredictor, *, embedding: Delay | None = None
 ) -> Float[np.ndarray, " nu"]:
     """Return for each input the share R² of its energy that is a linear function of ψ(x), 0 … 1.
 

@@ -201,11 +201,7 @@ class Coverage(Value):
 
 
 def coverage(
-    episodes: Episodes,
-    *,
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
-    bins: int | None = None,
+    episodes: Episodes, *, low: ArrayLike | None = None, high: ArrayLike | None = None, bins: int | None = None
 ) -> Coverage:
     """Return the regions in which the samples (x_k, u_k), k < T, of these episodes lie.
 

@@ -208,15 +208,7 @@ def _errors(report: TrustReport) -> Table:
             share = percent(report.error[h - 1, i])
             rows.append([name if h == ahead[0] else "", str(h), *(f"{v:.3g}" for v in numbers), share, ratio])
     return table(
-        (
-            "state",
-            "steps\nahead",
-            "RMSE",
-            "5 %\nquantile",
-            "95 %\nquantile",
-            "share of\nrange",
-            "RMSE over\nno change",
-        ),
+        ("state", "steps\nahead", "RMSE", "5 %\nquantile", "95 %\nquantile", "share of\nrange", "RMSE over\nno change"),
         rows,
     )
 

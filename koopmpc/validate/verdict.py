@@ -1,5 +1,6 @@
 """From the evidence on a predictor to sentences: what is wrong, and what to do."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,10 +124,10 @@ def findings(evidence: CheckResults) -> tuple[Finding, ...]:
     return tuple(sorted(found, key=lambda finding: not finding.grave))
 
 
-def _errors(evidence: CheckResults) -> list[Finding]:
+def _errors(evidence: CheckResults) -> Iterator[Finding]:
     horizon, steps = evidence.score.horizon, evidence.steps
     if steps == horizon:
-        return []
+        return
     state = int(np.argmin(evidence.usable))
     name, there = evidence.score.states[state], evidence.error[:, state]
     far = f"{percent(there[steps])} of its range at step {steps + 1} and {percent(there[-1])} at step {horizon}"
@@ -140,14 +141,14 @@ def _errors(evidence: CheckResults) -> list[Finding]:
     else:
         do = "take richer observables or bilinear_edmd, and compare their scores over this horizon"
     shorten = f"; a horizon of {steps} steps is within reach" if steps else ""
-    return [Finding(True, says, do + shorten)]
+    yield Finding(True, says, do + shorten)
 
 
-def _spectrum(evidence: CheckResults) -> list[Finding]:
+def _spectrum(evidence: CheckResults) -> Iterator[Finding]:
     of = evidence.residuals
     bad = of.spurious
     if not bad.any():
-        return []
+        return
     with np.errstate(over="ignore"):
         growth = np.abs(of.eigenvalues) ** evidence.score.horizon
     growing = bad & (growth > _GROWS)
@@ -157,16 +158,17 @@ def _spectrum(evidence: CheckResults) -> list[Finding]:
     if growing.any():
         n = int(growing.sum())
         says += f", and {n} of them grow{'s' * (n == 1)}: {told} grows {growth[worst]:.2g}-fold over the horizon"
-        return [Finding(False, says, "drop observables, raise the ridge, or truncate the rank")]
-    do = "read no modes or frequencies from these; predictions may still be good"
-    return [Finding(False, f"{says}; the worst is {told}", do)]
+        yield Finding(False, says, "drop observables, raise the ridge, or truncate the rank")
+    else:
+        do = "read no modes or frequencies from these; predictions may still be good"
+        yield Finding(False, f"{says}; the worst is {told}", do)
 
 
-def _dictionary(evidence: CheckResults) -> list[Finding]:
+def _dictionary(evidence: CheckResults) -> Iterator[Finding]:
     errors = evidence.invariance.errors
     bad = np.flatnonzero(errors > _INVARIANT)
     if not bad.size:
-        return []
+        return
     worst = bad[np.argsort(-errors[bad], kind="stable")]
     names = ", ".join(
         f"{observable(evidence.invariance.names[int(i)])} {percent(float(errors[i]))}" for i in worst[:_NAMED]
@@ -175,43 +177,32 @@ def _dictionary(evidence: CheckResults) -> list[Finding]:
         f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "
         f"more than {percent(_INVARIANT)} of its size ({names}{', …' if bad.size > _NAMED else ''})"
     )
-    return [
-        Finding(
-            False,
-            says,
-            "for a longer horizon add what their next values depend on; compare scores before dropping one",
-        )
-    ]
+    yield Finding(
+        False, says, "for a longer horizon add what their next values depend on; compare scores before dropping one"
+    )
 
 
-def _fit(evidence: CheckResults) -> list[Finding]:
-    found: list[Finding] = []
+def _fit(evidence: CheckResults) -> Iterator[Finding]:
     if evidence.train_score is not None and _overfit(evidence):
         ratio = evidence.score.total / max(evidence.train_score.total, np.finfo(float).tiny)
         says = f"errors on held-out episodes are {ratio:.3g} times those on the training episodes"
-        found.append(Finding(False, says, "collect more data, take fewer observables or a larger ridge"))
+        yield Finding(False, says, "collect more data, take fewer observables or a larger ridge")
     if evidence.unseen is not None and evidence.unseen > _UNSEEN:
         said = "; ".join(str(region) for region in evidence.coverage.empty[:_NAMED])
-        found.append(
-            Finding(
-                False,
-                f"{percent(evidence.unseen)} of the held-out samples lie where the training data never were"
-                + (f": {said}" if said else ""),
-                "collect data there, or keep the controller away from there",
-            )
+        yield Finding(
+            False,
+            f"{percent(evidence.unseen)} of the held-out samples lie where the training data never were"
+            + (f": {said}" if said else ""),
+            "collect data there, or keep the controller away from there",
         )
-    return found
 
 
-def _inputs(evidence: CheckResults) -> list[Finding]:
-    found: list[Finding] = []
+def _inputs(evidence: CheckResults) -> Iterator[Finding]:
     if evidence.persistency is not None and evidence.persistency.order < min(2, evidence.persistency.asked):
-        found.append(
-            Finding(
-                False,
-                f"the inputs are exciting to order {evidence.persistency.order} only, so B cannot be identified",
-                "excite every input, with noise or PRBS",
-            )
+        yield Finding(
+            False,
+            f"the inputs are exciting to order {evidence.persistency.order} only, so B cannot be identified",
+            "excite every input, with noise or PRBS",
         )
     if evidence.feedback is not None:
         bad = np.flatnonzero(evidence.feedback > _EXPLAINED)
@@ -219,46 +210,37 @@ def _inputs(evidence: CheckResults) -> list[Finding]:
             f"{percent(float(evidence.feedback[i]))} of {short(evidence.inputs[int(i)])}" for i in bad[:_NAMED]
         )
         if bad.size:
-            found.append(
-                Finding(
-                    False,
-                    f"feedback: the observables explain most of the inputs ({names}), so A and B are hard to separate",
-                    "add noise to the inputs",
-                )
+            yield Finding(
+                False,
+                f"feedback: the observables explain most of the inputs ({names}), so A and B are hard to separate",
+                "add noise to the inputs",
             )
-    return found
 
 
-def _band(evidence: CheckResults) -> list[Finding]:
+def _band(evidence: CheckResults) -> Iterator[Finding]:
     band = evidence.band
     if np.isfinite(band.quantile):
-        return []
+        return
     if band.episodes >= band.needed:
-        return [Finding(False, "forecasts leave the finite numbers", "look at the spectrum of A")]
-    return [
-        Finding(
-            False,
-            f"there is no band at {percent(band.level)}: there are {band.episodes} calibration episodes, "
-            f"at least {band.needed} are needed",
-            "hold out more episodes, or ask for a lower level",
-        )
-    ]
+        yield Finding(False, "forecasts leave the finite numbers", "look at the spectrum of A")
+    else:
+        there = f"there are {band.episodes} calibration episodes, at least {band.needed} are needed"
+        says = f"there is no band at {percent(band.level)}: {there}"
+        yield Finding(False, says, "hold out more episodes, or ask for a lower level")
 
 
-def _closed_loop(evidence: CheckResults) -> list[Finding]:
+def _closed_loop(evidence: CheckResults) -> Iterator[Finding]:
     loop, band = evidence.closed_loop, evidence.band
     if loop is None:
-        return []
+        return
     chance = 2 * np.sqrt(band.level * (1 - band.level) * (1 / band.episodes + 1 / loop.episodes))
     if loop.share >= band.level - chance:
-        return []
-    return [
-        Finding(
-            False,
-            f"in closed loop {percent(loop.share)} of the forecasts stay in the {percent(band.level)} band",
-            "use the band that is recalibrated on closed-loop episodes, or fit with closed-loop data",
-        )
-    ]
+        return
+    yield Finding(
+        False,
+        f"in closed loop {percent(loop.share)} of the forecasts stay in the {percent(band.level)} band",
+        "use the band that is recalibrated on closed-loop episodes, or fit with closed-loop data",
+    )
 
 
 def _overfit(evidence: CheckResults) -> bool:

@@ -16,6 +16,7 @@ from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.excitation import Feedback, Noise
+from koopmpc.errors import unwarned
 from koopmpc.figures.comparisons import runs as plot_runs
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
@@ -25,7 +26,7 @@ from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
-from koopmpc.papers.registry import percent, unwarned
+from koopmpc.papers.registry import percent
 from koopmpc.papers.snyder.reconstruction import Prediction, Setting, centred, prediction
 from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Shaking, gains
 from koopmpc.plants.integrators import RK4

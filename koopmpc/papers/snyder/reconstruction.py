@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import unwarned
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.papers.plants import trajectories
-from koopmpc.papers.registry import relative, unwarned
+from koopmpc.papers.registry import relative
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct

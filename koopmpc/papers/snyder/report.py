@@ -6,10 +6,11 @@ import numpy as np
 
 from koopmpc.data.collect import collect
 from koopmpc.data.excitation import Noise
+from koopmpc.errors import unwarned
 from koopmpc.figures.comparisons import reconstruction
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.papers.plants import Pendulum, inputs_of, trajectories
-from koopmpc.papers.registry import Claim, percent, relative, summary, unwarned
+from koopmpc.papers.registry import Claim, percent, relative, summary
 from koopmpc.papers.snyder.claims import Fits
 from koopmpc.papers.snyder.reconstruction import Reconstruction, Setting
 from koopmpc.papers.snyder.settings import FIGURES, VARIANTS, gains

@@ -216,7 +216,7 @@ class Writer:
             looked = np.flatnonzero(rows.known >= 0)
             self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
             ends = self._ends(k[:m])
-            limits = [value for *_, value in input_limits(self._about)]
+            limits = [value for _, value in input_limits(self._about)]
             self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
             if len(ends):
                 powers = np.full(len(ends), np.log10(self._about.dt))
@@ -361,7 +361,7 @@ class Writer:
         for panel in panels(self._about, rows.reference.shape[1]):
             own = [self._about.states[i] for i in panel.states]
             parts = [rows.X[:, panel.states], rows.Y[:, panel.measured], rows.reference[:, panel.references]]
-            values = np.concatenate([*map(np.ravel, parts), [value for name, _, value in limits if name in own]])
+            values = np.concatenate([*map(np.ravel, parts), [value for name, value in limits if name in own]])
             values = values[np.isfinite(values)]
             found[panel.entity] = [float(values.min()), float(values.max())] if len(values) else []
         return found
@@ -378,7 +378,7 @@ class Writer:
         bounds, ends = state_limits(self._about), self._ends(k)
         for panel in panels(self._about, rows.reference.shape[1]):
             own = [self._about.states[i] for i in panel.states]
-            limits = [value for name, _, value in bounds if name in own]
+            limits = [value for name, value in bounds if name in own]
             self._vectors(f"{panel.entity}/limits", ends, np.tile(limits, (len(ends), 1)))
         for j in ahead(N):
             of = [step for step in self._plans if k[0] <= step + j <= k[-1]]

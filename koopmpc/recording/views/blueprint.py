@@ -19,15 +19,9 @@ from koopmpc.recording.views.scenes import BACKGROUND, Extent
 from koopmpc.scene import Color
 
 PALETTE: tuple[Color, ...] = (
-    (88, 166, 255),
-    (255, 166, 87),
-    (86, 211, 160),
-    (240, 120, 170),
-    (188, 150, 255),
-    (235, 203, 100),
-    (110, 205, 220),
-    (190, 190, 190),
-)
+    (88, 166, 255), (255, 166, 87), (86, 211, 160), (240, 120, 170),
+    (188, 150, 255), (235, 203, 100), (110, 205, 220), (190, 190, 190),
+)  # fmt: skip
 LIMIT: Color = (232, 84, 84)
 REFERENCE: Color = (165, 170, 180)
 _PREDICTION: Color = (250, 250, 250)
@@ -109,7 +103,7 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
             return [what if alone else f"{name}, {what}" for name in names]
 
         own = [about.states[i] for i in panel.states]
-        limits = called("limits", [name for name, *_ in bounds if name in own])
+        limits = called("limits", [name for name, _ in bounds if name in own])
         found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0)
         one = _points(called("prediction", own), _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": one for j in stages}
@@ -117,26 +111,21 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
 
 
 _HELD: dict[str, Any] = {"interpolation_mode": "StepAfter"}
-_Limit = tuple[str, str, float]  # name, "lower" or "upper", value
+_Limit = tuple[str, float]  # name, value
 
 
 def input_limits(about: About) -> list[_Limit]:
-    """Return the finite input limits: name, end and value of each."""
+    """Return the finite input limits, lower ones first: name and value of each."""
     return [] if about.limits is None else _finite(about.inputs, about.limits.inputs(len(about.inputs)))
 
 
 def state_limits(about: About) -> list[_Limit]:
-    """Return the finite limits of states: name, end and value of each."""
+    """Return the finite limits of states, lower ones first: name and value of each."""
     return [] if about.limits is None else _finite(about.states, about.limits.states(len(about.states)))
 
 
 def _finite(names: Sequence[str], ends: Any) -> list[_Limit]:
-    pairs = [
-        (n, end, float(v))
-        for end, row in zip(("lower", "upper"), ends, strict=True)
-        for n, v in zip(names, row, strict=True)
-    ]
-    return [(name, end, value) for name, end, value in pairs if np.isfinite(value)]
+    return [(name, float(v)) for row in ends for name, v in zip(names, row, strict=True) if np.isfinite(v)]
 
 
 def _statuses() -> Any:
@@ -242,7 +231,7 @@ def blueprint(
         plot(row.entity, row.title, [*part], axis, roomy, part)
         for row, axis, part in zip(rows, axes, parts, strict=True)
     ]
-    bounds = readable([v for *_, v in input_limits(about)], _TICKS[roomy])
+    bounds = readable([v for _, v in input_limits(about)], _TICKS[roomy])
     shown.append(plot("plots/u", _title("Input", about.inputs), ["/control/u", "/control/limits"], bounds, roomy))
     slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
     time = {"/solver/time_ms": [_alone(_lines(["time of a step [10^y s]"], color(2), 1.5), LOG_TIME)]}
@@ -317,12 +306,7 @@ def _animation(extent: Extent) -> Any:
             origin="world", name=name, background=list(BACKGROUND), line_grid=False, eye_controls=eye
         )
     fixed = None if ranges is None else rrb.VisualBounds2D(x_range=ranges[0], y_range=ranges[1])
-    return rrb.Spatial2DView(
-        origin="world",
-        name=name,
-        background=list(BACKGROUND),
-        visual_bounds=fixed,
-    )
+    return rrb.Spatial2DView(origin="world", name=name, background=list(BACKGROUND), visual_bounds=fixed)
 
 
 def readable(values: Sequence[float], ticks: float) -> Any:

@@ -54,7 +54,7 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     if len(logs) < 2:
         raise LogError("a comparison needs two logs or more; pass them all, or leave --compare out")
     runs = [load_run(log) for log in logs]
-    names = _names(runs, [Path(log) for log in logs])
+    names, heading = _names(runs, [Path(log) for log in logs])
     states = _in_order([run.states for run in runs])
     inputs = _in_order([run.inputs for run in runs])
     if max(sum(name in (*run.states, *run.inputs) for run in runs) for name in (*states, *inputs)) < 2:
@@ -81,25 +81,22 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
                     _line(rec, f"{entity}/{r + 1}", names[r], color(r), 2.0, values, run.dt, **held)
             for r, (name, shade, values, dt) in enumerate(_marks(runs, title)):
                 _line(rec, f"{entity}/mark/{r}", name, shade, 1.0, values, dt)
-        text = rr.TextDocument(drawable(f"{_heading(runs)}{_table(runs, names)}"), media_type=rr.MediaType.MARKDOWN)
+        text = rr.TextDocument(drawable(f"{heading}{_table(runs, names)}"), media_type=rr.MediaType.MARKDOWN)
         rec.log("metrics", text, static=True)
 
 
-def _names(runs: Sequence[Run], paths: Sequence[Path]) -> list[str]:
-    """Return the title of each run, without what all of them share; the name of the file too where two are the same."""
+def _names(runs: Sequence[Run], paths: Sequence[Path]) -> tuple[list[str], str]:
+    """Return the title of each run, without what all of them share; and that, in bold, to stand above the table.
+
+    Where two titles are the same they have the name of the file too.
+    """
     titles = [title_of(About(**run.about())).split(" · ") for run in runs]
     shared = [part for part in titles[0] if all(part in other for other in titles)]
     short = [" · ".join(part for part in title if part not in shared) for title in titles]
     whole = [" · ".join(title) for title in titles]
     chosen = short if all(short) and len(set(short)) == len(short) else whole
-    return [name if chosen.count(name) == 1 else f"{name} ({p})" for name, p in zip(chosen, paths, strict=True)]
-
-
-def _heading(runs: Sequence[Run]) -> str:
-    """Return what the titles of all runs share, in bold above the table."""
-    titles = [title_of(About(**run.about())).split(" · ") for run in runs]
-    shared = [part for part in titles[0] if all(part in other for other in titles)]
-    return f"**{' · '.join(shared)}**\n\n" if shared else ""
+    names = [name if chosen.count(name) == 1 else f"{name} ({p})" for name, p in zip(chosen, paths, strict=True)]
+    return names, f"**{' · '.join(shared)}**\n\n" if shared else ""
 
 
 def _in_order(named: Sequence[Sequence[str]]) -> list[str]:
@@ -135,11 +132,10 @@ def _marks(runs: Sequence[Run], title: str) -> list[tuple[str, Any, np.ndarray, 
             values = run.reference[:, tracked.index(title)]
             key = b"r" + (values[:1] if np.ptp(values) == 0 else values).tobytes()
             found.setdefault(key, ("reference", REFERENCE, values, run.dt))
-        for name, _, value in (*state_limits(about), *input_limits(about)):
+        for name, value in (*state_limits(about), *input_limits(about)):
             if name == title:
-                found.setdefault(
-                    b"l" + np.float64(value).tobytes(), ("limits", LIMIT, np.full(2, value), run.steps * run.dt)
-                )
+                line = ("limits", LIMIT, np.full(2, value), run.steps * run.dt)
+                found.setdefault(b"l" + np.float64(value).tobytes(), line)
     return list(found.values())
 
 

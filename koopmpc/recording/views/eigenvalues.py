@@ -110,10 +110,7 @@ def draw_eigenfunctions(
         turns = np.angle(phi) / (2 * np.pi) + 0.5  # dark at 0, blue below, red above, light at ±π
         shaded = {"magnitude": shades(np.abs(phi), SEQUENTIAL), "phase": shades(turns, CYCLIC)}
         sign = "+" if value.imag > 0 else "−"
-        titles = {
-            "magnitude": f"|φ{j}|, λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i",
-            "phase": f"Phase of φ{j}",
-        }
+        titles = {"magnitude": f"|φ{j}|, λ = {value.real:.4g} {sign} {abs(value.imag):.4g}i", "phase": f"Phase of φ{j}"}
         pictures += [(f"{entity}/{k}", titles[k], _picture(f"{entity}/{k}", shaded[k], plane)) for k in shaded]
     return pictures
 

@@ -248,10 +248,7 @@ def draw(names: Names, scenes: Sequence[Sequence[Shape]], extent: Extent) -> dic
 
 
 def draw_ahead(
-    names: Names,
-    scenes: Sequence[Sequence[Shape]],
-    ahead: Sequence[Sequence[Sequence[Shape]]],
-    extent: Extent,
+    names: Names, scenes: Sequence[Sequence[Shape]], ahead: Sequence[Sequence[Sequence[Shape]]], extent: Extent
 ) -> dict[str, Drawing]:
     """Return a drawing by name for the predicted scenes of each row, the later the fainter.
 
@@ -270,10 +267,7 @@ def draw_ahead(
 
 
 def draw_reference(
-    names: Names,
-    scenes: Sequence[Sequence[Shape]],
-    aims: Sequence[Sequence[Shape]],
-    extent: Extent,
+    names: Names, scenes: Sequence[Sequence[Shape]], aims: Sequence[Sequence[Shape]], extent: Extent
 ) -> dict[str, Drawing]:
     """Return a drawing by name, in grey below all others, for the scene of the reference of each row.
 
