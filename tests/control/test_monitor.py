@@ -252,3 +252,15 @@ def test_where_the_data_have_no_width_they_count_as_a_billionth_of_their_widest_
     inside = np.sort((a / size) ** 2)[39]  # (a, a) in units of the size, by the width along it
     across = np.array([1.0, -3.0]) * size
     assert (G @ across) @ (G @ across) == pytest.approx(2 / 2e-9 / inside, rel=1e-4)
+
+
+def test_a_share_of_each_state_is_inside_whatever_the_errors_are():
+    """‖G v‖² is at most 1 where v is the share of one state, and 1 for the worst of these or the rank-th of the rows."""
+    rng = np.random.default_rng(0)
+    for spread in (0.01, 0.3, 10.0):
+        rows, of = spread * rng.standard_normal((60, 3)) @ rng.standard_normal((3, 3)), rng.standard_normal((60, 3))
+        G = _bounds(rows, 0.5, of * [1, 5, 0.2], 50)
+        shares = np.diag(0.5 * np.sqrt(np.mean((of * [1, 5, 0.2]) ** 2, axis=0)))
+        worst = max(float(np.sum((G @ v) ** 2)) for v in shares)
+        ranked = np.sort(np.sum((rows @ G.T) ** 2, axis=1))[49]
+        assert max(worst, ranked) == pytest.approx(1.0)

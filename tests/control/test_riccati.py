@@ -360,3 +360,17 @@ def test_an_input_that_costs_nothing_is_refused_in_any_units():
         stage = Stage(np.eye(2), unit * np.array([[1.0, 1.0], [0.0, 0.0]]), np.eye(2), None, np.zeros((2, 2)))
         with pytest.raises(km.errors.DefinitenessError, match="raise R"):
             rooted([stage] * 3, stage.Q, np.zeros((2, 1)))
+
+
+def test_a_slow_loop_takes_few_steps_for_most_are_taken_by_doubling(monkeypatch):
+    """A slow state under a dear input settles over more than 500 steps."""
+    taken, own = [], riccati.step
+    monkeypatch.setattr(riccati, "step", lambda *rest: taken.append(1) or own(*rest))
+    A, B, Q, R = np.array([[0.999, 0.01], [0.0, 0.99]]), np.array([[0.0], [0.01]]), np.eye(2), np.array([[300.0]])
+    stage = one_step(A, B, Q, R, None)
+    found = stationary(stage, 100_000)
+    np.testing.assert_allclose(found.K, km.dlqr(A, B, Q, R).K, rtol=1e-5)
+    assert len(taken) < 100
+    taken.clear()
+    iterate(stage, stage.Q, 100_000)
+    assert len(taken) > 500

@@ -183,7 +183,16 @@ def test_what_a_soft_limit_gives_way_is_told_in_its_unit_above_its_allowance(mul
     [((-9, 9), -1, 1.5, 0), ((-9, -3), -1.5, 1.5, 1.0), ((4, 9), -1, 2.0, 1.0), ((-1, 1), -1, 1.5, 0)],
 )
 def test_the_first_change_may_be_as_large_as_the_limits_of_the_inputs_need(room, low, high, conflict):
-    """−1 ≤ 0.5 (u − u_last) ≤ 1.5 gives way to u inside its limits, which are `room` from the last input."""
+    """−1 ≤ 0.5 (u − u_last) ≤ 1.5 gives way to u inside its limits, which are `room` from the last input.
+
+    It is told where it is more than a hundred-thousandth of what is told of a soft limit.
+    """
+    for allowance, told in ((5e4, 1), (2e5, 0)):
+        qp, (free, _) = step_qp(), scripted("first", True, (OPTIMAL, [0, 0], [0, 0, 0], 1))
+        qp.softness.allowance[0] = allowance
+        solver = StepSolver(qp, [Choice(free, {})])
+        _, gave_way = solver.solve(PLAN, Interval(np.array([room[0]]), np.array([room[1]])), None)
+        assert gave_way == pytest.approx(told * conflict)
     first, asked = scripted("first", True, (OPTIMAL, [0, 0], [0, 0, 0], 1))
     solver = StepSolver(step_qp(), [Choice(first, {})])
     _, gave_way = solver.solve(PLAN, Interval(np.array([room[0]]), np.array([room[1]])), None)
