@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.terminal_cost import held
+from koopmpc.control import terminal_cost
+from koopmpc.control.terminal_cost import believed_steps, held, tail_stage
 from tests.bare import shown
 from tests.control.models import Told, linear, random_pair, step_map
 
@@ -456,3 +457,15 @@ def test_the_tail_of_a_learned_model_is_as_long_as_helps_on_the_model_itself(dt,
         run = km.simulate(plant, mpc, x0=[0.3, 0, 0], reference=reference, steps=int(4 / dt), cost=cost, limits=box)
         costs.append(km.metrics(run).cost)
     assert costs[0] < 1.2 * costs[1]
+
+
+def test_tails_of_all_steps_half_a_quarter_and_none_of_them_are_tried_and_the_longest_good_one_is_taken(monkeypatch):
+    """Each trial is a law u = −K z; those before the good ones push the wrong way."""
+    model, _ = learned(0, 1e-3, km.State() + km.Constant())
+    stage = tail_stage(model.A, model.B, np.zeros((3, 0)), model.C, np.eye(2), np.eye(1), None)
+    good, lengths, asked = terminal_cost.stationary(stage, 1000).K.T, [18, 9, 4, 0], []
+    for best in range(4):
+        found = np.array([-good] * best + [good] * (4 - best))
+        monkeypatch.setattr(terminal_cost, "_laws", lambda _, steps, found=found: asked.append(steps) or found)
+        assert believed_steps(stage, model, 10, 18, np.eye(3)) == lengths[best]
+        assert asked.pop() == [n + 10 for n in lengths]

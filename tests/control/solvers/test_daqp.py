@@ -1,3 +1,5 @@
+from typing import ClassVar
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -240,3 +242,31 @@ def test_hard_rows_alone_are_accurate_where_they_are_met():
         assert not solver._accurate(x + 1e-3 * size, multipliers)
         across = np.linalg.solve((np.ones((2, 2)) + EYE).T * solver._rows, np.full(2, -1e-3 * size))
         assert not solver._accurate(x + 1e-3 * size, multipliers + across)  # stationary, but beyond its limits
+
+
+def test_a_solve_gets_as_many_iterations_as_its_time_is_enough_for_at_the_pace_of_the_last_ones():
+    """The pace moves half of the way to what the last solve took; a short solve says nothing of it."""
+
+    class Timed:
+        settings: ClassVar[dict] = {}
+        told = (0, 0.0)
+
+        def solve(self):
+            iterations, seconds = self.told
+            return ONE, None, 1, {"iterations": iterations, "solve_time": seconds, "lam": ONE}
+
+    solver, timed = box(), Timed()
+    solver._model, solver._refused, pace = timed, 0, solver._pace
+    assert pace == 1e-9
+    for limit, iterations, seconds in ((0.01, 100, 1e-3), (0.002, 200, 1e-4), (0.01, 16, 9.0), (0.003, 17, 1e-3)):
+        timed.told = iterations, seconds
+        wanted = min(solver._most, 1 + int(limit / pace))
+        solver._run(limit)
+        assert timed.settings == {"time_limit": limit, "iter_limit": wanted}
+        if iterations > 16:
+            pace = (pace + seconds / iterations) / 2
+        assert solver._pace == pytest.approx(pace)
+    timed.told = 500, 1.0
+    solver._run(0.0)  # without a limit nothing is learned
+    assert solver._pace == pytest.approx(pace)
+    assert timed.settings == {"time_limit": 0.0, "iter_limit": solver._most}
