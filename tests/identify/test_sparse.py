@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.identify.fits.sparse import lasso
+from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.composed import Picked
 from tests.bare import shown
-from tests.identify.plants import one_step_pairs
+from tests.identify.plants import brute_force, one_step_pairs
 
 SMALL = km.Constant() + km.State() + km.Monomials(4)
 DICTIONARY = SMALL + km.Fourier(2)  # collinear to 1e-13
@@ -100,7 +101,11 @@ def test_least_squares_on_what_is_kept() -> None:
 
 def test_a_large_penalty_leaves_the_states_and_a_small_one_everything() -> None:
     data = slow_manifold(0.02)
-    assert km.identify.sparse_edmd(data, DICTIONARY, penalty=1e3).lifting.names == ("1", "x0", "x1")
+    few = km.identify.sparse_edmd(data, DICTIONARY, penalty=1e3)
+    assert few.lifting.names == ("1", "x0", "x1")
+    plain = km.edmd(data, few.lifting)
+    assert np.allclose(few.A, plain.A, rtol=0, atol=1e-9)
+    assert np.allclose(few.B, plain.B, rtol=0, atol=1e-9)  # inputs have no penalty
     every = km.State() + km.Monomials(2)
     whole = km.identify.sparse_edmd(data, every, penalty=1e-12, adaptive=False)
     assert whole.lifting.names == every.bind(data.states).names
@@ -136,3 +141,57 @@ def test_a_wrong_penalty_or_lifting_is_refused() -> None:
         km.identify.sparse_edmd(data, km.Monomials(2), penalty=1)
     with pytest.raises(km.errors.DataError, match="which holds 9"):
         Picked(km.State(), (9,)).bind(("a", "b"))
+
+
+@pytest.mark.parametrize("over", ["observables", "entries"])
+@pytest.mark.parametrize("adaptive", [False, True])
+@pytest.mark.parametrize("penalty", [1e-3, 3e-2])
+def test_what_is_zero_is_zero_in_the_solution_of_cvxpy_on_the_rows_of_the_data(over, adaptive, penalty) -> None:
+    data = slow_manifold(0.05, seed=4, count=80)
+    model = km.identify.sparse_edmd(data, SMALL, penalty=penalty, over=over, adaptive=adaptive)
+    lifting = SMALL.bind(data.states)
+    D = brute_force(data, lifting)
+    nz, n = lifting.nz, lifting.nz + 1
+    P, T = D[:, :n] / np.linalg.norm(D[:, :n], axis=0), D[:, n:] / np.linalg.norm(D[:, n:], axis=0)
+    stay = [lifting.names.index(name) for name in model.lifting.names]
+    rows = RegressionRows(P, T[:, stay], np.zeros(len(stay)), len(P), lifting.constant_index)
+    large = np.abs(solve(rows, ridge="gcv").K)
+    if over == "observables":
+        large = np.linalg.norm(large, axis=1, keepdims=True) * np.ones_like(large)
+    weights = penalty / np.maximum(large, 1e-12) if adaptive else np.full_like(large, penalty)
+    K = cp.Variable((n, len(stay)))
+    if over == "observables":
+        rated = [j for j in range(nz) if j not in stay]
+        price = sum(weights[j, 0] * cp.norm(K[j]) for j in rated)
+    else:
+        price = cp.sum(cp.multiply(weights, cp.abs(K)))
+    cp.Problem(cp.Minimize(0.5 * cp.sum_squares(T[:, stay] - P @ K) + price)).solve(solver=cp.CLARABEL)
+    own = np.zeros((n, len(stay)))
+    own[[*stay, nz]] = np.hstack([model.A, model.B]).T
+    if over == "observables":
+        assert np.abs(K.value[rated]).max(initial=0) < 1e-5
+    else:
+        away = (np.abs(K.value) < 1e-6) | (np.abs(K.value) > 1e-4)  # what the solver says clearly
+        assert np.array_equal((own != 0)[away], (np.abs(K.value) > 1e-5)[away])
+
+
+def test_a_state_that_is_zero_throughout_is_kept_and_said_to_be() -> None:
+    data = slow_manifold(0.02)
+    still = km.Episodes([km.Episode(X=e.X * [1, 0], U=e.U) for e in data], data.dt, data.states, data.inputs)
+    with pytest.warns(km.FitWarning, match="'x1' was 0 in all snapshots"):
+        model = km.identify.sparse_edmd(still, km.State() + km.Monomials(2))
+    assert model.lifting.names[:2] == ("x0", "x1")
+    assert np.isfinite(model.A).all()
+    assert not model.A[1].any()
+
+
+def test_a_lasso_that_stops_early_says_by_how_much_it_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    P, T = rng.standard_normal((30, 6)), rng.standard_normal((30, 1))
+    G, H, weights = P.T @ P, P.T @ T, np.full((6, 1), 2.0)
+    assert lasso(G, H, weights, grouped=False).missed <= 1e-10 * np.abs(H).max()
+    monkeypatch.setattr("koopmpc.identify.fits.sparse._STEPS", 3)
+    assert lasso(G, H, weights, grouped=False).missed > 1e-3
+    with pytest.warns(km.FitWarning, match="the LASSO met its optimality conditions only to .*; raise the penalty"):
+        model = km.identify.sparse_edmd(slow_manifold(0.02), SMALL)
+    assert len(model.report.warnings) == 1

@@ -80,7 +80,7 @@ def _shrunk(K: Float[np.ndarray, "n nt"], by: Float[np.ndarray, "n nt"], grouped
     """Return argmin ½ ‖X − K‖² + the penalty of X."""
     size = np.sqrt(np.sum(K**2, axis=1, keepdims=True)) if grouped else np.abs(K)
     least = by[:, :1] if grouped else by
-    return K * np.maximum(1.0 - least / np.where(size > 0, size, 1.0), 0.0)
+    return K * np.maximum(1.0 - least / np.maximum(size, 1e-200), 0.0)
 
 
 def sparse_edmd(
