@@ -21,7 +21,7 @@ from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, WholeRun, alone, busy
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.compiled import compiler, library, private_cache
+from koopmpc.plants.routines import compiler, library, private_cache
 from koopmpc.plants.step_map import StepMap
 
 _STATUS, _FALLBACK = list(Status), list(Fallback)

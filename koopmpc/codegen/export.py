@@ -23,7 +23,7 @@ from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.disk import writing
 from koopmpc.errors import DataError
 from koopmpc.estimate.kalman_filter import KalmanFilter
-from koopmpc.plants.compiled import compiler
+from koopmpc.plants.routines import compiler
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 

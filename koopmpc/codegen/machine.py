@@ -13,7 +13,7 @@ from jaxtyping import Float
 from koopmpc.codegen.sources import sources_of, tables_of
 from koopmpc.codegen.tables import Exportable
 from koopmpc.codegen.text import Language, function, traced
-from koopmpc.plants.compiled import library, private_cache
+from koopmpc.plants.routines import library, private_cache
 from koopmpc.plants.step_map import StepMap
 
 Precision = Literal["double", "float"]

@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Measured, StateModel
-from koopmpc.plants.compiled import interpreter
+from koopmpc.plants.routines import interpreter
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 

@@ -9,7 +9,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.storage import Files
 from koopmpc.errors import DataError
-from koopmpc.validate.logs.report import audit
+from koopmpc.validate.logs.audit import audit
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 T = TypeVar("T")

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError, ObservableError, ShapeError
-from koopmpc.plants.compiled import Buffered
 from koopmpc.plants.graph import Graph
+from koopmpc.plants.routines import Buffered
 from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.errors import DataError
-from koopmpc.plants import compiled
+from koopmpc.plants import routines
 from koopmpc.plants.graph import Graph
 
 _WORTH_COMPILING = 20_000  # steps that the interpreter makes in 0.2 s, the time of a compiler
@@ -24,7 +24,7 @@ class Batch:
     expression graph over numpy columns. Any other F (implicit integrators, matrices) is called step by step.
     """
 
-    def __init__(self, step: compiled.Buffered) -> None:
+    def __init__(self, step: routines.Buffered) -> None:
         self._step = step
 
     def fill(self, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
@@ -41,12 +41,12 @@ class Batch:
                 march(self._step, episode, moves)
 
     @cached_property
-    def _kernel(self) -> compiled.Kernel | None:
-        F, command = self._step.function, compiled.compiler()
+    def _kernel(self) -> routines.Kernel | None:
+        F, command = self._step.function, routines.compiler()
         if command is None or F.n_instructions() > _LONGEST:
             return None
         try:
-            return compiled.kernel(F, command, compiled.private_cache())
+            return routines.kernel(F, command, routines.private_cache())
         except (OSError, AttributeError, subprocess.SubprocessError) as error:
             failed = isinstance(error, subprocess.CalledProcessError)
             said = error.stderr.decode(errors="replace")[-500:] if failed else ""
@@ -65,7 +65,7 @@ class Batch:
             return None
 
 
-def march(step: compiled.Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
+def march(step: routines.Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
     """Write x_1 … x_T after X[0], call by call; NaN from where an implicit method fails."""
     (x, u), (x_next,), evaluate = step.arguments, step.results, step.evaluate
     x[:] = X[0]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.compiled import dense
+from koopmpc.plants.routines import dense
 from koopmpc.values import Value
 
 Columns = np.ndarray | float

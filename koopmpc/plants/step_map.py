@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.batch import Batch, march, warn_of
-from koopmpc.plants.compiled import Buffered, dense
 from koopmpc.plants.dynamics import Dynamics, Sampled, drawn_by, output, right_side
 from koopmpc.plants.integrators import RK4, Integrator
+from koopmpc.plants.routines import Buffered, dense
 from koopmpc.scene import Scene
 from koopmpc.values import Named, Value, freeze
 

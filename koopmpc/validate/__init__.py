@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from koopmpc.validate.identifiability import Persistency as Persistency
     from koopmpc.validate.identifiability import feedback_share as feedback_share
     from koopmpc.validate.identifiability import persistency as persistency
-    from koopmpc.validate.logs.report import AuditReport as AuditReport
-    from koopmpc.validate.logs.report import audit as audit
+    from koopmpc.validate.logs.audit import AuditReport as AuditReport
+    from koopmpc.validate.logs.audit import audit as audit
     from koopmpc.validate.regions import Coverage as Coverage
     from koopmpc.validate.regions import coverage as coverage
     from koopmpc.validate.report import TrustReport as TrustReport

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.codegen.text import EXPRESSIONS, Language, function
-from koopmpc.plants.compiled import library
 from koopmpc.plants.graph import OPERATIONS, Graph
+from koopmpc.plants.routines import library
 from tests.faults.damage import room_for
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)

@@ -19,7 +19,7 @@ from itertools import repeat
 import numpy as np
 
 import koopmpc as km
-import koopmpc.plants.compiled
+import koopmpc.plants.routines
 
 STEPS = 40
 FAR = 1e4  # a loop ends where the state of a plant that its inputs cannot hold is this many times its start
@@ -198,7 +198,7 @@ if __name__ == "__main__":
     )
     given = parser.parse_args()
     if given.bilinear:
-        koopmpc.plants.compiled.compiler = lambda: None
+        koopmpc.plants.routines.compiler = lambda: None
     seeds = range(given.first, given.first + given.count)
     found = outcomes_of(seeds, given.processes, given.solver, given.large, given.bilinear)
     sys.stdout.write("\n".join(table(found)) + "\n")

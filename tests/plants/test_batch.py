@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.plants import batch, compiled
-from koopmpc.plants.compiled import Routine
+from koopmpc.plants import batch, routines
 from koopmpc.plants.graph import Graph
+from koopmpc.plants.routines import Routine
 from tests.example_plants import CartPole, Pendulum
 
-needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
+needs_compiler = pytest.mark.skipif(routines.compiler() is None, reason="no C compiler here")
 MAPS = {
     "euler": km.discretize(CartPole(), 0.02, km.Euler()),
     "rk4": km.discretize(CartPole(), 0.02),
@@ -25,10 +25,10 @@ MAPS = {
 
 @pytest.fixture(scope="module")
 def kernels(tmp_path_factory):
-    command = compiled.compiler()
+    command = routines.compiler()
     assert command is not None
     cache = tmp_path_factory.mktemp("cache")
-    return {name: compiled.kernel(plant.F, command, cache) for name, plant in MAPS.items()}
+    return {name: routines.kernel(plant.F, command, cache) for name, plant in MAPS.items()}
 
 
 def empty(X0, U):
@@ -63,7 +63,7 @@ def test_threads_share_the_episodes(kernels, monkeypatch):
     X0, U = random_episodes(MAPS["rk4"], 1003, 5)
     alone, shared = empty(X0, U), empty(X0, U)
     kernels["rk4"](alone, U)
-    monkeypatch.setattr(compiled, "_STEPS_A_THREAD", 100)
+    monkeypatch.setattr(routines, "_STEPS_A_THREAD", 100)
     monkeypatch.setattr("os.cpu_count", lambda: 7)
     kernels["rk4"](shared, U)
     assert shared.tobytes() == alone.tobytes()
@@ -126,7 +126,7 @@ def test_large_batches_compile_once_a_user(cache, monkeypatch):
     first = km.discretize(CartPole(), 0.02).rollouts(X0, U)
     (library,) = cache.iterdir()
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
-    monkeypatch.setattr(compiled, "_compile", lambda *_: pytest.fail("compiled twice"))
+    monkeypatch.setattr(routines, "_compile", lambda *_: pytest.fail("compiled twice"))
     assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == first.tobytes()
     assert list(cache.iterdir()) == [library]
 
@@ -152,7 +152,7 @@ def test_a_broken_file_in_the_cache_is_written_again(cache):
 def test_without_a_private_folder_nothing_is_left_on_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setattr(compiled, "private_cache", lambda: None)
+    monkeypatch.setattr(routines, "private_cache", lambda: None)
     X0, U = random_episodes(MAPS["rk4"], 100, 200)
     plant = km.discretize(CartPole(), 0.02)
     np.testing.assert_allclose(plant.rollouts(X0, U)[3, 1], plant(X0[3], U[3, 0]), rtol=1e-12)
@@ -160,21 +160,21 @@ def test_without_a_private_folder_nothing_is_left_on_disk(tmp_path, monkeypatch)
 
 
 def test_folders_that_others_can_write_are_not_trusted(cache):
-    assert compiled.private_cache() == cache
+    assert routines.private_cache() == cache
     cache.chmod(0o722)
-    assert compiled.private_cache() is None
+    assert routines.private_cache() is None
     cache.chmod(0o700)
     cache.parent.chmod(0o777)
-    assert compiled.private_cache() is None
+    assert routines.private_cache() is None
     cache.parent.chmod(0o700)
     cache.rmdir()
     real = cache.parent / "elsewhere"
     real.mkdir(0o700)
     cache.symlink_to(real)
-    assert compiled.private_cache() is None
+    assert routines.private_cache() is None
     cache.unlink()
     cache.write_text("a file")
-    assert compiled.private_cache() is None
+    assert routines.private_cache() is None
 
 
 def test_a_compiler_that_fails_costs_one_warning(cache, tmp_path, monkeypatch):
@@ -195,14 +195,14 @@ def test_a_compiler_that_fails_costs_one_warning(cache, tmp_path, monkeypatch):
 
 def test_the_compiler_may_have_arguments(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "sh -c")
-    assert compiled.compiler() == ["sh", "-c"]
+    assert routines.compiler() == ["sh", "-c"]
     monkeypatch.setenv("CC", "no-such-compiler -m64")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert compiled.compiler() is None
+    assert routines.compiler() is None
 
 
 def test_without_a_compiler_batches_run_over_columns(monkeypatch):
-    monkeypatch.setattr(compiled, "compiler", lambda: None)
+    monkeypatch.setattr(routines, "compiler", lambda: None)
     plant = km.discretize(CartPole(), 0.02)
     X0, U = random_episodes(plant, 100, 200)
     X = plant.rollouts(X0, U)
@@ -230,10 +230,10 @@ def results(routine_of) -> tuple[np.ndarray, np.ndarray, bool]:
     return X, sums, routine.compiled
 
 
-@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(routines.compiler() is None, reason="no C compiler here")
 def test_machine_code_is_the_interpreter_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     fast = results(Routine)
-    monkeypatch.setattr(compiled, "compiler", lambda: None)
+    monkeypatch.setattr(routines, "compiler", lambda: None)
     slow = results(Routine)
     assert (fast[2], slow[2]) == (True, False)
     assert np.array_equal(fast[0], slow[0])

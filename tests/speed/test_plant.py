@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.plants import batch, compiled
+from koopmpc.plants import batch, routines
 from koopmpc.plants.graph import Graph
 from tests.example_plants import CartPole
 
@@ -31,7 +31,7 @@ def report(benchmark, unit, value):
     sys.stdout.write(f"\n{benchmark.name}: {value:.3g} {unit}\n")
 
 
-@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(routines.compiler() is None, reason="no C compiler here")
 def test_batch_in_machine_code(benchmark, plant, episodes):
     plant.rollouts(*episodes)  # compile
     benchmark.pedantic(plant.rollouts, episodes, rounds=7, warmup_rounds=2)

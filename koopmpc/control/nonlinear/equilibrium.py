@@ -18,7 +18,7 @@ from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
 from koopmpc.interrupts import listening
 from koopmpc.lifting.state import State
-from koopmpc.plants.compiled import Buffered
+from koopmpc.plants.routines import Buffered
 
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
 RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too

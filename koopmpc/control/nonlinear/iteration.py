@@ -24,7 +24,7 @@ from koopmpc.control.nonlinear.stagewise import (
     unconstrained,
     weights,
 )
-from koopmpc.plants.compiled import Routine
+from koopmpc.plants.routines import Routine
 
 MOST = 100  # interior-point steps, before an active-set method finishes the program
 STALLED, CENTRING = 5, 0.3  # steps without half the μ, then one aims at this share of μ for every pair

@@ -14,7 +14,7 @@ from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import SOFTENED, Interval, Softness, ahead
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
-from koopmpc.plants.compiled import Buffered
+from koopmpc.plants.routines import Buffered
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
