@@ -40,7 +40,8 @@ NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum",
 DECLARED = ("annotation", "returns", "decorator_list", "bases")  # fields that hold types
 # What nobody could notice is left out: a comparison with a tolerance or a clock is an accident at the very end of it, a
 # number that stands for "next to nothing" or "far too much" may be twice as large, and a most that is never reached one
-# more; and CasADi's common subexpressions (cse) only save time.
+# more; CasADi's common subexpressions (cse) only save time; and what a column of zeros is divided by, the last 1 in
+# np.where(size > 0, size, 1), may be any number but zero.
 TOLERANCES = ("reach", "tolerance", "slack", "good", "enough", "close", "settled", "perf_counter", "monotonic")
 TINY, SMALL, VAST, MANY = 1e-5, 0.01, 1e5, 10
 SKIPPED = (ast.JoinedStr, ast.Raise, ast.Import, ast.ImportFrom, ast.Assert)  # what stands in them is said, not done
@@ -109,6 +110,11 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
         kept = [(k, v) for k, v in zip(node.keys, node.values, strict=True) if not (k and _most(ast.unparse(k)))]
         yield from (child for pair in kept for child in pair if child is not None)
         return
+    if isinstance(node, ast.Call) and len(node.args) == 3 and ast.unparse(node.func) == "np.where":
+        where, own, instead = node.args
+        if isinstance(instead, ast.Constant) and instead.value and ast.unparse(where) == f"{ast.unparse(own)} > 0":
+            yield from (where, own)
+            return
     for name, value in ast.iter_fields(node):
         if name not in DECLARED:
             yield from (
@@ -122,7 +128,7 @@ def _most(key: str) -> bool:
 
 def _is_skipped(node: ast.AST) -> bool:
     """Return whether a node is a union of types, an import for them, a warning's words, zip's assertion, or a most."""
-    if isinstance(node, ast.keyword) and node.arg == "strict":
+    if isinstance(node, ast.keyword) and (node.arg == "strict" or _most(node.arg or "")):
         return True
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
         return True

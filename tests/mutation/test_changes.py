@@ -46,6 +46,15 @@ def test_each_change_is_one_place_of_the_code_that_does_something() -> None:
     assert sorted(mutant.lines(SOURCE)[1] for mutant in mutants("file.py", SOURCE)) == sorted(EXPECTED)
 
 
+def test_what_stands_in_for_a_divisor_of_zero_and_a_most_of_rounds_stay() -> None:
+    source = b"s = np.where(size > 0, size, 1.0)\nt = np.where(size > 0, other, 1.0)\nsolve(max_iter=200, step=7)\n"
+    found = [mutant.lines(source)[1] for mutant in mutants("file.py", source)]
+    assert "s = np.where((size >= 0), size, 1.0)" in found
+    assert "t = np.where(size > 0, other, 2.0)" in found
+    assert "solve(max_iter=200, step=8)" in found
+    assert not any(line.endswith("size, 2.0)") or "201" in line for line in found)
+
+
 @pytest.mark.parametrize("name", ["control/lqr.py", "data/files/csv.py", "loop/simulate.py"])
 def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> None:
     source = (Path(__file__).parents[2] / "koopmpc" / name).read_bytes()
