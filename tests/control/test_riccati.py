@@ -374,3 +374,18 @@ def test_a_slow_loop_takes_few_steps_for_most_are_taken_by_doubling(monkeypatch)
     taken.clear()
     iterate(stage, stage.Q, 100_000)
     assert len(taken) > 500
+
+
+@pytest.mark.parametrize(("n", "rests"), [(1, 1), (3, 3), (60, 50)])
+def test_a_gain_rests_once_it_did_for_as_many_steps_as_there_are_states_and_fifty_at_most(monkeypatch, n, rests):
+    """From the solution on: the first step finds the gain, the others only see that it rests."""
+    stage = one_step(0.5 * np.eye(n), np.eye(n)[:, :1], np.eye(n), np.eye(1), None)
+    P, taken, own = stationary(stage, 1000).P, [], riccati.step
+    monkeypatch.setattr(riccati, "step", lambda *rest: taken.append(1) or own(*rest))
+    found, bounded = iterate(stage, P, 1000)
+    assert bounded
+    assert len(taken) == 1 + rests
+    np.testing.assert_allclose(found.P, P, rtol=1e-8)
+    taken.clear()
+    iterate(stage, P, rests)
+    assert len(taken) == rests
