@@ -441,3 +441,28 @@ def test_messages():
     ):
         with pytest.raises(error, match=text):
             call()
+
+
+@pytest.mark.parametrize(
+    ("R_delta", "du_max", "moves"), [(None, None, None), ([0.5, 0.1], 0.2, None), (None, None, (1, 1, 2, 3, 5, 13))]
+)
+def test_a_step_that_starts_from_the_last_one_moved_on_takes_half_of_the_iterations(R_delta, du_max, moves):
+    A = np.array([[1.05, 0.1, 0], [0, 1.02, 0.1], [0.05, 0, 0.9]])
+    B = np.array([[0.02, 0.1], [0.1, 0], [0, 0.2]])
+    model = km.LinearPredictor(A, B, np.eye(3), km.State(), 0.1, ("a", "b", "c"), ("u", "v"))
+    cost, limits = km.Cost(Q=[1, 2, 1], R=0.3, R_delta=R_delta), km.Limits(-0.8, 0.8, du_max=du_max)
+    taken = []
+    for cold in (False, True):
+        mpc, rng, x = (
+            km.KoopmanMPC(model, cost, limits, 25, solver="daqp", moves=moves),
+            np.random.default_rng(0),
+            [0.5, -0.4, 0.3],
+        )
+        taken.append(0)
+        for k in range(40):
+            if cold:
+                mpc._qps.cool()
+            move = mpc(x, [1.5 * (-1) ** (k // 10), 0, 0])
+            taken[-1] += move.iterations
+            x = A @ x + B @ move.u + 0.01 * rng.standard_normal(3)
+    assert taken[0] < 0.5 * taken[1]
