@@ -357,3 +357,8 @@ def test_a_run_is_as_long_as_the_plant_goes_on(steps):
     assert run.steps == len(observed) == 3
     assert len(run.X) == len(run.Y) == len(run.reference) == 4
     assert len(run.U) == len(run.status) == len(run.solve_time) == len(run.slack) == len(run.known) == 3
+
+
+def test_a_map_has_no_state_of_its_own_to_begin_in():
+    with pytest.raises(km.errors.DataError, match="a simulated plant has no state of its own to begin in; pass x0"):
+        km.simulate(step_map(A, B), Recorded(), x0=None, reference=[0.0, 0.0], steps=3)
