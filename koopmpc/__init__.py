@@ -115,23 +115,10 @@ else:
     __getattr__, __dir__, __all__ = attach(
         __name__,
         modules={
-            "bench": "bench",
-            "control": "control",
-            "data": "data",
-            "estimate": "estimate",
-            "identify": "identify",
-            "loop": "loop",
-            "plants": "plants",
-            "predict": "predict",
-            "recording": "recording",
-            "synthesis": "synthesis",
-            "errors": "errors",
             "faults": "loop.faults",
             "moments": "identify.moments",
             "plot": "figures",
-            "scene": "scene",
             "spectrum": "predict.spectrum",
-            "validate": "validate",
         },
         core=(
             "bench.library",

@@ -23,14 +23,17 @@ def attach(
     package
         The package's `__name__`.
     modules
-        Name → the module below ``koopmpc`` that it stands for; in `__dir__`, but not in `__all__`.
+        Name → the module below ``koopmpc`` that it stands for; in `__dir__`, but not in `__all__`. A module that the
+        package imports from itself, as ``from koopmpc import data as data``, is one of them.
     core
         Files below the package that the first name brings along, so that no later call waits for an import.
     moved
         Names that stood here once → the room below the package that has them now; asking for one says so.
     """
+    imported = _imported(package)
     rooms = {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
-    home = {name: file for name, file in _imported(package).items() if name not in rooms}
+    rooms |= {name: f"{package}.{name}" for name, file in imported.items() if file == package}
+    home = {name: file for name, file in imported.items() if name not in rooms}
     every = sorted(home)
     waiting = [f"{package}.{file}" for file in core]
 
