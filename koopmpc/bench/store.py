@@ -1,6 +1,7 @@
 """The store of a sweep: what was asked for, a line for each finished run, and the table that is made of them.
 
-A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way. The
+A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
+Each line, and the manifest, holds a checksum of the rest: a line that no longer matches is told and its run is lost. The
 table, results.parquet, is written beside and renamed, now and then and at the end; the lines are what counts.
 """
 
@@ -8,12 +9,14 @@ import errno
 import json
 import os
 import platform
+import warnings
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from io import FileIO
 from pathlib import Path
 from typing import Any, cast
+from zlib import crc32
 
 from koopmpc import disk
 from koopmpc.bench.results import RunRow, record_of, row_of
@@ -21,7 +24,7 @@ from koopmpc.errors import LogError, ProblemError
 
 MANIFEST, ROWS = "sweep.json", "rows"
 FORMAT = "koopmpc-sweep-1"
-_LINE = json.JSONEncoder()
+_LINE, _SEAL = json.JSONEncoder(), "crc32"
 
 
 class Journal:
@@ -29,7 +32,9 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rows, self._begun = {row.key: row for row in _rows_in(path)}, _begun_in(path)
+        lines = list(_lines(path))
+        self.rows = {row.key: row for _, row in lines if row is not None}
+        self._begun = [line["begins"] for line, row in lines if row is None]
 
     def __enter__(self) -> "Journal":
         try:
@@ -51,7 +56,7 @@ class Journal:
         """
         told = [] if done is None else [record_of(done)]
         told += [] if following is None else [{"begins": following.name}]
-        self._write("".join(f"{_LINE.encode(each)}\n" for each in told).encode())
+        self._write("".join(f"{_LINE.encode(_sealed(each))}\n" for each in told).encode())
         return 0 if following is None or not self._begun else self._begun.count(following.name)
 
     def _write(self, line: bytes) -> None:
@@ -67,27 +72,54 @@ def _whole(file: FileIO, data: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the whole lines; one that was torn is left out, for its run is done again."""
+def _sealed(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content with the checksum of its text."""
+    return {**content, _SEAL: crc32(_LINE.encode(content).encode())}
+
+
+def _unsealed(text: bytes) -> dict[str, Any]:
+    """Return the content of a text that holds its checksum; older ones hold none.
+
+    Raises
+    ------
+    ValueError
+        The text is cut, or no longer what was written.
+    """
+    content: object = json.loads(text)
+    if not isinstance(content, dict):
+        raise ValueError("it is no object")
+    content = cast("dict[str, Any]", content)
+    if content.pop(_SEAL, None) not in (None, crc32(_LINE.encode(content).encode())):
+        raise ValueError("it no longer holds what was written")
+    return content
+
+
+def _lines(path: Path) -> Iterator[tuple[dict[str, Any], RunRow | None]]:
+    """Yield each whole line, and the row of a run that it holds.
+
+    A line that was torn is left out, for its run is done again, and so is a damaged one, with a warning.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:
         return
-    for line in data.split(b"\n"):
+    damaged = 0
+    for line in filter(None, data.split(b"\n")):
         try:
-            found: object = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(found, dict):
-            yield cast("dict[str, Any]", found)
+            found = _unsealed(line)
+            yield found, None if "begins" in found else row_of(found, path.parent.parent)
+        except (LookupError, TypeError, ValueError):
+            damaged += _SEAL.encode() in line or line.endswith(b"}")
+    if damaged:
+        warnings.warn(
+            f"{path}: {damaged} lines are damaged and were left out; the same sweep in this folder does their runs again",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
-def _rows_in(path: Path) -> Iterator[RunRow]:
-    return (row_of(line, path.parent.parent) for line in _lines(path) if "begins" not in line)
-
-
-def _begun_in(path: Path) -> list[str]:
-    return [line["begins"] for line in _lines(path) if "begins" in line]
+def _rows_in(path: Path) -> list[RunRow]:
+    return [row for _, row in _lines(path) if row is not None]
 
 
 def load_rows(folder: str | Path) -> list[RunRow]:
@@ -134,7 +166,7 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
         file.seek(0)
         text = file.read()
         try:
-            known: dict[str, Any] = json.loads(text) if text.strip() else {}
+            known = _unsealed(text) if text.strip() else {}
         except ValueError as error:
             raise ProblemError(f"{path} is damaged; pass another folder, or remove it: {error}") from error
         if known and known["asked"] != asked:
@@ -144,7 +176,7 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
             known = {"format": FORMAT, "asked": asked, "machine": machine()}
             file.truncate(0)
             try:
-                _whole(file, json.dumps(known, indent=1).encode())
+                _whole(file, json.dumps(_sealed(known), indent=1).encode())
             except OSError as error:
                 file.truncate(0)
                 raise disk.refused(path, error) from error
@@ -174,7 +206,7 @@ def manifest_of(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / MANIFEST
     try:
-        return json.loads(path.read_bytes())
+        return _unsealed(path.read_bytes())
     except (OSError, ValueError) as error:
         raise LogError(
             f"{folder} holds no sweep: {MANIFEST} is missing or damaged; pass that of `koopmpc bench`"

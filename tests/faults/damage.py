@@ -1,8 +1,9 @@
 """Files of every kind that the library writes, ways to damage them, and a disk that is full."""
 
 import resource
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.results import RunRow, write_results
+from koopmpc.bench.results import RunRow, record_of, write_results
+from koopmpc.bench.store import Journal
 from koopmpc.recording.page import Curves, Page, record_curves
+from koopmpc.synthesis.designed import SavedDesign, saved_controller
 from tests.recording.runs import make_run
+from tests.synthesis.test_design import usual
 
 
 def episodes(seed: int = 0, steps: int = 30) -> km.Episodes:
@@ -29,6 +33,37 @@ def model(seed: int = 0) -> km.LinearPredictor:
     """Return a model of these walks whose file is some kilobytes long."""
     data, rng = episodes(seed), np.random.default_rng(seed)
     return km.edmd(data, km.State() + km.Constant() + km.Gaussian(rng.standard_normal((12, 3)), 1.0))
+
+
+def controller() -> km.KoopmanMPC:
+    """Return a controller on this model, with limits and an estimator."""
+    cost, limits = km.Cost(Q=[1.0, 1.0, 0.1], R=0.1, R_delta=0.2), km.Limits(u_min=-1, u_max=1, x_max=[2.0, 2.0, 3.0])
+    return km.KoopmanMPC(model(), cost, limits, 6, estimator=km.LiftedDisturbance(), latency=1, moves=3)
+
+
+def saved(path: Path) -> Any:
+    """Return what is in the file of a controller or a design, of which a controller was made."""
+    km.load_controller(path)
+    return saved_controller(path)
+
+
+@cache
+def rows() -> list[RunRow]:
+    """Return the rows of a sweep."""
+    figures = km.metrics(make_run(T=30))
+    return [RunRow("plant", f"case {i}", "lqr", figures, x0=(0.1 * i, -1.0)) for i in range(20)]
+
+
+def texts(rows: Iterable[RunRow]) -> list[str]:
+    """Return all that the rows hold."""
+    return [repr(record_of(row)) for row in rows]
+
+
+def journal(path: Path) -> None:
+    """Write the lines of these runs, as they end."""
+    with Journal(path) as lines:
+        for row in rows():
+            lines.turn(row, None)
 
 
 def results(path: Path) -> None:
@@ -67,6 +102,8 @@ def curves(path: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "model.npz": lambda path: model().save(path),
+    "controller.npz": lambda path: controller().save(path),
+    "design.npz": lambda path: usual().save(path),
     "episodes.npz": lambda path: episodes().save(path),
     "episodes.csv": lambda path: episodes().save(path),
     "episodes.parquet": lambda path: episodes().save(path),
@@ -83,10 +120,13 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 READERS: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
     "model.npz": (model, km.load_model),
+    "controller.npz": (lambda: controller().as_data(), saved),
+    "design.npz": (lambda: SavedDesign(usual().controller.as_data(), usual().evidence), saved),
     "episodes.npz": (episodes, km.load_episodes),
     "episodes.csv": (episodes, km.load_episodes),
     "episodes.parquet": (episodes, km.load_episodes),
     "run.rrd": (lambda: make_run(T=60), km.load_run),
+    "rows.jsonl": (lambda: texts(rows()), lambda path: texts(Journal(path).rows.values())),
 }
 """Each kind of file that is read: what was written, and what reads it."""
 
