@@ -70,6 +70,11 @@ def array(
     return result
 
 
+def start(x0: ArrayLike | None, nx: int) -> Float[np.ndarray, " nx"] | None:
+    """Return the state (nx,) in which a run begins; None where it is not known."""
+    return None if x0 is None else array(x0, "x0", (nx,))
+
+
 def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) -> Float[np.ndarray, " n"]:
     """Return `value` as a vector of `length`; a scalar is repeated."""
     result = array(value, name, infinite=infinite)

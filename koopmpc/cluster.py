@@ -1,12 +1,15 @@
 """Tasks on a Dask cluster, and the job that local workers and a cluster share."""
 
 import os
+import socket
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Generic, TypeVar
+from urllib.parse import urlsplit
 from uuid import uuid4
 
 from koopmpc.errors import DataError, KoopmpcError, install
@@ -20,7 +23,7 @@ ONE_THREAD: dict[str, str] = dict.fromkeys(
 )
 _SHOWN = 200  # characters of a task that a message shows
 _PATIENCE = 30.0  # longest wait for a cluster without any worker [s]
-_ANSWER = 10.0  # longest wait for a scheduler to answer [s]
+_ANSWER = 3.0  # longest wait for a scheduler to answer [s]
 _ANY_PORT = "127.0.0.1:0"
 
 
@@ -112,6 +115,19 @@ def _awaited(job: QueuedTask[Any], future: Any, client: Any) -> Any:
             raise KoopmpcError(died(str(job), "Dask gave it up")) from error
 
 
+def _knock(scheduler: str) -> None:
+    """Raise OSError where nothing listens at the address, now or within the time that a scheduler has to answer."""
+    place, last = urlsplit(scheduler), time.monotonic() + _ANSWER
+    while True:
+        try:
+            with socket.create_connection((place.hostname or "", place.port or 8786), timeout=_ANSWER):
+                return
+        except OSError:
+            if time.monotonic() + 0.2 > last:
+                raise
+        time.sleep(0.2)
+
+
 @contextmanager
 def _client(scheduler: str, workers: int | None) -> Generator[Any]:
     """Return a client of the cluster; a local one, which only this machine sees, is taken down after."""
@@ -135,9 +151,12 @@ def _client(scheduler: str, workers: int | None) -> Generator[Any]:
                 )
             address = open_now.enter_context(cluster)
         try:
+            if scheduler.startswith(("tcp://", "tls://")):
+                _knock(scheduler)  # a Client without an answer needs 11 s to say so
             client = open_now.enter_context(Client(address, set_as_default=False, timeout=_ANSWER))
-        except (OSError, TimeoutError) as error:
+        except (OSError, ValueError, MemoryError) as error:
             raise KoopmpcError(
-                f'no Dask scheduler answers at {scheduler}; start one with `dask scheduler`, or pass "local"'
+                f"no Dask scheduler answers at {scheduler} within {_ANSWER:g} s; start one with `dask scheduler`, "
+                'or pass "local"'
             ) from error
         yield client

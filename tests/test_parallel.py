@@ -224,7 +224,9 @@ def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("koopmpc.cluster._ANSWER", 0.5)
-    with pytest.raises(km.KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9; start one"):
+    with pytest.raises(
+        km.KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9 within 0\.5 s; start one"
+    ):
         list(map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:9"))
 
 

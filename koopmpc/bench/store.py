@@ -1,8 +1,8 @@
 """The store of a sweep: what was asked for, a line for each finished run, and the table that is made of them.
 
 A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
-Each line, and the manifest, holds a checksum of the rest: a line that no longer matches is told and its run is lost. The
-table, results.parquet, is written beside and renamed, now and then and at the end; the lines are what counts.
+Each line, and the manifest, holds a checksum of the rest: one that no longer matches is told, and left out. The table,
+results.parquet, is written beside and renamed, now and then and at the end; the lines are what counts.
 """
 
 import errno
@@ -112,7 +112,8 @@ def _lines(path: Path) -> Iterator[tuple[dict[str, Any], RunRow | None]]:
             damaged += _SEAL.encode() in line or line.endswith(b"}")
     if damaged:
         warnings.warn(
-            f"{path}: {damaged} lines are damaged and were left out; the same sweep in this folder does their runs again",
+            f"{path}: {damaged} lines are damaged and were left out; the same sweep in this folder does their runs "
+            "again",
             UserWarning,
             stacklevel=3,
         )

@@ -75,6 +75,7 @@ class InitialCondition(Viewing):
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
+        x0 = checks.start(x0, self._model.ny)
         if self._measured is None:  # else there is nothing that it remembers
             self.observer.reset(x0)
         self.drive[:] = 0.0
@@ -267,9 +268,14 @@ class MPCBase(Savable):
         return self._initial.observer
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Forget all earlier steps, so that a run repeats to the bit; a filter starts at x0, by default at zero.
+        """Forget all earlier steps, so that a run repeats to the bit; a filter starts at x0 (nx,), by default at zero.
 
         Rates count from `u_prev`, zero moved inside the limits by default; it is held if the first step fails.
+
+        Raises
+        ------
+        DataError
+            x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
         """
         zero = np.clip(np.zeros(self.nu), *self._inputs)
         self._kept: Float[np.ndarray, " nv"] | None = None

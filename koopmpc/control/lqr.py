@@ -31,14 +31,16 @@ class FeedbackLaw:
     ----------
     dt
         Sampling time [s].
+    nx
+        Number of states.
     inputs, rates
         The limits that u is clipped to; `rates` is None where changes have none.
     """
 
     horizon = 0  # no preview
 
-    def __init__(self, dt: float, inputs: Interval, rates: Interval | None) -> None:
-        self.dt, self.nu, self._inputs, self._rates = dt, len(inputs.low), inputs, rates
+    def __init__(self, dt: float, nx: int, inputs: Interval, rates: Interval | None) -> None:
+        self.dt, self.nu, self._nx, self._inputs, self._rates = dt, len(inputs.low), nx, inputs, rates
         self._token: Token = [0]
         self._inside = 0
         FeedbackLaw.reset(self)
@@ -51,8 +53,14 @@ class FeedbackLaw:
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Set the last input, from which rates count, and which is held if the first measurement is bad.
 
-        By default it is zero inside the limits.
+        By default it is zero inside the limits. x0 (nx,) will come as the first measurement.
+
+        Raises
+        ------
+        DataError
+            x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
         """
+        checks.start(x0, self._nx)
         zero = np.clip(np.zeros(self.nu), *self._inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
 
@@ -128,7 +136,7 @@ class LQR(FeedbackLaw):
         self._reference_key: tuple[bytes, int] | None = None
         self._feedforward = np.zeros(predictor.nu)
         self._row = 0  # of a given u_target, for the next call
-        super().__init__(predictor.dt, track.inputs, track.rates)
+        super().__init__(predictor.dt, predictor.nx, track.inputs, track.rates)
 
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:

@@ -102,8 +102,8 @@ class KalmanFilter(Viewing):
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Start at z = ψ(x0), by default ψ(0), and d = 0."""
         system = self._system
-        nx = system.predictor.nx
-        start = np.zeros(nx) if x0 is None else checks.array(x0, "x0", (nx,))
+        start = checks.start(x0, system.predictor.nx)
+        start = np.zeros(system.predictor.nx) if start is None else start
         self._s[:] = 0.0
         self._s[: len(system.kept)] = system.predictor.lift(system.predictor.held(start))[system.kept]
         self._inputs.clear()

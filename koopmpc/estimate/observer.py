@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting, buffered
@@ -190,6 +191,7 @@ class Measured:
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget d and the past; x0 will come as the first measurement."""
+        checks.start(x0, self.ny)
         self.d[:] = 0.0
         if self._history is not None:
             self._history.reset()

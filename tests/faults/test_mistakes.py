@@ -36,6 +36,45 @@ def test_a_number_is_no_path_of_a_controller():
         km.load_controller(3)
 
 
+@pytest.fixture(scope="module")
+def stateful(model):
+    """Return everything that begins a run at a state."""
+    cost, limits = PENDULUM.cost, PENDULUM.limits
+    mpc = km.KoopmanMPC(model, cost, limits, 8)
+    few = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=30, steps=20)
+    watched = km.KoopmanMPC(model, cost, limits, 8, monitor=few)
+    online = km.OnlineEDMD(model.lifting, dt=0.05, states=model.states, inputs=model.inputs)
+    found = {
+        "LQR": km.LQR(model, cost),
+        "LinearMPC": km.LinearMPC(PLANT, [0, 0], [0], cost, limits, 5),
+        "KoopmanMPC": mpc,
+        "estimated": km.KoopmanMPC(model, cost, limits, 8, estimator=km.LiftedDisturbance()),
+        "filtered": km.KoopmanMPC(model, cost, limits, 8, estimator=km.LiftedKalman(model.states)),
+        "BilinearMPC": km.BilinearMPC(PLANT, cost, limits, 5),
+        "NonlinearMPC": km.NonlinearMPC(PLANT, cost, limits, 3),
+        "Adaptive": km.Adaptive(km.KoopmanMPC(model, cost, limits, 8), online),
+        "Guarded": km.control.Guarded(watched, km.LQR(model, cost)),
+        "plant": km.plants.SimulatedPlant(PLANT),
+    }
+    return found | {f"observer of {name}": found[name].observer for name in ("KoopmanMPC", "estimated", "filtered")}
+
+
+NO_STATE = ["a", [1, 2, 3], [np.nan, 0], 5.0, {}, object(), [1j, 0], [[0.0, 0.0]], [[1], [2, 3]], [None, 1.0], "ab", []]
+
+
+@pytest.mark.parametrize("bad", NO_STATE, ids=str)
+def test_what_is_no_state_is_refused_where_a_run_begins(stateful, bad):
+    for name, each in stateful.items():
+        with pytest.raises(km.KoopmpcError, match="x0 "):
+            each.reset(bad), name
+        if "observer" in name or name == "plant":
+            continue
+        with pytest.raises(km.KoopmpcError, match="u_prev "):
+            each.reset(None, bad if bad != 5.0 else [5.0, 5.0])
+        each.reset([0.1, 0.0])
+        assert np.isfinite(each([0.1, 0.0], [0.0, 0.0]).u).all()
+
+
 class Answering:
     dt, nu, horizon = 0.05, 1, 0
 

@@ -106,7 +106,7 @@ class EigenfunctionLQR(FeedbackLaw):
         both = ca.densify(ca.vertcat(eigenfunction.symbolic(kept), self.law(kept, aim)))
         self._read = Buffered(ca.Function("u", [x, aim], [both], {"cse": True}))
         sized = Limits() if limits is None else limits
-        super().__init__(checks.positive(dt, "dt", "s"), sized.inputs(nu), sized.rates(nu))
+        super().__init__(checks.positive(dt, "dt", "s"), x.numel(), sized.inputs(nu), sized.rates(nu))
 
     def _effect(self, x: ca.SX, B: ArrayLike | Callable[[ca.SX], ca.SX] | None) -> ca.SX:
         """Return β(x), (1, nu)."""
