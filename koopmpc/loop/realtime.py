@@ -23,7 +23,7 @@ from koopmpc import checks
 from koopmpc.control.move import Controller, Fallback, Move, Status
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
-from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, known_start, rows_ahead
+from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, predictor_of, rows_ahead
 from koopmpc.plants.dynamics import Plant, reading, require_plant
 
 Late = Literal["skip", "hold"]
@@ -199,7 +199,8 @@ def realtime(
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
 
     y = reading(plant.reset(x0, np.random.default_rng(0)), None, 0)
-    controller.reset(known_start(controller, x0))
+    own = getattr(predictor_of(controller) or getattr(controller, "step_map", None), "states", None)
+    controller.reset(x0 if x0 is None or own is None or len(own) == len(x0) else None)
     main = threading.current_thread() is threading.main_thread()
     dog = _Watchdog(plant, at_rest, patience, main=main)
     read, ahead = getattr(plant, "read", None), controller.horizon + 1

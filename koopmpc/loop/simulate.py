@@ -186,7 +186,8 @@ def simulate(
     if state is not None:
         X[0] = state
     Y[0] = y = sensed(0, first) if spoilt else first
-    controller.reset(known_start(controller, x0))
+    own = getattr(model or getattr(controller, "step_map", None), "states", None)
+    controller.reset(x0 if own is None or len(own) == nx else None)  # a model of other states knows no such x0
     begin, whole = 0, getattr(controller, "whole_run", None)  # of a compiled controller
     if whole is not None and isinstance(plant, StepMap) and not (spoilt or disturbed or observers or plans):
         done: WholeRun | None = whole(plant, rows, W, X, Y, U, preview=preview)
@@ -313,14 +314,6 @@ def predictor_of(controller: object) -> Predictor | None:
     """Return the predictor that a controller holds, None where it has none."""
     held = (getattr(controller, name, None) for name in ("predictor", "model"))
     return next((each for each in held if isinstance(each, Predictor)), None)
-
-
-def known_start(controller: object, x0: ArrayLike | None) -> ArrayLike | None:
-    """Return the x0 of the plant as a controller is told it: None where its model has other states than the plant."""
-    if x0 is None:
-        return None
-    nx = getattr(predictor_of(controller) or getattr(controller, "step_map", None), "nx", None)
-    return x0 if nx is None or np.shape(x0) == (nx,) else None
 
 
 def rows_ahead(

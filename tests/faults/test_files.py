@@ -80,6 +80,25 @@ def test_a_save_keeps_links_permissions_and_read_only_files(tmp_path: Path) -> N
     assert Path("/dev/null").is_char_device()
 
 
+def test_a_link_to_a_log_of_another_name_stays_a_link_and_the_log_is_read_by_both_names(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    log, link = tmp_path / "runs" / "monday.rrd", tmp_path / "last.rrd"
+    link.symlink_to(log)  # at first to a log that is not there yet
+    for seed in (0, 1):
+        run = make_run(T=20, seed=seed)
+        km.record(run, link)
+        assert link.is_symlink()
+        assert km.load_run(log) == km.load_run(link) == run
+    before = log.read_bytes()
+    with room_for(2000), pytest.raises(km.errors.FullDiskError, match=r"monday\.rrd cannot be written"):
+        km.record(run, link)
+    assert log.read_bytes() == before
+    assert left(tmp_path) == ["last.rrd", "runs"]
+    assert left(tmp_path / "runs") == ["monday.rrd"]
+    with pytest.raises(km.errors.DataError, match="is given twice"):
+        km.Files([log, link])
+
+
 def flipped(data: bytes, rng: random.Random) -> bytes:
     """Return the bytes with one bit changed."""
     bad, bit = bytearray(data), rng.randrange(8 * len(data))

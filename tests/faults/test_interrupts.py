@@ -87,6 +87,7 @@ def _interrupt():
     os.kill(os.getpid(), signal.SIGINT)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of files that an import had open
 @pytest.mark.parametrize("name", BUSY)
 @pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.slow)])
 def test_an_interrupt_is_never_swallowed_in_python(tmp_path: Path, name: str, count: int) -> None:

@@ -62,7 +62,7 @@ def stateful(model):
 NO_STATE = ["a", [1, 2, 3], [np.nan, 0], 5.0, {}, object(), [1j, 0], [[0.0, 0.0]], [[1], [2, 3]], [None, 1.0], "ab", []]
 
 
-@pytest.mark.parametrize("bad", NO_STATE, ids=str)
+@pytest.mark.parametrize("bad", NO_STATE, ids=range(len(NO_STATE)))
 def test_what_is_no_state_is_refused_where_a_run_begins(stateful, bad):
     for name, each in stateful.items():
         with pytest.raises(km.KoopmpcError, match="x0 "):
@@ -73,6 +73,12 @@ def test_what_is_no_state_is_refused_where_a_run_begins(stateful, bad):
             each.reset(None, bad if bad != 5.0 else [5.0, 5.0])
         each.reset([0.1, 0.0])
         assert np.isfinite(each([0.1, 0.0], [0.0, 0.0]).u).all()
+
+
+@pytest.mark.parametrize("settings", ["max_iter", [("max_iter", 5)], 5])
+def test_settings_of_a_solver_are_given_by_name(model, settings):
+    with pytest.raises(km.errors.DataError, match=r"settings is a \w+, expected a Mapping; pass the solver's own by"):
+        km.KoopmanMPC(model, PENDULUM.cost, PENDULUM.limits, 5, settings=settings)
 
 
 class Answering:

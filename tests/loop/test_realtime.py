@@ -225,6 +225,53 @@ def test_a_controller_that_never_returns_is_interrupted_and_the_plant_is_safe():
     assert plant.got[2:] == [9.0]
 
 
+@pytest.mark.parametrize("part", ["the plant", "the recorder"])
+def test_a_reading_or_a_recorder_that_never_returns_is_named_and_the_plant_is_safe(part):
+    def stuck(step=None):
+        time.sleep(1e6)
+
+    class Reading(Here):
+        def read(self):
+            return stuck() if len(self.got) == 2 and part == "the plant" else [0.0]
+
+        def step(self, u):
+            super().step(u)
+
+        def stop(self, u):
+            super().step(u)
+
+    plant = Reading()
+    recorder = None if part == "the plant" else lambda step: stuck() if step.k == 1 else None
+    paced = km.realtime(Toward(), plant, dt=DT, reference=[0.0], watchdog=0.3, safe=9.0, recorder=recorder)
+    assert paced.ended == f"watchdog: {part} did not return within 0.3 s"
+    assert plant.got[-1] == 9.0
+    assert len(plant.got) == 3
+
+
+def test_a_plant_that_fails_once_is_made_safe_by_its_next_step():
+    class Loose(Here):
+        def step(self, u):
+            super().step(u)
+            if len(self.got) == 3:
+                raise OSError("no answer")
+            return [0.0]
+
+    plant = Loose()
+    paced = km.realtime(Toward(), plant, dt=DT, reference=[0.0], watchdog=20, safe=9.0)
+    assert paced.ended == "plant: OSError: no answer"
+    assert plant.got[3:] == [9.0]
+
+
+def test_what_a_recorder_raises_is_no_failure_of_the_plant():
+    def full(step):
+        raise OSError("no room")
+
+    plant = Here()
+    with pytest.raises(OSError, match="no room"):
+        km.realtime(Toward(), plant, dt=DT, reference=[0.0], watchdog=20, safe=9.0, recorder=full)
+    assert plant.got[1:] == [9.0]
+
+
 def test_what_a_controller_raises_is_raised_when_the_plant_is_safe():
     class Broken(Toward):
         def __call__(self, y, reference, applied=None, w=None):
