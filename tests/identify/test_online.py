@@ -307,6 +307,8 @@ def test_wrong_forgetting_windows_and_shapes_are_refused() -> None:
         make(window=0)
     with pytest.raises(km.errors.DataError, match="keep is 1"):
         make(keep=1.0)
+    with pytest.raises(km.errors.DataError, match="keep is 0; it must lie between 0 and 1"):
+        make(keep=0.0)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
         make(ridge=-1.0)
     online = make()
@@ -358,3 +360,12 @@ def test_outliers_are_not_looked_for_with_a_memory_of_less_than_four_pairs_a_reg
     online.learn(X[-1], [0.0], 1e6 * np.ones(states))
     assert online.outliers == outliers
     assert online.pairs == 301 - outliers
+
+
+@pytest.mark.parametrize(("forgetting", "outliers"), [(0.75, 1), (0.74, 0)])
+def test_a_memory_of_four_pairs_is_enough_for_one_regressor(forgetting, outliers):
+    x = np.random.default_rng(0).uniform(-1, 1, (300, 1))
+    online = km.OnlineEDMD(km.State(), dt=0.1, states=("a",), forgetting=forgetting)
+    online.learn(x, np.zeros((300, 0)), 0.5 * x)
+    online.learn([1.0], [], [1e6])
+    assert online.outliers == outliers

@@ -105,7 +105,7 @@ class OnlineEDMD:
             self._memory = Window(width, checks.count(window, "window"), max(_BLOCK, width))
         self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
         self._waiting: int = 0
-        long = factor < 1 and 1 / (1 - factor) > 4 * self._n  # else forecasts say nothing of outliers
+        long = factor < 1 and 1 / (1 - factor) >= 4 * self._n  # else forecasts say nothing of outliers
         self._gate = Gate(width, self._n, nz) if long else None
         self._rival: Rival | None = None
         self.pairs = self.outliers = 0
