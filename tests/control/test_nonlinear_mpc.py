@@ -245,3 +245,22 @@ def test_the_next_step_starts_from_the_solution_moved_on_by_one_step_multipliers
     whole = np.hstack([solution.U, solution.X, solution.slacks]) / mpc._shooting._sizes
     wanted = np.vstack([whole[1:], whole[-1:]])
     np.testing.assert_allclose(solution.start.v.reshape(horizon, -1), wanted, atol=1e-12)
+
+
+def test_a_solution_that_is_no_number_in_one_place_is_a_failure():
+    mpc = km.NonlinearMPC(pendulum(), km.Cost(Q=[1, 0.1], R=0.1), km.Limits(-1, 1), 4)
+    mpc([0.5, 0.0], [0, 0])
+    own = mpc._shooting._solver
+
+    class Torn:
+        stats = own.stats
+
+        def __call__(self, **given):
+            found = dict(own(**given))
+            found["x"][3] = np.nan
+            return found
+
+    mpc._shooting._solver = Torn()
+    move = mpc([0.5, 0.0], [0, 0])
+    assert move.status is km.Status.FAILED
+    assert np.isfinite(move.u).all()
