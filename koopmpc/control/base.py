@@ -97,7 +97,8 @@ class InitialCondition(Viewing):
         last
             The input that was computed last.
         applied
-            The input that acted since the last call; by default the one that was computed L + 1 calls ago.
+            The input that acted since the last call; where it is not told, or no number, the one that was computed
+            L + 1 calls ago.
         w
             (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
@@ -118,6 +119,8 @@ class InitialCondition(Viewing):
         if measured.shape != self._shape:
             what = "measurement of the estimator" if self._estimated else "state"
             raise ShapeError(f"y has shape {measured.shape}, expected {self._shape}, one value a {what}")
+        if got is not None and not (np.abs(got) < HUGE).all():
+            got = None
         if self._with_rates:  # what acts before the plan's first input
             self.u_prev[:] = last if got is None or self._latency else got
         if self.W.size or w is not None:
@@ -126,7 +129,7 @@ class InitialCondition(Viewing):
         if self._latency:
             self._sent.append(last.copy())
             acted = self._sent[0]
-        if got is not None and (np.abs(got) < HUGE).all():
+        if got is not None:
             acted = got
         good = observer.observe(measured, acted, self._w)
         if self._ahead.size:  # an unknown one stays as it was

@@ -127,3 +127,38 @@ def test_select_says_which_column_is_constant_and_its_model_controls(still):
         found = km.select(episodes(8, 40, still), **FEW)
     mpc = km.KoopmanMPC(found.predictor, COST, km.Limits(-1, 1, x_max=[4, 1]), 10)
     assert np.abs(mpc([3.0, 0.5], [3.0, 0.0]).u).max() <= 1.0
+
+
+TWO = km.LinearPredictor(
+    [[1.05, 0.1], [0.08, 1.0]], [[0.1, 0.02], [0.0, 0.2]], np.eye(2), km.State(), 0.1, ("a", "b"), ("u", "v")
+)
+WEIGHTS, RATES = km.Cost(Q=[1, 2], R=0.3, R_delta=0.1), km.Limits(-0.8, 0.8, du_max=0.3)
+MAKERS = {
+    "lqr": lambda: km.LQR(TWO, WEIGHTS, RATES),
+    "koopman": lambda: km.KoopmanMPC(TWO, WEIGHTS, RATES, 6, solver="daqp"),
+    "estimating": lambda: km.KoopmanMPC(TWO, WEIGHTS, RATES, 6, solver="daqp", estimator=km.LiftedDisturbance(0.3)),
+    "bilinear": lambda: km.BilinearMPC(TWO, WEIGHTS, RATES, 6),
+    "nonlinear": lambda: km.NonlinearMPC(TWO, WEIGHTS, RATES, 6),
+}
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e31])
+def test_what_is_no_number_in_one_place_is_as_if_nothing_were_told(kind, value):
+    """An applied input that is partly known is not used; a reference of which a part is none makes no plan."""
+    told, other = MAKERS[kind](), MAKERS[kind]()
+    x = np.array([0.5, -0.4])
+    for k in range(4):
+        a, b = told(x, [0.1, 0.0], [0.2, value] if k else None), other(x, [0.1, 0.0])
+        assert a.status is b.status
+        np.testing.assert_allclose(a.u, b.u, atol=1e-9)
+        x = TWO.A @ x + TWO.B @ a.u
+    for mpc in (told, other):
+        mpc.solver_fails = False
+    failed = told(x, [0.1, value], [0.0, value])
+    assert failed.status is km.Status.BAD_MEASUREMENT
+    again = other([0.5, value], [0.1, 0.0])
+    assert again.status is km.Status.BAD_MEASUREMENT
+    np.testing.assert_allclose(failed.u, again.u, atol=1e-9)
+    for mpc in (told, other):  # the next step goes on
+        assert mpc(x, [0.1, 0.0]).fallback is km.control.Fallback.NONE

@@ -284,10 +284,6 @@ class KoopmanMPC(MPCBase):
     def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step in which the plan or its target breaks a limit, or something is not finite."""
         plan, origin, u_prev = self._map, self._initial, self._initial.u_prev
-        changed = self._with_rates and not (np.abs(u_prev) < HUGE).all()
-        if changed:  # the applied input was reported as NaN or huge: take the last one returned instead
-            u_prev[:] = self._given
-            np.dot(plan.matrix, origin.known, out=t)
         if not t.dot(t) < HUGE * HUGE:
             self._qps.cool()
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
@@ -297,9 +293,8 @@ class KoopmanMPC(MPCBase):
             e = plan.disturbance @ origin.drive
             moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
             v += plan.maps.from_target @ moved.ravel()
-            changed = True
-        if changed and (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
-            return self._unconstrained(t, start)
+            if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
+                return self._unconstrained(t, start)
         inputs, room = plan.track.inputs, None
         if self._hard_rates is not None:
             room = Interval(inputs.low - u_prev, inputs.high - u_prev)

@@ -157,7 +157,7 @@ class StagedMPC(MPCBase):
     ) -> Move:
         initial = self._initial
         initial.take(y, self._given, applied, w)
-        x, u_prev = initial.z, self._known_input()
+        x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
         s, first, conflict = self._first_stage(x, u_prev)
         target = checks.numbers(reference, "reference")
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
@@ -176,15 +176,6 @@ class StagedMPC(MPCBase):
                 slack = max(slack, beyond(u - u_prev, self._hard_rates))
         self._keep(self._U.ravel())
         return self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
-
-    def _known_input(self) -> Float[np.ndarray, " nu"]:
-        """Return the input that rates count from: what was applied, where it can be used."""
-        u_prev = self._initial.u_prev
-        if not u_prev.size:
-            return self._given
-        if not (np.abs(u_prev) < HUGE).all():
-            u_prev[:] = self._given
-        return u_prev
 
     @abstractmethod
     def _solve(
