@@ -141,6 +141,9 @@ def fit(
 def check(
     controller: Annotated[Path, typer.Argument(help="What `koopmpc fit --goal` or the save of a design wrote.")],
     runs: Annotated[int, typer.Option("--runs", help="Runs of each kind.")] = 12,
+    faults: Annotated[
+        bool, typer.Option("--faults", help="Ask that the goal is kept with broken sensors, inputs and solvers, too.")
+    ] = False,
     logs: Logs = Path("logs"),
 ) -> None:
     """Test a designed controller from random starts, with noise, inputs 20 % off and faults; exit 1 where it fails."""
@@ -148,7 +151,7 @@ def check(
 
     out = console()
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
-        done = check_controller(controller, folder, runs=runs, progress=progress)
+        done = check_controller(controller, folder, runs=runs, faults=faults, progress=progress)
     out.print(Text(f"{done}\n\nreport: {done.page}"), soft_wrap=True)
     if not done.kept:
         raise typer.Exit(1)

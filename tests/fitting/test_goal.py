@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.control.base import MPCBase
-from koopmpc.fitting.check import check_controller
+from koopmpc.fitting.check import RunKind, check_controller
 from koopmpc.fitting.control import design_data
 from koopmpc.fitting.goal import goal_template, read_goal
 
@@ -87,6 +87,10 @@ def test_a_design_that_keeps_its_goal_passes_the_check_and_its_page_says_so(made
     assert "inputs 20 % weaker" in text
     assert {one.kind.name for one in done.figures} >= {"as in the data", "sensor NaN", "half of the solves fail"}
     assert 0 < done.hot < done.dt
+    steps = sum(count for _, count in done.figures[0].statuses)
+    assert (
+        steps == 4 * 3 * 3 * 15
+    )  # a reference that rests has three times the three horizons of the design for arriving
 
 
 def test_a_check_repeats_for_a_seed(made, tmp_path):
@@ -120,6 +124,20 @@ def test_an_input_beyond_its_limits_under_a_fault_fails_the_check(made, tmp_path
     assert outside["as in the data"] == 0
     assert not done.kept
     assert any("sensor NaN: " in one and "outside their limits" in one for one in done.reasons)
+
+
+def test_runs_lost_under_a_fault_are_told_and_count_only_where_that_is_asked(made, tmp_path, monkeypatch):
+    frozen = [RunKind("as in the data"), RunKind("sensor frozen", faults=(km.faults.FrozenSensor(begin=2),))]
+    monkeypatch.setattr("koopmpc.fitting.check.kinds", lambda *_, **__: frozen)
+    done, strict = (check_controller(made.controller, tmp_path / str(how), runs=3, faults=how) for how in (False, True))
+    assert (done.kept, strict.kept) == (True, False)
+    assert done.broken == strict.broken == strict.reasons
+    assert done.broken[0].startswith("sensor frozen: ")
+    assert done.broken[0].endswith("5 % are allowed")
+    assert done.broken[0] in str(done)
+    assert f"- {done.broken[0]}" in done.page.read_text()
+    assert "`koopmpc check --faults` counts it" in done.page.read_text()
+    assert "counts it" not in strict.page.read_text()
 
 
 def test_a_controller_without_evidence_cannot_be_checked(tmp_path):

@@ -12,7 +12,8 @@ from koopmpc.validate.logs.log import LogFault, Log, fitted, information
 from koopmpc.validate.text import percent
 
 _PAST = 10  # inputs of the past that may tell the next one
-_EXPLAINED = 0.95  # share of what is new in an input that the state explains: feedback
+_EXPLAINED = 0.8  # share of an input that the state of the same row explains: feedback
+_NEWS = 0.02  # share of what is new in an input that this state must explain then
 _FREE = 1e-4  # share of an input that its own past must leave open
 _ENOUGH = 200  # rows without which no effect is looked for
 
@@ -103,10 +104,11 @@ def _past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
 
 
 def feedback(log: Log) -> Iterator[LogFault]:
-    """Find inputs of which the state tells what their own past does not.
+    """Find inputs u_k that follow from the state x_k of the same row.
 
-    In an open loop the state tells nothing of that part, which has not acted yet; under feedback u = K x it tells
-    nearly all of it.
+    An input that was chosen freely may be told by the state as well, where the plant is much faster than the input is
+    changed. Two signs tell a feedback u = K x from that: x_k knows more of u_k than of u_{k−1}, although that one has
+    acted already, and it tells a part of u_k that earlier inputs do not.
     """
     U = [e.U for e in log.data if len(e) > 2 * _PAST]
     X = [e.X for e in log.data if len(e) > 2 * _PAST]
@@ -121,12 +123,13 @@ def feedback(log: Log) -> Iterator[LogFault]:
     one, Z = np.ones((len(V), 1)), (state - log.center) / log.size
     left = (fitted(np.hstack([one, own]), V) ** 2).mean(axis=0)
     after = (fitted(np.hstack([one, own, Z]), V) ** 2).mean(axis=0)
-    alone = (fitted(np.hstack([one, Z]), V) ** 2).mean(axis=0)
+    alone, acted = np.split((fitted(np.hstack([one, Z]), np.hstack([V, own[:, : V.shape[1]]])) ** 2).mean(axis=0), 2)
     around = np.maximum((V**2).mean(axis=0) - V.mean(axis=0) ** 2, 1e-300)
     for j in np.flatnonzero(around > 1e-12):
         told = 1 - after[j] / max(left[j], 1e-300)
         exact = alone[j] < 1e-8 * around[j]
-        if exact or (told > _EXPLAINED and left[j] > _FREE * around[j] and alone[j] < 0.1 * around[j]):
+        known = alone[j] < (1 - _EXPLAINED) * around[j] and alone[j] < acted[j]
+        if exact or (known and told > _NEWS and left[j] > _FREE * around[j]):
             name = short(log.data.inputs[j])
             yield LogFault(
                 "feedback",

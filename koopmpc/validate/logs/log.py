@@ -15,6 +15,7 @@ _PAIRED = 6  # states up to which their products are regressors too
 _CUBED = 3  # states up to which the products of three are
 _RIDGE = 1e-10  # of the regressions, on columns of unit size
 _FINE = 0.02  # share of a change from row to row that a prediction need not tell
+ALONE = 0.2  # leverage of a row from which on so few rows are like it that nothing is known of what follows
 _SMALLEST = 1e-9  # share of a state's size below which a residual counts as rounding
 
 

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import LogFault, Log, Place, episodes_of_places, listed, runs
+from koopmpc.validate.logs.log import ALONE, LogFault, Log, Place, episodes_of_places, listed, runs
 from koopmpc.validate.text import percent
 
 _GRID = 0.95  # share of a sensor's different values that stand on a grid
-_COARSE = 0.5  # of a usual step, from which on a grid is coarse
+_COARSE = 0.3  # of a usual change from row to row, from which on a grid is coarse
 _LONG = 12  # rows without any change from which on a sensor is stuck
 _AT_LIMIT = 8  # rows at the same extreme value from which on a sensor is at its limit
 _RESTS = 0.1  # of a usual change: where the law misses less than this, a state that stands still is at rest
@@ -347,7 +347,8 @@ def _spikes(log: Log, i: int, changes: np.ndarray) -> Iterator[Place]:
         off = np.abs(log.residuals[e][:, i])
         for k in np.flatnonzero((sizes > far) & (off[:-1] > usual) & (off[:-1] * log.size[i] > 0.5 * sizes)):
             around = np.concatenate([off[max(k - 4, 0) : max(k - 1, 0)], off[k + 3 : k + 6]])
-            if k >= 2 and np.max(around, initial=0.0) < 0.3 * off[k]:
+            known = log.leverage[e][max(k - 1, 0) : k + 1].max() < ALONE
+            if k >= 2 and known and np.max(around, initial=0.0) < 0.3 * off[k]:
                 yield Place(e, int(k) + 1, int(k) + 2)
 
 

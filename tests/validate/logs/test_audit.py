@@ -5,9 +5,11 @@ import pytest
 
 import koopmpc as km
 from tests.bare import shown
-from tests.validate.logs.corpus import BEDS, FAULTS, Draw, clean, episodes, faulty, simulated
+from tests.validate.logs.corpus import BEDS, FAULTS, Draw, clean, draw, episodes, faulty, simulated
 
-CLEAN = [0, 7, 19, 40, 51, 87, 91058]  # in the last the other state follows better from the future of a sensor in time
+# 91058: the other state follows better from the future of a sensor in time; 3021: a law is not known before it is met;
+# 12061: a stiff plant whose rate tells more a step later; 20187: a smooth input that wins by any delay
+CLEAN = [0, 7, 19, 40, 51, 87, 91058, 3021, 12061, 20187]
 
 
 @pytest.mark.parametrize(
@@ -32,8 +34,25 @@ def test_each_kind_of_fault_is_found_in_two_of_three_logs_that_have_it(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", list(FAULTS))
 def test_most_logs_of_varied_plants_that_have_a_fault_show_it(kind):
-    found = [kind in km.validate.audit(faulty(kind, seed)[1]).kinds for seed in range(10)]
-    assert sum(found) >= 8, found
+    reports = [km.validate.audit(faulty(kind, seed)[1]) for seed in range(10)]
+    assert sum(kind in report.kinds for report in reports) >= 8, "\n".join(map(str, reports))
+
+
+@pytest.mark.parametrize("seed", [1, 8])
+def test_an_input_that_acts_along_a_smooth_curve_has_no_end(seed):
+    """The limit that predicts best wins 0.2 to 0.6 nats a sample here; a polynomial wins more."""
+    rng = np.random.default_rng([seed, 5])
+    of = draw(rng, None, ("noise", "multisine", "chirp", "prbs"))
+    low, high = (np.array(end, float) for end in BEDS[of.bed].u)
+    middle, half = (low + high) / 2, (high - low) / 2
+    X, U = simulated(of, rng, lambda U: middle + half * np.tanh(1.5 * (U - middle) / half) / np.tanh(1.5))
+    assert km.validate.audit(episodes(of, X, U)).faults == ()
+
+
+def test_a_feedback_with_noise_enough_on_top_is_no_fault():
+    for share, told in {0.0: True, 0.02: True, 0.6: False}.items():
+        X, U = simulated(STEADY, np.random.default_rng(9), share=share)
+        assert ("feedback" in km.validate.audit(episodes(STEADY, X, U)).kinds) == told
 
 
 STEADY = Draw("motor", 0.03, 20, 100, 1e-3, 0.0, "noise", 3)
@@ -51,7 +70,7 @@ def test_a_late_input_is_told_with_the_delay_that_models_it():
     assert fit(embedding=km.Delay(2)) < 0.5 * fit()  # the advice is worth something
 
 
-@pytest.mark.parametrize(("seed", "steps"), [(5, 2), (7022, 2), (7027, 3)])
+@pytest.mark.parametrize(("seed", "steps"), [(5, 2), (7022, 2), (7027, 4), (1001, 2)])
 def test_a_sensor_whose_delay_changes_its_own_forecasts_alone_is_told(seed, steps):
     (fault,) = km.validate.audit(faulty("late sensor", seed)[1]).faults
     assert (fault.name, fault.steps) == ("late sensor", steps)
