@@ -86,7 +86,8 @@ class LQR(FeedbackLaw):
     """u = −K ψ(x) + v_r r + v_u u_r + v_w w on a lifted predictor, or on a linearisation of `LinearPredictor.local`.
 
     It minimises Σ ‖of(x_k) − r‖²_Q + ‖u_k − u_r‖²_R over an endless horizon, the reference r, its input target u_r and
-    the disturbance w held: the gain K and the feedforward are where the Riccati difference equation rests. Where r is
+    the disturbance w held: the gain K and the feedforward are where the Riccati difference equation rests. It does not
+    look ahead: of several reference rows, or rows of w, the first counts and the others change nothing. Where r is
     an equilibrium and u_r holds it, u = u_r − K (ψ(x) − z_r). With R_delta it acts on [ψ(x); u_{k−1}]. The input is
     clipped to the limits of its change, soft or hard, and to its own (status SATURATED); other limits are not seen.
 

@@ -22,6 +22,14 @@ def test_the_feedback_law_and_its_limits():
     assert (lqr.dt, lqr.nu, lqr.horizon) == (0.1, 1, 0)
 
 
+def test_it_does_not_look_ahead_the_first_of_several_reference_rows_counts():
+    lqr = km.LQR(linear(A, B), km.Cost([2, 1], 0.1))
+    x, rows = [0.3, 0.1], np.random.default_rng(0).normal(size=(5, 2))
+    alone = lqr(x, rows[0]).u
+    np.testing.assert_array_equal(lqr(x, rows).u, alone)
+    assert abs(lqr(x, rows[1]).u - alone) > 1e-3
+
+
 def test_nan_holds_the_last_input():
     lqr = km.LQR(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5))
     for bad in ([np.nan, 0], [np.inf, 0], [0, 1e31]):
