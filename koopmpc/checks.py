@@ -136,11 +136,29 @@ def names(given: Sequence[str] | None, what: str, letter: str, size: int) -> tup
     """
     if given is None:
         return tuple(f"{letter}{i}" for i in range(size))
-    if isinstance(given, str):
-        raise DataError(f"{what} is {given!r}; pass a tuple of names")
+    given = texts(given, what)
     if len(given) != size:
         raise ShapeError(f"{what} has {len(given)} names, expected {size}; give one name each: got {tuple(given)}")
-    return tuple(given)
+    return given
+
+
+def texts(given: object, what: str) -> tuple[str, ...]:
+    """Return a sequence of names as a tuple.
+
+    Raises
+    ------
+    DataError
+        It is a single text, or holds what is no text.
+    """
+    found = tuple(cast("Sequence[object]", given)) if isinstance(given, Sequence | np.ndarray) else (None,)
+    if isinstance(given, str) or not all(isinstance(name, str) for name in found):
+        raise DataError(f"{what} is {given!r}; pass a tuple of names")
+    return cast("tuple[str, ...]", found)
+
+
+def among(value: object, known: Iterable[str]) -> bool:
+    """Return whether `value` is one of these words; an array or a list is none."""
+    return isinstance(value, str) and value in known
 
 
 def positive(value: float, name: str, unit: str = "") -> float:

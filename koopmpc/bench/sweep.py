@@ -15,7 +15,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from koopmpc import checks
+from koopmpc import checks, disk
 from koopmpc.bench.controllers import LEARNED, Prepared, controller_names
 from koopmpc.bench.library import load_problem
 from koopmpc.bench.problem import Problem
@@ -139,7 +139,11 @@ def sweep(
     FullDiskError
         The disk is full; the runs that are finished are kept.
     """
-    problems, folder = list(problems), Path(folder)
+    folder = disk.path_of(folder)
+    checks.members(problems, "problems", ("__iter__",), "pass a list of what km.load_problem returns")
+    problems = list(problems)
+    for problem in problems:
+        checks.kind(problem, "a problem", Problem, "load it with km.load_problem")
     rows = _rows(problems, controllers, starts, seeds, noise, wrong, faults)
     alone = scheduler is None and (workers is None or workers == 1)
     if live and not alone:

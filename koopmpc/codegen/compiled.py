@@ -52,7 +52,7 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
     DataError
         A part of the controller cannot be written in C; the message says which, and what would do.
     """
-    if precision not in ("double", "float"):
+    if not checks.among(precision, ("double", "float")):
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     if isinstance(controller, Compiled):
         return controller

@@ -20,7 +20,7 @@ from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.iteration import MOST
-from koopmpc.disk import writing
+from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError
 from koopmpc.estimate.kalman_filter import KalmanFilter
 from koopmpc.plants.routines import compiler
@@ -101,7 +101,7 @@ def export(
     texts |= {name: shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
     texts |= _plant(controller, tables, plant, x0, rows, checks.count(steps, "steps"), Language(single))
     texts = named(texts, name)
-    root = Path(folder)
+    root = path_of(folder)
     _refuse_others(root, {*texts, "README.md"}, name)
     for path, text in texts.items():
         _write(root / path, text)

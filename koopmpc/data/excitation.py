@@ -312,6 +312,8 @@ class Feedback(Excitation):
         if hasattr(K, "K"):
             raise DataError(f"K is a {type(K).__name__}; pass its matrix, gain.K")
         gain = checks.array(K, "K", (None, None))
+        if noise is not None:
+            checks.members(noise, "noise", ("nu", "start"), "pass an excitation, such as Noise(-1, 1), or None")
         if noise is not None and noise.nu != len(gain):
             raise ShapeError(f"noise has {noise.nu} inputs and K {len(gain)} rows; pass one level for each input")
         freeze(

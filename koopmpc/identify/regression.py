@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 from scipy.linalg import qr
 
+from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
@@ -94,6 +95,8 @@ def read(
 ) -> Regression:
     """Return the regression on [ψ(x) u w] that these episodes hold, read as `second_moments` says."""
     source = source_of(episodes)
+    if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
     sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
     total = second_moments(source.driven(), lifting, embedding=sized, **options)
     return regression_of(total, method, noisy=noisy, disturbances=source.disturbances)

@@ -175,7 +175,7 @@ class Expressions(Lifting):
     labels: tuple[str, ...]
 
     def __init__(self, fn: Callable[[ca.SX], Sequence[ca.SX]], names: Sequence[str]) -> None:
-        freeze(self, fn=fn, labels=(names,) if isinstance(names, str) else tuple(names), bound=None)
+        freeze(self, fn=fn, labels=checks.texts((names,) if isinstance(names, str) else names, "names"), bound=None)
 
     def bind(self, states: Sequence[str]) -> Traced:
         """Return the traced list of operations, which needs `fn` no more."""

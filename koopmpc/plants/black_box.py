@@ -70,7 +70,8 @@ def black_box(
             raise DataError(f"{name} is a {type(function).__name__}; pass a function")
     if (measure is None) != (outputs is None):
         raise DataError("measure and outputs belong together: pass the function and the names of y, or neither")
-    if not len(states):
+    states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
+    if not states:
         raise DataError("states is empty; name at least one state")
     named = tuple(checks.names(states, "states", "x", len(states)))
     return SimulatedPlant(

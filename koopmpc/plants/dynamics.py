@@ -142,6 +142,7 @@ def right_side(dynamics: Dynamics) -> ca.Function:
     DataError
         `rhs` returns no CasADi expression, or one with symbols other than x and u.
     """
+    checks.members(dynamics, "dynamics", ("states", "inputs", "rhs"), "pass one of your subclass of km.Dynamics")
     _check_names(dynamics)
     x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
     value = _expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", ca.vertcat(x, u), dynamics.nx)

@@ -297,6 +297,7 @@ def _vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]
 
 
 def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
+    checks.members(function, name, ("n_in", "n_out"), "pass a casadi Function")
     wanted = "(x, u)" if arguments == 2 else "(x)"
     if function.n_in() != arguments or function.n_out() != 1:
         raise ShapeError(

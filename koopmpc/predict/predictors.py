@@ -16,7 +16,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
@@ -250,8 +250,9 @@ def _store(
     scale: ArrayLike | None,
 ) -> tuple[Lifting, int]:
     """Check the fields that all predictors share and store them; return the bound lifting and nz."""
+    states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
     embedded = None if embedding is None else embedding.bind(states, inputs)
-    bound = lifting.bind(tuple(states) if embedded is None else embedded.names)
+    bound = lifting_of(lifting).bind(tuple(states) if embedded is None else embedded.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)
     transition = checks.array(A, "A")
     largest = float(np.abs(transition).max(initial=0.0))

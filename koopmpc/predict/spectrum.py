@@ -128,6 +128,8 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
 
 def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes | Source) -> None:
     """Raise where data and predictor differ in states, inputs, the disturbances that it knows, or dt."""
+    checks.members(predictor, "the model", ("states", "inputs", "dt"), "pass one that edmd or bilinear_edmd returned")
+    checks.members(episodes, "episodes", ("states", "inputs", "dt"), "pass Episodes, of collect or load_episodes")
     known = predictor.disturbances if isinstance(predictor, LinearPredictor) else ()
     for mine, theirs, what in (
         (predictor.states, episodes.states, "states"),

@@ -75,6 +75,46 @@ def test_what_is_no_state_is_refused_where_a_run_begins(stateful, bad):
         assert np.isfinite(each([0.1, 0.0], [0.0, 0.0]).u).all()
 
 
+GARBAGE = [None, 7, float("nan"), object(), [1, 2], [[1], [2, 3]], np.full((2, 2), np.nan), b"x", {1: 2}, len]
+KEPT = {  # what is no garbage in some places: a function for an excitation, None for what may be left out
+    "excitation": [len],
+    "noise": [None],
+    "embedding": [None],
+}
+EPISODES = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=4, steps=8)
+LIFTED = km.edmd(EPISODES, km.State())
+TAKES = {
+    "states": lambda bad: replace(LIFTED, states=bad),
+    "inputs": lambda bad: replace(LIFTED, inputs=bad),
+    "lifting": lambda bad: replace(LIFTED, lifting=bad),
+    "predictor": lambda bad: km.score(bad, EPISODES, 3),
+    "episodes": lambda bad: km.score(LIFTED, bad, 3),
+    "data": lambda bad: km.eigenfunctions(bad, km.State()),
+    "embedding": lambda bad: km.edmd(EPISODES, km.State(), embedding=bad),
+    "method": lambda bad: km.edmd(EPISODES, km.State(), method=bad),
+    "towards": lambda bad: km.edmd(EPISODES, km.State(), towards=bad),
+    "kernel": lambda bad: km.kernel_edmd(EPISODES, bad),
+    "noise": lambda bad: km.Feedback([[1.0, 2.0]], bad),
+    "F": lambda bad: km.StepMap(bad, 0.1),
+    "dynamics": lambda bad: km.discretize(bad, 0.1),
+    "excitation": lambda bad: km.collect(PLANT, [[0.0, 0.0]], bad, episodes=1, steps=2),
+    "names": lambda bad: km.Expressions(lambda x: [x[0]], bad),
+    "online": lambda bad: km.OnlineEDMD(km.State(), dt=0.1, states=bad, inputs=("u",)),
+    "black box": lambda bad: km.black_box(lambda x, u: x, dt=0.1, states=bad, inputs=("u",)),
+    "folder": lambda bad: km.export(km.KoopmanMPC(LIFTED, PENDULUM.cost), bad),
+    "problems": lambda bad: km.sweep(bad, ["lqr"], folder="nowhere"),
+    "store": lambda bad: km.sweep([PENDULUM], ["lqr"], folder=bad),
+}
+
+
+@pytest.mark.parametrize("where", TAKES)
+def test_garbage_is_refused_in_a_sentence(where):
+    for bad in GARBAGE:
+        if not any(bad is kept for kept in KEPT.get(where, [])):
+            with pytest.raises(km.KoopmpcError):
+                TAKES[where](bad)
+
+
 @pytest.mark.parametrize("settings", ["max_iter", [("max_iter", 5)], 5])
 def test_settings_of_a_solver_are_given_by_name(model, settings):
     with pytest.raises(km.errors.DataError, match=r"settings is a \w+, expected a Mapping; pass the solver's own by"):

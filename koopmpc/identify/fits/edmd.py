@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.linalg import sqrtm
 
+from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
@@ -50,11 +51,11 @@ def fit(
         What the ridge pulls to, as in `edmd`.
     """
     ridge = ridge_of(ridge)
-    if towards not in ("zero", "affine"):
+    if not checks.among(towards, ("zero", "affine")):
         raise DataError(f'towards is {towards!r}; pass "zero" or "affine"')
     if towards == "affine" and rank is not None:
         raise DataError('towards="affine" tells columns apart, and rank mixes them; pass one of the two')
-    if method not in _WORDS:
+    if not checks.among(method, _WORDS):
         raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
     if method != "ls" and ridge != 0:
         raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
@@ -311,5 +312,5 @@ def edmd(
     >>> model.rollout([0.5, 0.0], [[0.0], [1.0]]).shape  # x_0 … x_2
     (3, 2)
     """
-    regression = read(episodes, lifting, embedding, "edmd", noisy=method != "ls", **options)
+    regression = read(episodes, lifting, embedding, "edmd", noisy=not checks.among(method, ("ls",)), **options)
     return linear_predictor(regression, fit(regression, ridge=ridge, rank=rank, method=method, towards=towards))

@@ -81,7 +81,8 @@ def eigenfunctions(
     Kaiser, Kutz & Brunton, "Data-driven discovery of Koopman eigenfunctions for control", Mach. Learn.: Sci.
     Technol. 2, 2021. Sparse vectors in a subspace: Qu, Sun & Wright, NIPS 27, 2014.
     """
-    if by not in ("steps", "derivatives"):
+    checks.kind(episodes, "episodes", Episodes, "collect or load some")
+    if not checks.among(by, ("steps", "derivatives")):
         raise DataError(f'by is {by!r}; pass "steps" or "derivatives"')
     if growth < 1:
         raise DataError(f"growth is {growth:g}; pass a factor of at least 1")

@@ -84,7 +84,7 @@ def kernel_edmd(
     Williams, Rowley & Kevrekidis, "A kernel-based method for data-driven Koopman spectral analysis", J. Comput. Dyn. 2,
     2015. Nyström: Williams & Seeger, NIPS 13, 2001; for the Koopman operator Meanti et al., NeurIPS 36, 2023.
     """
-    if kernel not in ("polynomial", "gaussian"):
+    if not checks.among(kernel, ("polynomial", "gaussian")):
         raise DataError(f'kernel is {kernel!r}; pass "polynomial" or "gaussian"')
     checks.count(landmarks, "landmarks")
     source = source_of(episodes)

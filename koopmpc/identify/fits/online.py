@@ -82,10 +82,11 @@ class OnlineEDMD:
         ridge: Ridge = 0.0,
         keep: float = 1e-6,
     ) -> None:
-        self._lifting = lifting_of(lifting).bind(tuple(states))
+        self._lifting = lifting_of(lifting).bind(checks.texts(states, "states"))
         self._full = row_columns(self._lifting, (), bilinear=False).full
         self._psi, self._pair = buffered(self._full), np.empty((2, self._full.nz))  # for single pairs
-        self._inputs, self._disturbances = tuple(inputs), tuple(disturbances)
+        self._inputs = checks.texts(inputs, "inputs")
+        self._disturbances = checks.texts(disturbances, "disturbances")
         self._dt = checks.positive(dt, "dt", "s")
         self._ridge: Ridge = ridge_of(ridge)
         factor = checks.positive(forgetting, "forgetting")

@@ -93,6 +93,7 @@ def second_moments(
     """
     source = source_of(episodes)
     if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
         embedding = embedding.fitted(source.states, source.inputs)
         source = embedding.source(source)
     bound = lifting_of(lifting).bind(source.states)
