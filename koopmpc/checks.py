@@ -150,7 +150,7 @@ def texts(given: object, what: str) -> tuple[str, ...]:
     DataError
         It is a single text, or holds what is no text.
     """
-    found = tuple(cast("Sequence[object]", given)) if isinstance(given, Sequence | np.ndarray) else (None,)
+    found = tuple(cast("Iterable[object]", given)) if isinstance(given, Iterable) else (None,)
     if isinstance(given, str) or not all(isinstance(name, str) for name in found):
         raise DataError(f"{what} is {given!r}; pass a tuple of names")
     return cast("tuple[str, ...]", found)

@@ -161,3 +161,11 @@ print(checks.count(np.int64(3), "steps"))
         ),
         "3",
     ]
+
+
+def test_names_come_in_anything_that_holds_texts_in_order():
+    for held in (["a", "b"], ("a", "b"), np.array(["a", "b"]), {"a": 1, "b": 2}, iter("ab")):
+        assert checks.texts(held, "states") == ("a", "b")
+    for bad in ("ab", None, 3, b"ab", [1, "b"], {1: "a"}):
+        with pytest.raises(km.errors.DataError, match=r"states is .*; pass a tuple of names"):
+            checks.texts(bad, "states")
