@@ -57,7 +57,7 @@ def test_eigenvalues_that_crowd_are_drawn_closer() -> None:
 
 def test_a_bilinear_predictor_has_a_spectrum_too() -> None:
     model = km.BilinearPredictor(
-        np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), km.State(), 0.1, "ab", "u"
+        np.eye(2) / 2, np.ones((2, 1)), np.zeros((1, 2, 2)), np.eye(2), km.State(), 0.1, ("a", "b"), ("u",)
     )
     assert _named(km.plot.spectrum(model).axes[0], "eigenvalues").get_xdata() == pytest.approx([0.5, 0.5])
 
