@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import ALONE, LogFault, Log, Place, fitted, information, listed
+from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, fitted, information, listed
 
 _LATEST = 8  # steps by which a signal is looked for
 _ENOUGH = 200  # rows without which no lag is looked for
@@ -73,15 +73,21 @@ def rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> Row
     count = 0
     for episode in log.data:
         T = len(episode)
-        if T < 2 * margin + 3:
+        if 2 * margin + 3 > T:
             continue
         k = np.arange(margin + 1, T - margin)
         moved = np.zeros(nx + log.data.nu, dtype=np.intp)
         for shift in shifts:
             moved[shift.column] += shift.steps
+
         def states(at: np.ndarray, X: np.ndarray = episode.X, moved: np.ndarray = moved) -> np.ndarray:
             return np.stack([X[at + moved[i], i] for i in range(nx)], axis=1)
-        U = np.stack([episode.U[k + moved[nx + j], j] for j in range(log.data.nu)], axis=1) if log.data.nu else episode.U[k]
+
+        U = (
+            np.stack([episode.U[k + moved[nx + j], j] for j in range(log.data.nu)], axis=1)
+            if log.data.nu
+            else episode.U[k]
+        )
         parts.append((states(k), U, states(k - 1), states(k + 1)))
         count += len(k)
         if count > _ROWS:
@@ -97,9 +103,7 @@ def won(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]
     return float((information(other, log.fine) - information(E, log.fine)).min())
 
 
-def better(
-    log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN
-) -> bool:
+def better(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN) -> bool:
     """Return True where `other` predicts better than `E` by more than chance, and in nearly all parts of the log."""
     parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
     agree = sum(won(log, a, b) > 0 for a, b in parts)
@@ -226,7 +230,9 @@ def _by_one_row(log: Log) -> Shift | None:
     if won(log, fitted(log.regressors(plain.X), (plain.after - plain.X) / log.size), E) < _GAIN:
         return None
     best, most = None, _OWN_ONE_ROW
-    for shift in (Shift(i, n) for i in range(log.data.nx if log.data.nx > 1 else 0) for n in range(1, _ONE_ROW_LATEST + 1)):
+    for shift in (
+        Shift(i, n) for i in range(log.data.nx if log.data.nx > 1 else 0) for n in range(1, _ONE_ROW_LATEST + 1)
+    ):
         other = rows(log, (shift,)).one_row_residuals(log)
         i = shift.column
         pairs = zip(np.array_split(E[:, i], _BLOCKS), np.array_split(other[:, i], _BLOCKS), strict=True)

@@ -12,7 +12,7 @@ from koopmpc.validate.logs.alignment import ending, jumps, late
 from koopmpc.validate.logs.changes import midway
 from koopmpc.validate.logs.clocks import clock_faults
 from koopmpc.validate.logs.inputs import constant, excitation, feedback, together, without_effect
-from koopmpc.validate.logs.log import LogFault, Log, Place, runs
+from koopmpc.validate.logs.log import Log, LogFault, Place, runs
 from koopmpc.validate.logs.values import (
     coarse,
     held,

@@ -11,13 +11,13 @@ Rousseeuw & Van Driessen, "Computing LTS regression for large data sets", Data M
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import LogFault, Log, Place, episodes_of_places, solved
+from koopmpc.validate.logs.log import Log, LogFault, Place, episodes_of_places, solved
 
 _SEGMENTS = 40
 _SHORTEST = 30  # rows of a segment
@@ -107,7 +107,8 @@ def midway(log: Log) -> Iterator[LogFault]:
             undone = change.errors(law, *pairs[s])
             gain = float((np.clip(errors[s], spread, None) - np.clip(undone, spread, None)).mean())
             back = undone.max() < spread + _BACK + change.charged and gain > _MOST * most[s]
-            if gain > (_SHIFTED if change.kind == "offset change" else _GAIN) and back and gain * len(pairs[s][1]) > _SURE:
+            least = _SHIFTED if change.kind == "offset change" else _GAIN
+            if gain > least and back and gain * len(pairs[s][1]) > _SURE:
                 won += gain * len(pairs[s][1])
                 which.append(s)
         if len(which) == 1 and change.chosen:
@@ -136,7 +137,7 @@ def _segments(log: Log) -> list[Place]:
     for e, episode in enumerate(log.data):
         count = max(len(episode) // longest, 1)
         edges = np.linspace(0, len(episode), count + 1).astype(int)
-        made += [Place(e, int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        made += [Place(e, int(a), int(b)) for a, b in pairwise(edges)]
     return [place for place in made if place.last - place.first >= _SHORTEST]
 
 
@@ -189,13 +190,27 @@ def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change
     for j, name in enumerate(data.inputs):
         yield Change("input sign", (name,), f"{short(name)} has the other sign", _scaled_input(j, -1.0), chosen=False)
     if data.nu > 1:
-        yield Change("input sign", data.inputs, "every input has the other sign", _scaled_input(slice(None), -1.0), chosen=False)
+        yield Change(
+            "input sign", data.inputs, "every input has the other sign", _scaled_input(slice(None), -1.0), chosen=False
+        )
     for i, j in combinations(range(data.nx), 2):
         names = data.states[i], data.states[j]
-        yield Change("swapped sensors", names, f"{short(names[0])} and {short(names[1])} are swapped", _swapped(i, j, True), chosen=False)
+        yield Change(
+            "swapped sensors",
+            names,
+            f"{short(names[0])} and {short(names[1])} are swapped",
+            _swapped(i, j, True),
+            chosen=False,
+        )
     for i, j in combinations(range(data.nu), 2):
         names = data.inputs[i], data.inputs[j]
-        yield Change("swapped inputs", names, f"{short(names[0])} and {short(names[1])} are swapped", _swapped(i, j, False), chosen=False)
+        yield Change(
+            "swapped inputs",
+            names,
+            f"{short(names[0])} and {short(names[1])} are swapped",
+            _swapped(i, j, False),
+            chosen=False,
+        )
     for said, factor in _FACTORS.items():
         for up, text in ((factor, f"{said} times as large"), (1 / factor, f"{said} times as small")):
             for i, name in enumerate(data.states):
@@ -210,7 +225,13 @@ def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change
             continue
         yield Change("offset change", (name,), f"{short(name)} is {b:+.3g} off", _moved(i, -b))
     for r in (2, 3, 4):  # in r steps a push has moved a speed r times as far, and a position r² times
-        yield Change("mixed sampling", (), f"rows are {r} times as far apart ({r * data.dt:.3g} s)", _slower(r), 2 * float(np.log(r)))
+        yield Change(
+            "mixed sampling",
+            (),
+            f"rows are {r} times as far apart ({r * data.dt:.3g} s)",
+            _slower(r),
+            2 * float(np.log(r)),
+        )
         yield Change("mixed sampling", (), f"rows are {r} times as close ({data.dt / r:.3g} s)", _faster(r))
 
 

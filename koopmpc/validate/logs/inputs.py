@@ -8,7 +8,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import short
 from koopmpc.validate.identifiability import persistency
 from koopmpc.validate.logs.alignment import better, rows
-from koopmpc.validate.logs.log import LogFault, Log, fitted, information
+from koopmpc.validate.logs.log import Log, LogFault, fitted, information
 from koopmpc.validate.text import percent
 
 _PAST = 10  # inputs of the past that may tell the next one
@@ -83,11 +83,14 @@ def without_effect(log: Log) -> Iterator[LogFault]:
             continue
         rest = [i for i in range(nu) if i != j]
         base = log.regressors(near.X)
-        kept = np.hstack([base, (near.before - log.center) / log.size, *(V[:, i::nu] / log.input_size[i] for i in rest)])
+        kept = np.hstack(
+            [base, (near.before - log.center) / log.size, *(V[:, i::nu] / log.input_size[i] for i in rest)]
+        )
         Y = (near.after - near.X) / log.size
         E, other = fitted(kept, Y), fitted(np.hstack([kept, own]), Y)
         chance = own.shape[1] * Y.shape[1] / (2 * len(Y))
-        if information(other, log.fine)[0] - information(E, log.fine)[0] < 4 * chance + 2e-4 and not better(log, E, other, 1e-3):
+        gain = information(other, log.fine)[0] - information(E, log.fine)[0]
+        if gain < 4 * chance + 2e-4 and not better(log, E, other, 1e-3):
             name = short(log.data.inputs[j])
             yield LogFault(
                 "input without effect",
@@ -119,7 +122,8 @@ def feedback(log: Log) -> Iterator[LogFault]:
     state = np.concatenate([x[_PAST + 1 : -1] for x in X])
     if len(now) < max(_ENOUGH, 4 * (past.shape[1] + state.shape[1])):
         return
-    V, own = (now - log.input_center) / log.input_size, (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
+    V = (now - log.input_center) / log.input_size
+    own = (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
     one, Z = np.ones((len(V), 1)), (state - log.center) / log.size
     left = (fitted(np.hstack([one, own]), V) ** 2).mean(axis=0)
     after = (fitted(np.hstack([one, own, Z]), V) ** 2).mean(axis=0)

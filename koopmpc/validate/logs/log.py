@@ -185,9 +185,7 @@ def solved(gram: Float[np.ndarray, "p p"], cross: Float[np.ndarray, "p n"]) -> F
     return np.linalg.solve(scaled, cross / norm[:, None]) / norm[:, None]
 
 
-def information(
-    E: Float[np.ndarray, "M n"], fine: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " two"]:
+def information(E: Float[np.ndarray, "M n"], fine: Float[np.ndarray, " n"]) -> Float[np.ndarray, " two"]:
     """Return −½ log det of the residuals' mean square, in nats a sample: the larger, the better the prediction.
 
     The first number counts all errors. The second takes errors below `fine` for as large as `fine`, so that it does not

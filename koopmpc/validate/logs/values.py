@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import ALONE, LogFault, Log, Place, episodes_of_places, listed, runs
+from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, episodes_of_places, listed, runs
 from koopmpc.validate.text import percent
 
 _GRID = 0.95  # share of a sensor's different values that stand on a grid
@@ -316,7 +316,10 @@ def _marked(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, 
         for e, episode in enumerate(log.data):
             column = episode.X[:, i]
             for a, b in runs(column == value):
-                before, after = column[a - 1] if a else column[min(b, len(column) - 1)], column[b] if b < len(column) else column[a - 1]
+                before, after = (
+                    column[a - 1] if a else column[min(b, len(column) - 1)],
+                    column[b] if b < len(column) else column[a - 1],
+                )
                 places.append(Place(e, int(a), int(b)))
                 sizes.append(min(abs(value - before), abs(value - after)))
         rows = sum(p.last - p.first for p in places)

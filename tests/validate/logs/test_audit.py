@@ -66,7 +66,10 @@ def test_a_late_input_is_told_with_the_delay_that_models_it():
     assert report.kinds == ("input delay",)
     assert report.delay == 2
     assert "voltage acts 2 steps late. Let the model see the past: embedding=km.Delay(2)." in str(report)
-    fit = lambda **how: km.score(km.edmd(data[:14], km.State() + km.Constant(), **how), data[14:], 10).total
+
+    def fit(**how):
+        return km.score(km.edmd(data[:14], km.State() + km.Constant(), **how), data[14:], 10).total
+
     assert fit(embedding=km.Delay(2)) < 0.5 * fit()  # the advice is worth something
 
 
