@@ -181,11 +181,12 @@ def measure(names: Sequence[str]) -> None:
         with TemporaryDirectory() as folder:
             rows = sweep([replace(problem, scene=_nothing)], folder=folder)  # drawing is what takes long
         found = standings(rows, [problem])
-        write_measured(found)
         for row in rows:
             if row.failure:
                 sys.stdout.write(f"{row.problem}:{row.case} {row.controller}: {row.failure}\n")
-        sys.stdout.write(f"{markdown(found)}\n")
+        if found[problem.name]:
+            write_measured(found)
+            sys.stdout.write(f"{markdown(found)}\n")
 
 
 if __name__ == "__main__":

@@ -172,6 +172,8 @@ def test_each_problem_of_the_list_has_its_number():
 
 @pytest.mark.slow
 def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(path: Path, tmp_path: Path):
+    if path.stem not in measured():
+        pytest.skip("a problem for other controllers than those of the table")
     problem, said = km.load_problem(path), measured()[path.stem]
     best, baseline = best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else BASELINE
     assert best is not None
