@@ -50,6 +50,7 @@ ALIASES: dict[str, str] = {"Row": "LeaderboardRow", "Storage": "Dissipation"}
 """Old name of a class → its name now: files of earlier versions name classes as they were called then."""
 
 _ROOMS = ("predict", "lifting", "data", "identify", "validate", "estimate", "control", "loop", "synthesis")
+_DOORS = ("koopmpc", *(f"koopmpc.{room}" for room in _ROOMS))
 
 
 class Value:
@@ -206,14 +207,14 @@ class Viewing:
 def class_of(name: str) -> type[Value] | None:
     """Return the Value of koopmpc that has this name, or had it once; None where there is none.
 
-    What a room serves is imported when it is first asked for. A class that is not known yet is therefore looked up in
-    the tables of the rooms: the name in the file only chooses among them.
+    What a package serves is imported when it is first asked for. A class that is not known yet is therefore looked up
+    in the tables of koopmpc and of its rooms: the name in the file only chooses among them.
     """
     name = ALIASES.get(name, name)
-    for room in _ROOMS:
+    for package in _DOORS:
         if name in Value._kinds:
             break
-        door = import_module(f"koopmpc.{room}")
+        door = import_module(package)
         if name in getattr(door, "__all__", ()):
             getattr(door, name)
     return Value._kinds.get(name)

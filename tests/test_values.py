@@ -1,7 +1,10 @@
 import importlib
 import json
 import pkgutil
+import subprocess
+import sys
 from dataclasses import dataclass, fields, replace
+from inspect import isabstract
 
 import numpy as np
 import pytest
@@ -285,3 +288,18 @@ def _run() -> km.Run:
         inputs=("u",),
         outputs=("a", "b"),
     )
+
+
+def test_a_fresh_process_knows_every_class_that_a_saved_model_or_controller_may_name():
+    families = [cls for cls in descendants(km.Lifting) if cls.__module__.startswith("koopmpc.lifting.")]
+    served = [getattr(km, name) for name in km.__all__]
+    values = [each for each in served if isinstance(each, type) and issubclass(each, Value)]
+    names = sorted({cls.__name__ for cls in families + values if not isabstract(cls)})
+    assert {"Eigenfunction", "LiftedKalman", "Feedback"} <= set(names)
+    code = f"from koopmpc.values import class_of; print([name for name in {names} if class_of(name) is None])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def descendants(cls):
+    return [each for direct in cls.__subclasses__() for each in (direct, *descendants(direct))]

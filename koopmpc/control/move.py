@@ -30,7 +30,7 @@ class Status(Enum):
     UNCONSTRAINED = 0  # the unconstrained optimum meets every limit
     OPTIMAL = 1  # a QP or NLP was solved to its tolerance
     SOFTENED = 2  # solved, and a soft limit gave way by more than the tolerance
-    SATURATED = 3  # a feedback law was clipped to the input limits
+    SATURATED = 3  # a feedback law was clipped to the limits of the inputs, or of their rates
     MAX_ITERATIONS = 4  # the solver ended before its tolerance
     TIME_LIMIT = 5  # the step took longer than it may
     INFEASIBLE = 6  # no plan meets the hard limits

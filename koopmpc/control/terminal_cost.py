@@ -104,7 +104,10 @@ def _given(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targets)
 
 
 class Tail(NamedTuple):
-    """The cost-to-go V(ξ) = ξᵀP ξ + 2 ξᵀp g + const, and the law u = −K ξ + v g of the step before it."""
+    """The cost-to-go V(ξ) = ξᵀP ξ + 2 ξᵀp g + const, and the law u = −K ξ + v g of its first step.
+
+    A tail without steps has the law of a step before it.
+    """
 
     P: Float[np.ndarray, "nx nx"]
     p: Float[np.ndarray, "nx ng"]
@@ -168,8 +171,8 @@ def learned_steps(
     misses in one step is of its states, further steps only make the tail follow the model's errors: modes that the
     plant does not have grow in it until they rule the plan. Both shares are root mean squares over the data, about
     their mean: that of the change is ‖Lᵀ(K⁺ − K)(z − z̄)‖ over ‖LᵀK⁺(z − z̄)‖, S = L Lᵀ, so that inputs count by what
-    they cost. The gain rests when the change is so small for as many steps as the model's point has entries, for a
-    weight may take that long to reach an input. The tail has N steps where this takes more than 10 N, and where the
+    they cost. The gain rests when the change is so small for as many steps in a row as ψ has arguments, for a weight
+    may take that long to reach an input. The tail has N steps where this takes more than 10 N, and where the
     model does not know its errors. It is shortened to a half, a quarter or none of that where the loop is better off
     on the re-lifted model, see `believed_steps`. `inverse` takes z into the coordinates of the stage, where these are
     others.

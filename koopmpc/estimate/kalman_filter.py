@@ -49,7 +49,7 @@ class Augmented:
 
 
 class FilterModel(NamedTuple):
-    """The data of a filter: the augmented system, the covariance P before a measurement, and that of y."""
+    """The data of a filter: the augmented system, the covariance P before a measurement, and R of the noise of y."""
 
     system: Augmented
     P: Float[np.ndarray, "n n"]
@@ -111,7 +111,10 @@ class KalmanFilter(Viewing):
         self._missed = 0
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Correct the state of `delay` steps ago with y, and predict it to the present with the inputs since then."""
+        """Correct the state of `delay` steps ago with y, and predict it to the present with the inputs since then.
+
+        False says that the estimate cannot be used: measurements have been missing for too long, or it has run away.
+        """
         if self._started and not self._delay:
             self._uw[: len(u)] = u
             if len(w):

@@ -112,7 +112,7 @@ def compiler() -> list[str] | None:
 
 
 def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
-    """Return F's machine code, from `cache` if it is there; without a cache nothing is left on disk.
+    """Return F's machine code, loaded from `cache` or compiled into it; without a cache nothing is left on disk.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
 
 
 def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
-    """Return the loaded machine code of this C, from `cache` if it is there; else nothing is left on disk.
+    """Return the machine code of this C, loaded from `cache` or compiled into it; without one nothing is left on disk.
 
     Raises
     ------

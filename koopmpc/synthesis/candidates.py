@@ -127,8 +127,8 @@ def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.ran
     """Return the candidates for an unknown plant: linear, polynomial, trigonometric, radial and random ones.
 
     A candidate is left out if it has more than 120 observables, more than 260 regressors, or fewer than 10 snapshot
-    pairs for each regressor. With delays the nonlinear observables are those of the present state; the past enters
-    linearly.
+    pairs for each regressor; 2 (nx + nu) regressors are always allowed, and so is [x, 1]. With delays the nonlinear
+    observables are those of the present state; the past enters linearly.
     """
     pairs = sum(len(episode) for episode in episodes)
     room = min(_REGRESSORS, max(pairs // _EACH, 2 * (episodes.nx + episodes.nu)))
@@ -185,7 +185,7 @@ def _angle(name: str) -> bool:
 
 
 def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Iterator[tuple[str, Lifting]]:
-    """Yield sines and cosines of the angles, alone and times the other states; without angles, those of all states."""
+    """Yield sines and cosines of the angles, alone and times the other states; or else of the states without a unit."""
     found, base = angles(states, X), State() + Constant()
     if found:
         which, where = found, ", ".join(short(states[i]) for i in found)
@@ -345,7 +345,7 @@ class Recipe(Value):
     def controller(
         self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False
     ) -> Designed:
-        """Return the controller of a model; one that is used `briefly` compiles no machine code of the model.
+        """Return the controller of a model; one that is used briefly (`brief`) compiles no machine code of the model.
 
         Raises
         ------
