@@ -61,11 +61,12 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         part = beside(file)
-        stream = _Stream(part, "wb" if part == file else "xb")
-        with discarded(part, file), io.BufferedWriter(stream) as buffered:
-            yield cast("BinaryIO", buffered)
-            buffered.flush()
-            settle(part, file, stream.fileno())
+        with discarded(part, file):  # before the file is there, so that no interrupt leaves it
+            stream = _Stream(part, "wb" if part == file else "xb")
+            with io.BufferedWriter(stream) as buffered:
+                yield cast("BinaryIO", buffered)
+                buffered.flush()
+                settle(part, file, stream.fileno())
     except Exception as error:
         failure = stream.failure if stream is not None else None
         if failure is None and not isinstance(error, OSError):

@@ -160,9 +160,11 @@ class Writer:
         self._u: np.ndarray | None = None
         self._names, self._reference = Names(), ReferenceScenes(about)
         self._plans: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # plans that look beyond what is written
-        self._file = None if path is None else LogFile(path, growing=growing)
+        self._file: LogFile | None = None
         self._rec: Any = None
         try:
+            with deferred():  # no interrupt between the file and its name leaves it behind
+                self._file = None if path is None else LogFile(path, growing=growing)
             self._rec = _new_recording(application_of(about))
         except BaseException:  # a Ctrl-C
             self.discard()
