@@ -370,6 +370,12 @@ def _begin(function: Callable[[Any], Any]) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
+def is_orphan() -> bool:
+    """Return whether this is a worker whose parent has ended; it ends soon itself."""
+    parent = parent_process()
+    return parent is not None and not parent.is_alive()
+
+
 def _end_with_parent() -> None:
     """End this worker when its parent has ended, killed perhaps: it would wait for tasks for ever."""
     parent = parent_process()

@@ -10,7 +10,7 @@ from textwrap import dedent
 import pytest
 
 import koopmpc as km
-from koopmpc.parallel import Workers, map_tasks
+from koopmpc.parallel import Workers, is_orphan, map_tasks
 from tests import tasks
 from tests.cluster import two_workers
 
@@ -115,7 +115,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     script.write_text(
         dedent(f"""
         import os, signal
-        from koopmpc.parallel import Workers, map_tasks
+        from koopmpc.parallel import Workers, is_orphan, map_tasks
         from tests import tasks
         if __name__ == "__main__":
             results = map_tasks(tasks.sleep, [({str(tmp_path / "pids")!r}, 0)] * 4, workers=2)
@@ -180,7 +180,7 @@ def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         dedent("""
-        from koopmpc.parallel import Workers, map_tasks
+        from koopmpc.parallel import Workers, is_orphan, map_tasks
         print(list(map_tasks(abs, [1, 2], workers=2)))
         """)
     )
@@ -201,7 +201,7 @@ def test_a_program_that_ends_at_once_leaves_no_lines_of_its_workers_semaphores(t
         dedent("""
         import os
 
-        from koopmpc.parallel import Workers, map_tasks
+        from koopmpc.parallel import Workers, is_orphan, map_tasks
 
         if __name__ == "__main__":
             results = map_tasks(abs, range(100), workers=2)
@@ -254,3 +254,33 @@ def test_without_dask_the_message_says_what_to_install(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(km.KoopmpcError, match=r"install it with: pip install '.+\[dask\]'"):
         list(map_tasks(tasks.square, [1], scheduler="local"))
+
+
+def test_a_worker_knows_that_its_parent_was_killed(tmp_path: Path) -> None:
+    assert not is_orphan()
+    script, told = tmp_path / "parent.py", tmp_path / "told"
+    script.write_text(
+        dedent(f"""
+        import os, signal, time
+        from multiprocessing import get_context
+        from pathlib import Path
+        from koopmpc.parallel import is_orphan
+
+        def worker():
+            assert not is_orphan()
+            os.kill(os.getppid(), signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
+            while not is_orphan():
+                time.sleep(0.01)
+            Path({str(told)!r}).write_text("an orphan")
+
+        if __name__ == "__main__":
+            process = get_context("spawn").Process(target=worker)
+            process.start()
+            process.join()
+        """)
+    )
+    subprocess.run([sys.executable, script], timeout=60, check=False)
+    deadline = time.monotonic() + 20
+    while not told.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert told.read_text() == "an orphan"

@@ -1,6 +1,7 @@
 """The store of a sweep: what was asked for, a line for each finished run, and the table that is made of them.
 
 A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
+It holds its file locked meanwhile: a sweep that goes on waits for workers which outlive the sweep that was killed.
 Each line, and the manifest, holds a checksum of the rest: one that no longer matches is told, and left out. The table,
 results.parquet, is written beside and renamed, now and then and at the end; the lines are what counts.
 """
@@ -9,6 +10,7 @@ import errno
 import json
 import os
 import platform
+import time
 import warnings
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -21,10 +23,12 @@ from zlib import crc32
 from koopmpc import disk
 from koopmpc.bench.results import RunRow, record_of, row_of
 from koopmpc.errors import LogError, ProblemError
+from koopmpc.parallel import is_orphan
 
 MANIFEST, ROWS = "sweep.json", "rows"
 FORMAT = "koopmpc-sweep-1"
 _LINE, _SEAL = json.JSONEncoder(), "crc32"
+_OUTLIVES = 2.0  # time that a worker gets to end after the sweep that it works for [s]
 
 
 class Journal:
@@ -40,10 +44,13 @@ class Journal:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("ab", buffering=0)
-            if self._file.tell():
-                self._write(b"\n")  # the last line was torn, perhaps, when a worker was killed
         except OSError as error:
             raise disk.refused(self.path, error) from error
+        _lock(self._file)
+        if is_orphan():  # a sweep that goes on may not have seen the lock
+            raise ProblemError(f"the sweep in {self.path.parent.parent} was killed")
+        if self._file.tell():
+            self._write(b"\n")  # the last line was torn, perhaps, when a worker was killed
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
@@ -163,7 +170,7 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
     except OSError as error:
         raise disk.refused(path, error) from error
     with file:
-        _claim(file.fileno(), folder)
+        _claim(file, folder)
         file.seek(0)
         text = file.read()
         try:
@@ -184,17 +191,34 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
         yield known
 
 
-def _claim(number: int, folder: Path) -> None:
-    """Lock the manifest, as long as this process lives."""
+def _claim(manifest: FileIO, folder: Path) -> None:
+    """Lock the manifest, as long as this process lives, once the workers of a sweep that was killed have ended.
+
+    Raises
+    ------
+    ProblemError
+        Another sweep is at work in the folder, or a worker of one.
+    """
+    busy, ends = not _lock(manifest), time.monotonic() + _OUTLIVES
+    for path in sorted((folder / ROWS).glob("*.jsonl")):
+        with path.open("ab", buffering=0) as file:
+            while not busy and not _lock(file):
+                time.sleep(0.01)
+                busy = time.monotonic() >= ends
+    if busy:
+        raise ProblemError(f"another process runs a sweep in {folder}; wait for it, or pass another folder")
+
+
+def _lock(file: FileIO) -> bool:
+    """Lock the file until it is closed, and return whether no other process has it locked."""
     with suppress(ImportError):  # Windows has no fcntl
         import fcntl
 
         try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ProblemError(
-                f"another process runs a sweep in {folder}; wait for it, or pass another folder"
-            ) from error
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+    return True
 
 
 def manifest_of(folder: str | Path) -> dict[str, Any]:

@@ -227,3 +227,26 @@ def test_two_sweeps_at_once_in_one_folder_are_refused(problem, tmp_path):
             km.sweep([problem], ["lqr"], folder=tmp_path)
 
     assert len(km.sweep([problem], ["lqr"], folder=tmp_path, progress=second)) == 2
+
+
+def test_a_sweep_waits_for_the_worker_of_one_that_was_killed(problem, tmp_path):
+    pytest.importorskip("fcntl")
+    grid, folder = {**GRID, "starts": 1}, tmp_path / "kept"
+    expected = figures(km.sweep([problem], TWO, folder=folder, **grid))
+    hold = (
+        "import fcntl, sys, time\n"
+        f"file = open({str(next((folder / 'rows').glob('*.jsonl')))!r}, 'ab')\n"
+        "fcntl.flock(file, fcntl.LOCK_EX)\n"
+        "print('held', flush=True)\n"
+        "time.sleep(float(sys.argv[1]))\n"
+    )
+    for lives in (0.5, 60.0):
+        with subprocess.Popen([sys.executable, "-c", hold, str(lives)], stdout=subprocess.PIPE, text=True) as worker:
+            assert worker.stdout.readline() == "held\n"
+            if lives < 1.0:
+                assert figures(km.sweep([problem], TWO, folder=folder, **grid)) == expected
+                assert worker.poll() == 0
+            else:
+                with pytest.raises(km.errors.ProblemError, match="another process runs a sweep in"):
+                    km.sweep([problem], TWO, folder=folder, **grid)
+                worker.kill()
