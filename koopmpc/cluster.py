@@ -154,7 +154,7 @@ def _client(scheduler: str, workers: int | None) -> Generator[Any]:
             if scheduler.startswith(("tcp://", "tls://")):
                 _knock(scheduler)  # a Client without an answer needs 11 s to say so
             client = open_now.enter_context(Client(address, set_as_default=False, timeout=_ANSWER))
-        except (OSError, ValueError, MemoryError) as error:
+        except (OSError, ValueError, MemoryError) as error:  # MemoryError: another service's words were read as a size
             raise KoopmpcError(
                 f"no Dask scheduler answers at {scheduler} within {_ANSWER:g} s; start one with `dask scheduler`, "
                 'or pass "local"'

@@ -171,12 +171,11 @@ def test_each_problem_of_the_list_has_its_number():
 
 
 @pytest.mark.slow
-def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(path: Path, tmp_path: Path):
-    if path.stem not in measured():
-        pytest.skip("a problem for other controllers than those of the table")
-    problem, said = km.load_problem(path), measured()[path.stem]
+@pytest.mark.parametrize("name", sorted(measured()))
+def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(name: str, tmp_path: Path):
+    problem, said = km.load_problem(FILES[name]), measured()[name]
     best, baseline = best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else BASELINE
     assert best is not None
     rows = km.sweep([replace(problem, scene=lambda x, u: [])], [best, baseline], folder=tmp_path)
     assert [row.failure for row in rows if row.failure] == []
-    assert standings(rows, [problem])[path.stem][best].ratio == pytest.approx(said[best].ratio, rel=0.05)
+    assert standings(rows, [problem])[name][best].ratio == pytest.approx(said[best].ratio, rel=0.05)

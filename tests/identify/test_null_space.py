@@ -57,7 +57,9 @@ def shares(value):
     def integral(f):
         return quad(f, 0, DT, complex_func=True)[0] / DT
 
-    at = lambda s: np.exp(value * (DT - s))  # noqa: E731
+    def at(s):
+        return np.exp(value * (DT - s))
+
     return integral(lambda s: at(s) * (1 - s / DT)), integral(lambda s: at(s) * s / DT)
 
 

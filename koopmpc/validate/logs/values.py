@@ -316,10 +316,8 @@ def _marked(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, 
         for e, episode in enumerate(log.data):
             column = episode.X[:, i]
             for a, b in runs(column == value):
-                before, after = (
-                    column[a - 1] if a else column[min(b, len(column) - 1)],
-                    column[b] if b < len(column) else column[a - 1],
-                )
+                before = column[a - 1] if a else column[min(b, len(column) - 1)]
+                after = column[b] if b < len(column) else column[a - 1]
                 places.append(Place(e, int(a), int(b)))
                 sizes.append(min(abs(value - before), abs(value - after)))
         rows = sum(p.last - p.first for p in places)

@@ -164,7 +164,11 @@ def test_a_second_solve_has_what_the_first_one_has_left_of_the_time(monkeypatch)
     now, limits = iter(range(100)), []
     monkeypatch.setattr("koopmpc.control.solvers.osqp.perf_counter", lambda: float(next(now)))
     solver, own = box(), OSQP._run
-    never = lambda self, v, y, limit: limits.append(limit) or replaced(own(self, v, y, limit))  # noqa: E731
+
+    def never(self, v, y, limit):
+        limits.append(limit)
+        return replaced(own(self, v, y, limit))
+
     monkeypatch.setattr(OSQP, "_run", never)
     found = solver.solve(np.zeros(3), np.zeros(3), 10.0)
     assert limits == [10.0, 9.0]

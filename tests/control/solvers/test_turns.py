@@ -96,7 +96,10 @@ def test_the_one_that_had_the_answer_is_asked_first_until_a_plan_meets_all_limit
     second, b = scripted("second", True, GOOD, GOOD, GOOD)
     third, c = scripted("third", False)
     solver = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {}), Choice(third, {}, late=True)])
-    solves = lambda *lists: [sum(each[0] == "solve" for each in asked) for asked in lists]  # noqa: E731
+
+    def solves(*lists):
+        return [sum(each[0] == "solve" for each in asked) for asked in lists]
+
     found, _ = solver.solve(PLAN, None, None)
     assert (found.solver, found.iterations) == ("second", 12)
     assert solves(a, b) == [1, 1]
