@@ -288,7 +288,7 @@ def _stationary(
     """Return P = F (P − P Mᵀ(M P Mᵀ + R)⁻¹ M P) Fᵀ + Q, the covariance before a measurement."""
     try:
         P = np.asarray(scipy.linalg.solve_discrete_are(F.T, M.T, Q, R))
-    except np.linalg.LinAlgError as error:
+    except ValueError as error:  # SciPy's own where the pencil is too far from triangular, and LinAlgError
         raise DataError(
             f"no stationary filter was found ({error}); the disturbance is hardly detectable: measure more, or drop "
             "observables"

@@ -331,3 +331,22 @@ def test_of_all_equilibria_that_hold_a_reference_the_least_is_found() -> None:
     np.testing.assert_allclose(each.slope(each.linearise(near.x, near.u)), [[-0.5], [-0.5]], atol=1e-6)
     followed = each.follow(near, np.array([3.001]), np.array([1e-3]))
     np.testing.assert_allclose(followed.u, [0.75 - 0.00025, 0.75 - 0.00025], atol=1e-6)
+
+
+def test_an_equilibrium_that_was_not_found_is_looked_for_again_after_a_reset(monkeypatch):
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, 0.05)
+    controller, fresh = (km.BilinearMPC(plant, problem.cost, km.Limits(u_min=-10, u_max=10), 10) for _ in range(2))
+    find, asked = Equilibria.find, []
+
+    def lost(self, *arguments, **options):
+        asked.append(arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Equilibria, "find", lost)
+        moves = [controller([0.3, 0.0], [0.0, 0.0]) for _ in range(3)]
+    assert len(asked) == 1  # it is not looked for at each step
+    assert all(np.isfinite(move.u).all() for move in moves)
+    assert Equilibria.find is find
+    controller.reset()
+    assert np.array_equal(controller([0.3, 0.0], [0.0, 0.0]).u, fresh([0.3, 0.0], [0.0, 0.0]).u)

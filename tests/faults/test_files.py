@@ -2,6 +2,7 @@
 
 import io
 import random
+import subprocess
 import warnings
 import zipfile
 from pathlib import Path
@@ -225,15 +226,13 @@ def test_members_that_nobody_needs_are_not_read(tmp_path: Path) -> None:
 
 def test_a_reader_that_ends_its_process_ends_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A log that is not as it was written is read apart; here the child is killed as an abort would kill it."""
-    from koopmpc.recording.format import rerun_reader
-
     path = tmp_path / "run.rrd"
     km.record(make_run(T=20), path)
     path.write_bytes(path.read_bytes()[:-100])
     crash = tmp_path / "crash.py"
     crash.write_text("import os\nos.abort()\n")
-    run = rerun_reader.subprocess.run
-    monkeypatch.setattr(rerun_reader.subprocess, "run", lambda command, **more: run([command[0], str(crash)], **more))
+    run = subprocess.run
+    monkeypatch.setattr(subprocess, "run", lambda command, **more: run([command[0], str(crash)], **more))
     with pytest.raises(km.errors.LogError, match=r"run\.rrd is damaged, beyond what can be read"):
         km.load_run(path)
 

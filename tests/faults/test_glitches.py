@@ -128,26 +128,6 @@ def test_a_plant_that_has_changed_is_learned_all_the_same():
     assert learner.outliers < 30
 
 
-def test_an_equilibrium_that_was_not_found_is_looked_for_again_after_a_reset(monkeypatch):
-    from koopmpc.control.nonlinear.equilibrium import Equilibria
-
-    controller = km.BilinearMPC(PLANT, PENDULUM.cost, km.Limits(u_min=-10, u_max=10), 10)
-    fresh = km.BilinearMPC(PLANT, PENDULUM.cost, km.Limits(u_min=-10, u_max=10), 10)
-    find, asked = Equilibria.find, []
-
-    def lost(self, *arguments, **options):
-        asked.append(arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Equilibria, "find", lost)
-        moves = [controller([0.3, 0.0], [0.0, 0.0]) for _ in range(3)]
-    assert len(asked) == 1  # it is not looked for at each step
-    assert all(np.isfinite(move.u).all() for move in moves)
-    assert Equilibria.find is find
-    controller.reset()
-    assert np.array_equal(controller([0.3, 0.0], [0.0, 0.0]).u, fresh([0.3, 0.0], [0.0, 0.0]).u)
-
-
 class Drift(km.Dynamics):
     """Two integrators that no input within the limits brings to rest."""
 

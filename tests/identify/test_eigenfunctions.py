@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import koopmpc as km
-from koopmpc.identify.fits.null_space import EigenfunctionRows
 
 
 @dataclass(frozen=True)
@@ -195,15 +194,3 @@ def test_an_error_as_large_as_the_tolerance_is_within_it(one):
     again = km.eigenfunctions(one, QUARTIC, tolerance=found[0].error)
     assert again[0].error == found[0].error
     assert len(again) + len(again.rejected) == len(found) + len(found.rejected)
-
-
-@pytest.mark.parametrize("by", ["steps", "derivatives"])
-def test_the_pairs_of_the_explicit_regression_come_in_the_order_of_their_residuals(forced, by):
-    rows = EigenfunctionRows.read(forced, (km.State() + km.Monomials(3)).bind(forced.states), by)
-    left = []
-    for value, xi in rows.explicit(20):
-        M, F = rows.parts(value)
-        beta = np.linalg.lstsq(F, M @ xi, rcond=None)[0]
-        left.append(np.linalg.norm(M @ xi - F @ beta) / np.linalg.norm(rows.G @ xi))
-    assert len(left) > 3
-    np.testing.assert_allclose(left, np.sort(left), rtol=1e-6)

@@ -348,3 +348,16 @@ def test_by_default_every_fourth_episode_is_held_out_or_the_last_quarter_of_each
     test = data.with_episodes([km.Episode(X=e.X[18:], U=e.U[18:]) for e in three])
     asked = km.eigenfunctions(train, ALL, eigenvalue=-1.0, held_out=test)
     assert told(km.eigenfunctions(three, ALL, eigenvalue=-1.0)) == told(asked)
+
+
+@pytest.mark.parametrize("by", ["steps", "derivatives"])
+def test_the_pairs_of_the_explicit_regression_come_in_the_order_of_their_residuals(by):
+    data = wandering(9)
+    rows = EigenfunctionRows.read(data, (km.State() + km.Monomials(3)).bind(data.states), by)
+    left = []
+    for value, xi in rows.explicit(20):
+        M, F = rows.parts(value)
+        beta = np.linalg.lstsq(F, M @ xi, rcond=None)[0]
+        left.append(np.linalg.norm(M @ xi - F @ beta) / np.linalg.norm(rows.G @ xi))
+    assert len(left) > 3
+    np.testing.assert_allclose(left, np.sort(left), rtol=1e-6)

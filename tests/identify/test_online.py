@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.moments.sliding import Forgetting, Rival
 from tests.identify.plants import brute_force, random_episodes
 
 LIFTING = km.State() + km.Constant() + km.Monomials(2)
@@ -325,27 +324,6 @@ def test_wrong_forgetting_windows_and_shapes_are_refused() -> None:
     pushed = km.OnlineEDMD(km.State(), dt=0.1, states=("a",), disturbances=("w",))
     with pytest.raises(km.errors.DataError, match="1 measured disturbances; pass w"):
         pushed.learn([1], [], [1])
-
-
-@pytest.mark.parametrize(("off", "takes_over"), [(0.0012, True), (0.0008, False)])
-def test_a_rival_takes_over_where_the_first_factor_is_off_by_more_than_a_thousandth(off, takes_over):
-    rng, K = np.random.default_rng(0), np.array([[1.0], [-0.5]])
-    rival = Rival(Forgetting(3, 2, 0.9, 0.01), 2, 10.0)
-    first = K * (1 + off)  # t is forecast as (1 + off) t: off by this share of it
-    answers = [rival.push(np.hstack([r, r @ K]), first) for r in rng.normal(size=(200, 1, 2))]
-    assert any(answers) == takes_over
-
-
-def test_a_rival_judges_by_the_second_half_of_each_of_its_periods():
-    rng, K = np.random.default_rng(0), np.array([[1.0], [-0.5]])
-    for begin, takes_over in ((0, False), (50, True)):  # where the first factor is off
-        rival = Rival(Forgetting(3, 2, 0.9, 0.01), 2, 10.0)
-        answers = [
-            rival.push(np.hstack([r, r @ K]), K * (1 + 0.1 * (begin <= k % 100 < begin + 50)))
-            for k, r in enumerate(rng.normal(size=(300, 1, 2)))
-        ]
-        assert any(answers) == takes_over
-        assert all(k % 100 == 99 for k, yes in enumerate(answers) if yes)  # at the end of a period
 
 
 @pytest.mark.parametrize(("states", "outliers"), [(1, 1), (2, 0)])

@@ -4,15 +4,16 @@ import itertools
 import math
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.loop import realtime as module
 from tests.loop.test_realtime import Counting, Here
 
 DT = 0.1
+REAL_SLEEP = time.sleep
 
 
 class Clock:
@@ -36,7 +37,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(time, "monotonic", clock.monotonic)
+    monkeypatch.setattr(time, "sleep", clock.sleep)
     return clock
 
 
@@ -136,20 +138,30 @@ def test_a_measurement_that_step_gives_back_is_used_unless_the_plant_is_read(clo
     assert [None if step.y_next is None else step.y_next[0] for step in seen] == [None, 70.0, None, 70.0]
 
 
-@pytest.mark.parametrize(("given", "patience"), [(None, 1.0), (0.7, 0.7)])
-def test_the_watchdog_waits_ten_steps_unless_it_is_told(clock, monkeypatch, given, patience):
-    made, own = [], module._Watchdog
-    monkeypatch.setattr(module, "_Watchdog", lambda *a, **kw: made.append(a[2]) or own(*a, **kw))
-    km.realtime(Spending(clock, {}), Here(DT), dt=DT, reference=[0.0], steps=1, watchdog=given)
-    assert made == [patience]
+class Stuck(Counting):
+    """A controller that lasts `spent` seconds of the clock, and on the machine until it is given up or `most` [s]."""
+
+    def __init__(self, clock, dt, spent, most):
+        super().__init__(dt)
+        self.clock, self.spent, self.most = clock, spent, most
+
+    def __call__(self, y, reference, applied=None, w=None):
+        self.clock.now += self.spent
+        for _ in range(round(self.most / 5e-3)):
+            REAL_SLEEP(5e-3)
+        return super().__call__(y, reference)
 
 
-def test_the_watchdog_waits_a_fifth_of_a_second_at_least(clock, monkeypatch):
-    made, own = [], module._Watchdog
-    monkeypatch.setattr(module, "_Watchdog", lambda *a, **kw: made.append(a[2]) or own(*a, **kw))
-    controller, plant = Counting(0.01), Here(0.01)
-    km.realtime(controller, plant, dt=0.01, reference=[0.0], steps=1)
-    assert made == [0.2]
+@pytest.mark.parametrize(("dt", "given", "patience"), [(DT, None, 1.0), (DT, 0.7, 0.7), (0.01, None, 0.2)])
+def test_the_watchdog_waits_ten_steps_and_a_fifth_of_a_second_at_least_unless_it_is_told(clock, dt, given, patience):
+    for spent, most, ended in (
+        (0.99 * patience, 0.2 * patience, "done"),  # it looks up each eighth of its patience
+        (1.01 * patience, 20.0, f"watchdog: the controller did not return within {patience:.3g} s"),
+    ):
+        controller = Stuck(clock, dt, spent, most)
+        paced = km.realtime(controller, Here(dt), dt=dt, reference=[0.0], steps=1, watchdog=given)
+        assert paced.ended == ended
+        assert paced.steps == (ended == "done")
 
 
 def test_a_simulated_loop_takes_as_long_as_its_plant_would(clock):

@@ -36,22 +36,34 @@ def test_matrices_and_a_lifting_by_hand_are_a_model_in_one_line():
     assert np.abs(_controlled(model).X[-1]).max() < 1e-3
 
 
-def test_a_function_of_numbers_is_enough_for_koopman_mpc_and_says_where_it_is_not(tmp_path):
-    from koopmpc.predict.peers import Numeric
+class Pipeline:
+    """What km.from_peer reads of a fitted KoopmanPipeline of pykoop: [A B] and a function of rows, no formula."""
 
+    min_samples_ = n_inputs_in_ = n_inputs_out_ = 1
+
+    def __init__(self, lift, A, B, n_states=2):
+        self.lift, self.n_states_in_, self.n_states_out_ = lift, n_states, len(A)
+        self.regressor_ = type("Regressor", (), {"coef_": np.hstack([A, B]).T})
+
+    def lift_state(self, X, episode_feature):
+        assert not episode_feature
+        return self.lift(X)
+
+
+def test_a_lifting_of_numbers_is_enough_for_koopman_mpc_and_says_where_it_is_not(tmp_path):
     fitted = km.edmd(_data(), km.State() + km.Monomials(2))
-    psi = Numeric(
-        lambda X: np.column_stack([X, X[:, 0] ** 2, X[:, 0] * X[:, 1], X[:, 1] ** 2]), ("a", "b", "aa", "ab", "bb")
-    )
-    model = km.LinearPredictor(fitted.A, fitted.B, fitted.C, psi, 0.1, ["a [m]", "b [m/s]"], ["u [N]"])
+    squares = lambda X: np.column_stack([X, X[:, 0] ** 2, X[:, 0] * X[:, 1], X[:, 1] ** 2])  # noqa: E731
+    names = {"dt": 0.1, "states": ["a [m]", "b [m/s]"], "inputs": ["u [N]"]}
+    model = km.from_peer(Pipeline(squares, fitted.A, fitted.B), **names)
+    np.testing.assert_allclose(_controlled(model).U[0], _controlled(fitted).U[0], rtol=0.05)
     assert np.abs(_controlled(model).X[-1]).max() < 1e-3
     with pytest.raises(km.errors.ObservableError, match=r"write it with km\.Expressions"):
         model.step_map()
     with pytest.raises(km.errors.DataError, match="which no file holds"):
         model.save(tmp_path / "model.npz")
-    wrong = Numeric(lambda X: X, ("a", "b", "c")).bind(["a", "b"])
+    wrong = km.from_peer(Pipeline(lambda X: X, fitted.A[:3, :3], fitted.B[:3]), **names)
     with pytest.raises(km.errors.DataError, match=r"returns shape \(1, 2\) for 1 states, expected \(1, 3\)"):
-        wrong([0.0, 0.0])
+        wrong.lift([0.0, 0.0])
 
 
 def test_a_pipeline_of_pykoop_is_a_model_in_one_line():
@@ -190,11 +202,9 @@ def test_what_is_not_fitted_is_told():
 
 
 def test_one_measured_state_is_lifted_by_the_function_and_is_nan_where_it_is_far_off():
-    from koopmpc.predict.peers import Numeric
-
-    psi = Numeric(lambda X: np.column_stack([X[:, 0], X[:, 0] * X[:, 1]]), ("a", "ab")).bind(["a", "b"])
-    measured = psi.measured()
-    np.testing.assert_array_equal(np.array(measured([2.0, 3.0])).ravel(), [2, 6])
+    product = Pipeline(lambda X: np.column_stack([X, X[:, 0] * X[:, 1]]), 0.9 * np.eye(3), np.ones((3, 1)))
+    measured = km.from_peer(product, dt=0.1).lifting.measured()
+    np.testing.assert_array_equal(np.array(measured([2.0, 3.0])).ravel(), [2, 3, 6])
     for bad in ([np.nan, 1.0], [1.0, 2e30], [-2e30, 1.0]):
         assert np.isnan(np.array(measured(bad))).all()
     assert np.isfinite(np.array(measured([1.0, 0.5e30]))).all()

@@ -1,15 +1,16 @@
-"""Several runs or curves in one set of plots, and the animation of a log as a video."""
+"""Several runs or curves in one set of plots, a page of words and pictures, the animation of a log as a video."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.figure
 import numpy as np
 import pytest
 
 import koopmpc as km
 from koopmpc.loop.metrics import running_cost
 from koopmpc.recording.format.rrd import read_columns
-from koopmpc.recording.page import Curves, record_curves
+from koopmpc.recording.page import Curves, Page, record_curves
 from koopmpc.recording.video import export_video
 from koopmpc.recording.views.comparison import record_comparison
 from tests.recording.runs import make_run
@@ -32,12 +33,24 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [folder / "one.rrd", folder / "two.rrd"]
 
 
-def test_the_cost_so_far_ends_at_the_cost_of_the_run() -> None:
-    for run in (pendulum_run(), make_run(), replace(make_run(), cost=km.Cost(1, 1, R_delta=0.5))):
-        so_far = running_cost(run)
+@pytest.mark.parametrize("R_delta", [None, 0.3])
+def test_the_cost_so_far_grows_by_the_cost_of_each_step_and_ends_at_that_of_the_run(R_delta: float | None) -> None:
+    made, rng = make_run(), np.random.default_rng(0)
+    sized = {name: rng.standard_normal(getattr(made, name).shape) for name in ("X", "U", "reference", "u_reference")}
+    for run in (pendulum_run(), replace(made, **sized)):
+        weighed = replace(run, cost=km.Cost([2.0, 1.0], 0.5, R_delta=R_delta), angles=())
+        so_far = running_cost(weighed)
         assert so_far[0] == 0
-        assert len(so_far) == len(run.X)
-        assert so_far[-1] == pytest.approx(km.metrics(run).cost)
+        assert so_far.shape == (run.steps + 1,)
+        assert so_far[-1] == pytest.approx(km.metrics(weighed).cost)
+        for k in (1, 5):
+            error, moved = run.X[k] - run.reference[k], run.U[k - 1] - run.u_reference[k - 1]
+            step = error @ np.diag([2.0, 1.0]) @ error + 0.5 * moved @ moved
+            step += (R_delta or 0.0) * np.sum((run.U[k - 1] - run.U[k - 2]) ** 2) * (k > 1)
+            assert so_far[k] - so_far[k - 1] == pytest.approx(step)
+    none = running_cost(replace(make_run(), cost=None))
+    assert none.shape == (21,)
+    assert np.isnan(none).all()
 
 
 def test_each_run_is_a_curve_of_every_plot_and_a_column_of_the_table(logs: list[Path], tmp_path: Path) -> None:
@@ -128,3 +141,27 @@ WIDE = Curves("one", 0.1, ("x", "y"), {"truth": np.zeros((3, 1))})
 def test_curves_that_cannot_be_drawn_are_named(tmp_path, error, text, tabs):
     with pytest.raises(error, match=text):
         record_curves(tabs, tmp_path / "c.rrd", application="koopmpc-test", page="")
+
+
+def test_a_report_holds_its_parts_in_order_and_its_pictures_beside_it(tmp_path):
+    page = Page(tmp_path, beside="mine")
+    page.text("## Title", "two\nlines")
+    page.table(("|u|", "b"), [(1, "x")])
+    page.code("a  b")
+    page.items(["one", "two"])
+    page.picture("one", "A picture", matplotlib.figure.Figure())
+    assert (tmp_path / "mine" / "one.png").read_bytes().startswith(b"\x89PNG")
+    assert page.write().read_text(encoding="utf-8") == (
+        "## Title\n\ntwo lines\n\n| \\|u\\| | b |\n| --- | --- |\n| 1 | x |\n\n```text\na  b\n```\n\n- one\n- two\n\n"
+        "![A picture](mine/one.png)\n\n*A picture*\n"
+    )
+    assert "![" not in page.words
+    assert "- two" in page.words
+
+
+def test_a_picture_that_cannot_be_saved_leaves_the_report_as_it_was(tmp_path):
+    (tmp_path / "one.png").mkdir()
+    page = Page(tmp_path)
+    with pytest.raises(km.errors.LogError, match="is a folder"):
+        page.picture("one", "A picture", matplotlib.figure.Figure())
+    assert page.parts == []

@@ -1,4 +1,4 @@
-"""The law of a log: load_run(record(run)) is run, to the bit."""
+"""The law of a log: load_run(record(run)) is run, to the bit; its description is exact data and a page to read."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.loop.run import About, StepRows
-from koopmpc.recording.description import _FORMAT
+from koopmpc.recording.description import _FORMAT, drawable, from_json, to_json, to_markdown
 from koopmpc.recording.format.rrd import block_of_run, blocks, read_columns
 from koopmpc.recording.views.scenes import ReferenceScenes
 from tests.fixtures.logs.make import FOLDER as LOGS
@@ -181,3 +181,48 @@ def test_a_log_of_each_format_reads_to_the_bit(log: Path) -> None:
 
 def test_todays_format_has_its_log() -> None:
     assert (LOGS / f"{_FORMAT}.rrd").is_file()
+
+
+def test_what_the_font_holds_stays_as_it_is() -> None:
+    text = "θ̇ [rad/s], x̂ − Φ⁺ψ(x₁) ≤ 10⁻⁴ √2 · ‖x‖ Жč\n| a | – |"
+    assert drawable(text) == text
+
+
+def test_what_the_font_lacks_is_spelled_otherwise() -> None:
+    assert drawable("Uᵀ𝜓 ∈ ℝ") == "U^Tψ  in  R"
+    assert drawable("位置 [m] 😀") == "?? [m] ?"
+
+
+@settings(max_examples=40, deadline=None)
+@given(text=st.text())
+def test_text_that_can_be_drawn_is_left_alone(text: str) -> None:
+    once = drawable(text)
+    assert drawable(once) == once
+
+
+def test_the_description_says_what_ran_and_with_what() -> None:
+    told = {
+        "problem": "pendulum",
+        "case": "upright",
+        "controller": "lqr",
+        "seed": 7,
+        "versions": {"casadi": "9.9"},
+    }
+    page = to_markdown(About(**make_run(metadata=told).about()))
+    assert page.startswith("# pendulum · upright · lqr")
+    for part in (
+        "| seed | 7 |",
+        "casadi 9.9",
+        "| u_max | [",
+        "state 0 [m]",
+        "written with",
+        "rerun-sdk 0.41",
+    ):
+        assert part in page
+
+
+def test_the_description_is_exact_data() -> None:
+    run = make_run(metadata={"a": [1, 2.5, None], "b": {"c": float("nan")}, "d": np.arange(3.0)})
+    about, steps = from_json(to_json(About(**run.about()), 20))
+    assert about == About(**run.about())
+    assert steps == 20

@@ -12,7 +12,6 @@ import pytest
 from scipy.sparse import csc_matrix
 
 import koopmpc as km
-from koopmpc.control.solvers.osqp import DEFAULTS
 
 pytestmark = pytest.mark.speed
 
@@ -84,7 +83,7 @@ class Kept:
     def __init__(self, solver, qp, asked):
         self.solver, self.qp, self.asked = solver, qp, asked
         self.name, self.exact = solver.name, solver.exact
-        self.other = BARE[self.name](self.qp, self.solver._settings)
+        self.other = BARE[self.name](self.qp, self.solver)
 
     def reset(self):
         self.solver.reset()
@@ -109,10 +108,15 @@ class Kept:
         return solution
 
 
-def bare_osqp(qp, settings):
+ASKED = ("eps_abs", "eps_rel", "sigma", "max_iter", "check_termination", "eps_prim_inf", "eps_dual_inf")
+
+
+def bare_osqp(qp, ours):
+    """Return a step of OSQP with the settings that ours has now."""
+    held = ours._solver.get_settings()
     solver, P, A = osqp.OSQP(), csc_matrix(np.triu(qp.P)), csc_matrix(qp.A)
     low, high = np.maximum(qp.low, -1e30), np.minimum(qp.high, 1e30)
-    solver.setup(P, qp.q, A, low, high, verbose=False, **{**DEFAULTS, **settings})
+    solver.setup(P, qp.q, A, low, high, verbose=False, **{name: getattr(held, name) for name in ASKED})
 
     def step(low, high, v, y):
         solver.update(l=low, u=high)
@@ -122,7 +126,7 @@ def bare_osqp(qp, settings):
     return step
 
 
-def bare_daqp(qp, settings):
+def bare_daqp(qp, ours):
     import daqp
 
     solver = daqp.Model()

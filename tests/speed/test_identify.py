@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.identify.moments.rows import ROWS
 
 pytestmark = pytest.mark.speed
 
 NX = 100  # on State() these are 100 observables
+ROWS = 1023  # snapshot pairs of a block, with the last state 1024 rows: a plain Gram of the same cache
 
 
 def data(snapshots: int, steps: int = 5000) -> km.Episodes:
@@ -144,10 +144,15 @@ def test_five_thousand_episodes_cost_what_a_hundred_do(benchmark) -> None:
 @contextmanager
 def cluster(workers: int) -> Iterator[str]:
     """Yield the address of a cluster like that of scheduler="local", so that its start is not timed."""
-    from koopmpc.parallel import _client
-
-    with _client("local", workers) as client:
-        yield client.scheduler.address
+    dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
+    alone = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with (
+        dask.config.set({"distributed.nanny.pre-spawn-environ": alone}),
+        distributed.LocalCluster(
+            workers, threads_per_worker=1, host="127.0.0.1", processes=True, dashboard_address="127.0.0.1:0"
+        ) as made,
+    ):
+        yield made.scheduler_address
 
 
 def test_two_dask_workers_against_one(benchmark, tmp_path: Path) -> None:
