@@ -12,13 +12,12 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
-import tests.typecheck  # noqa: F401  # the hook looks it up by name
+import tests.typecheck
 
 MODE = os.environ.get("KOOPMPC_TESTS", "")
 if MODE == "typed":
-    install_import_hook("koopmpc", "tests.typecheck.beartyped")
+    tests.typecheck.hook()
 
 LONGEST = [
     "fitting/test_fit.py",
