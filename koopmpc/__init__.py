@@ -31,7 +31,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.bench.sweep import sweep as sweep
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export
-    from koopmpc.control.adaptive import Adaptive as Adaptive
     from koopmpc.control.cost import Cost as Cost
     from koopmpc.control.limits import Limits as Limits
     from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
@@ -53,9 +52,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.data.excitation import Feedback as Feedback
     from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
-    from koopmpc.data.files.storage import Files as Files
     from koopmpc.data.files.storage import load_episodes as load_episodes
-    from koopmpc.data.source import Stream as Stream
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
@@ -65,8 +62,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.identify.fits.dmd import dmd as dmd
     from koopmpc.identify.fits.dmd import dmdc as dmdc
     from koopmpc.identify.fits.edmd import edmd as edmd
-    from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
-    from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
     from koopmpc.lifting.base import Lifting as Lifting
     from koopmpc.lifting.composed import Standardized as Standardized
@@ -86,7 +81,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.plants.black_box import black_box as black_box
     from koopmpc.plants.dynamics import Dynamics as Dynamics
     from koopmpc.plants.dynamics import Plant as Plant
-    from koopmpc.plants.gym_plant import GymPlant as GymPlant
     from koopmpc.plants.integrators import CVODES as CVODES
     from koopmpc.plants.integrators import RK4 as RK4
     from koopmpc.plants.integrators import Collocation as Collocation
@@ -95,7 +89,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
     from koopmpc.predict import spectrum as spectrum
-    from koopmpc.predict.peers import from_peer as from_peer
     from koopmpc.predict.predictors import BilinearPredictor as BilinearPredictor
     from koopmpc.predict.predictors import LinearPredictor as LinearPredictor
     from koopmpc.predict.predictors import load_model as load_model
@@ -132,11 +125,18 @@ else:
             "loop.simulate",
         ),
         moved={
+            "Adaptive": "control",
+            "Files": "data",
+            "GymPlant": "plants",
             "Guarded": "control",
             "KoopmanRegressor": "identify",
             "Monitor": "control",
             "Prior": "identify",
+            "Stream": "data",
             "constrained_edmd": "identify",
+            "eigenfunctions": "identify",
+            "from_peer": "predict",
+            "kernel_edmd": "identify",
             "sparse_edmd": "identify",
             "stable_edmd": "identify",
             "view": "recording",

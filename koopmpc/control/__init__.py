@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.control.adaptive import Adaptive as Adaptive
     from koopmpc.control.adaptive import Guarded as Guarded
     from koopmpc.control.monitor import Monitor as Monitor
     from koopmpc.control.move import Controller as Controller

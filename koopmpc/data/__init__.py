@@ -6,6 +6,8 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.data.episodes import Snapshots as Snapshots
+    from koopmpc.data.files.storage import Files as Files
     from koopmpc.data.source import Source as Source
+    from koopmpc.data.source import Stream as Stream
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -158,7 +158,7 @@ def source_of(given: object) -> Source:
         return given
     raise DataError(
         f"episodes is a {type(given).__name__}; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, "
-        "Files(folder) or Stream(episodes)"
+        "km.data.Files(folder) or km.data.Stream(episodes)"
     )
 
 
@@ -200,8 +200,8 @@ class Stream(Source):
         """Return the parts in order."""
         if self._read and not self.replayable:
             raise DataError(
-                "the stream was read already, and an iterator gives its episodes once; make a new Stream, or "
-                "pass Stream a list, or Files"
+                "the stream was read already, and an iterator gives its episodes once; make a new km.data.Stream, "
+                "or pass Stream a list, or km.data.Files"
             )
         self._read = True
         return self._parts()

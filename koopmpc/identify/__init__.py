@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from koopmpc.identify.constrained.prior import Dissipation as Dissipation
     from koopmpc.identify.constrained.prior import Prior as Prior
     from koopmpc.identify.constrained.stable import stable_edmd as stable_edmd
+    from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
+    from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.kic import InputPredictor as InputPredictor
     from koopmpc.identify.fits.kic import kic as kic
     from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor

@@ -8,10 +8,10 @@ Q = R = 1 it is u = −sign(∇H·B) (H − H_r); J = ∫ (H − H_r)² + u² dt
 100 s; double well ẋ = [x₂; x₁ − x₁³ + u], 25 s; the feedback is `km.control.EigenfunctionLQR`, continuous inside the
 integration, and beside it sampled at 0.01 s in the library's own loop.
 
-Discovery: `km.eigenfunctions` on one unforced trajectory of the double well (from [0, −2.8], 10 s at 0.01 s), monomials
-to degree 4, by the null space of Γ(x, ẋ) with ẋ from differences of fourth order, as in the paper, and by that of
-ψ(x⁺) − ψ(x). EDMDc on the same monomials is fitted to the paper's forced trajectory, u = 2 sin(0.2πt) sin(2πt), held
-over each sample. The asymmetric well, H = x₂²/2 + x₁⁴/4 − x₁²/2 − a x₁³/3 + a x₁ with a = −¼, and the quartic one,
+Discovery: `km.identify.eigenfunctions` on one unforced trajectory of the double well (from [0, −2.8], 10 s at 0.01 s),
+monomials to degree 4, by the null space of Γ(x, ẋ) with ẋ from differences of fourth order, as in the paper, and by
+that of ψ(x⁺) − ψ(x). EDMDc on the same monomials is fitted to the paper's forced trajectory, u = 2 sin(0.2πt) sin(2πt),
+held over each sample. The asymmetric well, H = x₂²/2 + x₁⁴/4 − x₁²/2 − a x₁³/3 + a x₁ with a = −¼, and the quartic one,
 H = x₂²/2 + x₁⁴/4, have two inputs, B = I, as in the authors' code.
 """
 

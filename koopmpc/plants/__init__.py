@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.plants.gym_plant import GymPlant as GymPlant
     from koopmpc.plants.step_map import Affine as Affine
     from koopmpc.plants.step_map import SimulatedPlant as SimulatedPlant
 else:

@@ -39,7 +39,7 @@ class GymPlant:
     sin_cos
         Pairs of observations (sin θ, cos θ), by index; θ [rad] takes the place of the first of the two that comes, and
         the other is left out. It is continuous within an episode and starts between −π and π.
-        ``GymPlant("Pendulum-v1", sin_cos=[(1, 0)])`` has the states θ and its rate.
+        ``km.plants.GymPlant("Pendulum-v1", sin_cos=[(1, 0)])`` has the states θ and its rate.
     start
         start(env, x0) puts the environment into x0. By default MuJoCo's environments get their positions and
         velocities, others their attribute `state`, and the observation must then be x0.

@@ -38,8 +38,8 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     """
     if not source.replayable:
         raise DataError(
-            "a stream is read once, and a selection reads its data several times; pass Episodes, Files(folder), or "
-            "Stream of a list"
+            "a stream is read once, and a selection reads its data several times; pass Episodes, "
+            "km.data.Files(folder), or km.data.Stream of a list"
         )
     parts = source.parts()
     if isinstance(parts, Sized):

@@ -34,7 +34,7 @@ def model(train):
 
 def adaptive(model, train, **options):
     online = km.OnlineEDMD.start(train, LIFTING, forgetting=0.98)
-    return km.Adaptive(km.KoopmanMPC(model, COST, LIMITS, HORIZON, monitor=train), online, **options)
+    return km.control.Adaptive(km.KoopmanMPC(model, COST, LIMITS, HORIZON, monitor=train), online, **options)
 
 
 def test_it_follows_a_payload_that_grows_by_half():
@@ -93,10 +93,10 @@ def test_a_run_begins_with_the_first_model_and_repeats_what_it_was_told(model, t
 def test_what_cannot_learn_is_refused_in_words(model, train):
     mpc = km.KoopmanMPC(model, COST, LIMITS, HORIZON)
     with pytest.raises(km.errors.DataError, match="OnlineEDMD learns another lifting than the model's"):
-        km.Adaptive(mpc, km.OnlineEDMD.start(train, km.State()))
+        km.control.Adaptive(mpc, km.OnlineEDMD.start(train, km.State()))
     late = km.edmd(train, km.State(), embedding=km.Delay(1))
     with pytest.raises(km.errors.DataError, match="has an embedding, and OnlineEDMD takes none"):
-        km.Adaptive(km.KoopmanMPC(late, COST, LIMITS, HORIZON), km.OnlineEDMD.start(train, LIFTING))
+        km.control.Adaptive(km.KoopmanMPC(late, COST, LIMITS, HORIZON), km.OnlineEDMD.start(train, LIFTING))
 
 
 def test_the_controller_that_stands_by_takes_over_where_the_model_does_not_know(model, train):
@@ -223,6 +223,6 @@ def test_a_fit_of_the_last_steps_does_not_replace_a_model_that_plans_better(reme
         return np.sqrt(((found.X[:, 0] - swing) ** 2).mean())
 
     fixed, mpc = (km.KoopmanMPC(model, cost, km.Limits(-6, 6), 30) for _ in range(2))
-    learning = km.Adaptive(mpc, km.OnlineEDMD.start(little, lifting, **remembers))
+    learning = km.control.Adaptive(mpc, km.OnlineEDMD.start(little, lifting, **remembers))
     assert missed(learning) <= 1.01 * missed(fixed)
     assert learning.refused + learning.renewed > 0  # models were on trial

@@ -92,7 +92,7 @@ def test_an_eigenfunction_from_forced_data_is_controlled_without_knowing_the_pla
     plant = km.discretize(Pendulum(), 0.02, km.RK4(4))
     data = km.collect(plant, km.Uniform([-2, -1], [2, 1]), km.Noise(-1, 1), episodes=20, steps=100)
     library = km.State() + km.Monomials(2) + km.Fourier(1, states=[0])
-    found = km.eigenfunctions(data, library)[0]
+    found = km.identify.eigenfunctions(data, library)[0]
     energy = found.scaled(0.5 / found.coefficients[0, found.lifting.names.index("omega^2")], "energy")
     law = km.control.EigenfunctionLQR(energy, km.Cost(Q=1, R=1, of=energy), dt=0.02)
     run = km.simulate(plant, law, x0=[0.5, 0.5], reference=[0.0], steps=750)
@@ -123,7 +123,7 @@ def test_a_copy_goes_on_by_itself():
 def test_bad_input_is_refused_in_a_sentence():
     pair = km.Expressions(lambda x: [x[0], x[1]], ["a", "b"]).bind(STATES)
     for options, text in (
-        ({"eigenfunction": "H"}, "find one with km.eigenfunctions"),
+        ({"eigenfunction": "H"}, "find one with km.identify.eigenfunctions"),
         ({"eigenfunction": pair}, "has 2 observables .*; pass a real one"),
         ({"eigenvalue": None}, "eigenvalue is missing; pass that of the observable, 0 for a conserved"),
         ({"cost": km.Cost(Q=1, R=1)}, "the cost is of theta .*, omega .*, the controller moves H"),

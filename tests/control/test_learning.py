@@ -26,9 +26,9 @@ def data() -> km.Episodes:
     return km.Episodes([km.Episode(X=np.array(X), U=U, W=W)], 0.1, *NAMES)
 
 
-def learning(**options) -> km.Adaptive:
+def learning(**options) -> km.control.Adaptive:
     mpc = km.KoopmanMPC(model(), km.Cost(1, 0.1), km.Limits(-9, 9), 4)
-    return km.Adaptive(mpc, km.OnlineEDMD.start(data(), km.State()), **options)
+    return km.control.Adaptive(mpc, km.OnlineEDMD.start(data(), km.State()), **options)
 
 
 def path(rng: np.random.Generator, steps: int) -> list[LearnedPair]:

@@ -89,7 +89,7 @@ def test_measured_disturbances_are_no_part_of_the_past() -> None:
 
 def test_a_source_of_points_asks_its_parts_for_the_past() -> None:
     data = some(0, [6, 7])
-    (part,) = km.Delay(2).source(km.Stream([data])).parts()
+    (part,) = km.Delay(2).source(km.data.Stream([data])).parts()
     assert part.load() == km.Delay(2)(data)
 
 

@@ -123,7 +123,7 @@ show(lambda: km.dmdc(X))
 show(lambda: km.bilinear_edmd(X, km.State()))
 """
     )
-    episodes = "; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, Files(folder) or Stream(episodes)"
+    episodes = "; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, km.data.Files(folder) or km.data.Stream(episodes)"
     assert lines == [
         "DataError episode 0 is a ndarray; pass Episode(X=…, U=…)",
         "DataError episodes is a ndarray; pass a list of Episode(X=…, U=…)",

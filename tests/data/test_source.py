@@ -35,15 +35,15 @@ def read(source: km.data.Source) -> list[km.Episode]:
 def test_a_folder_holds_its_files_in_the_order_of_their_names(tmp_path: Path, suffix: str) -> None:
     given = sets()
     (tmp_path / "notes.txt").write_text("no data")
-    source = km.Files(folder_of(tmp_path, given, suffix))
+    source = km.data.Files(folder_of(tmp_path, given, suffix))
     assert read(source) == [episode for one in given for episode in one]
     assert (source.dt, source.states, source.inputs) == (0.1, ("x0", "x1"), ("u0",))
-    backward = km.Files([tmp_path / f"{i}{suffix}" for i in (3, 0)])
+    backward = km.data.Files([tmp_path / f"{i}{suffix}" for i in (3, 0)])
     assert read(backward) == [*given[3], *given[0]]
 
 
 def test_small_files_share_a_part_and_large_ones_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = km.Files(folder_of(tmp_path, sets()))
+    source = km.data.Files(folder_of(tmp_path, sets()))
     assert [str(part) for part in source.parts()] == [f"{tmp_path}/0.npz and 3 files after it"]
     size = (tmp_path / "0.npz").stat().st_size
     monkeypatch.setattr("koopmpc.data.files.storage._PART", 2 * size)
@@ -55,12 +55,14 @@ def test_small_files_share_a_part_and_large_ones_do_not(tmp_path: Path, monkeypa
 def test_a_stream_gives_each_set_once_and_a_list_again() -> None:
     given = sets()
     every = [episode for one in given for episode in one]
-    once, again = km.Stream(iter(given)), km.Stream(given)
+    once, again = km.data.Stream(iter(given)), km.data.Stream(given)
     assert not once.replayable
     assert again.replayable
     assert read(once) == every
     assert read(again) == read(again) == every
-    with pytest.raises(km.errors.DataError, match=r"stream was read already.*make a new Stream, or pass Stream a list"):
+    with pytest.raises(
+        km.errors.DataError, match=r"stream was read already.*make a new km\.data\.Stream, or pass Stream a list"
+    ):
         once.parts()
 
 
@@ -73,7 +75,7 @@ def test_a_stream_reads_one_set_ahead_and_no_more(monkeypatch: pytest.MonkeyPatc
             taken.append(i)
             yield one
 
-    parts = iter(km.Stream(generator()).parts())
+    parts = iter(km.data.Stream(generator()).parts())
     assert str(next(parts)) == "set 0 of the stream"
     assert taken == [0, 1]
     assert str(next(parts)) == "set 1 of the stream"
@@ -91,7 +93,7 @@ def last_state_only(episodes: km.Episodes) -> km.Episodes:
 @pytest.mark.parametrize("kind", ["files", "stream"])
 def test_a_change_is_made_to_each_part_as_it_is_loaded(kind: str, tmp_path: Path) -> None:
     given = sets()
-    source = km.Files(folder_of(tmp_path, given)) if kind == "files" else km.Stream(iter(given))
+    source = km.data.Files(folder_of(tmp_path, given)) if kind == "files" else km.data.Stream(iter(given))
     changed = Changed(source, last_state_only, ("x1",), source.inputs)
     assert (changed.nx, changed.nu, changed.nw) == (1, 1, 0)
     assert read(changed) == [episode for one in given for episode in last_state_only(one)]
@@ -101,36 +103,36 @@ def test_measured_disturbances_come_behind_the_inputs() -> None:
     rng = np.random.default_rng(0)
     episode = km.Episode(X=rng.normal(size=(5, 1)), U=rng.normal(size=(4, 1)), W=rng.normal(size=(4, 2)))
     data = km.Episodes([episode], 0.1)
-    driven = km.Stream([data]).driven()
+    driven = km.data.Stream([data]).driven()
     assert driven.inputs == ("u0", "w0", "w1")
     assert [part.load() for part in driven.parts()] == [data.driven()]
 
 
 def test_the_path_must_be_there_and_hold_episodes(tmp_path: Path) -> None:
     with pytest.raises(km.errors.LogError, match="nowhere does not exist; pass a folder"):
-        km.Files(tmp_path / "nowhere")
+        km.data.Files(tmp_path / "nowhere")
     with pytest.raises(km.errors.LogError, match=r"holds no .npz, .parquet, .csv or .rrd file: it holds nothing"):
-        km.Files(tmp_path)
+        km.data.Files(tmp_path)
     (tmp_path / "a.txt").touch()
     with pytest.raises(km.errors.LogError, match=r"it holds a\.txt"):
-        km.Files(tmp_path)
+        km.data.Files(tmp_path)
     with pytest.raises(km.errors.LogError, match=r"b\.npz is no file; pass files, or one folder"):
-        km.Files([tmp_path / "b.npz"])
+        km.data.Files([tmp_path / "b.npz"])
     with pytest.raises(km.errors.DataError, match="there is no path"):
-        km.Files([])
+        km.data.Files([])
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".parquet"])
 def test_an_empty_file_is_named(tmp_path: Path, suffix: str) -> None:
     folder_of(tmp_path, sets(2), suffix)
     (tmp_path / f"1{suffix}").write_bytes(b"")
-    source = km.Files(tmp_path)
+    source = km.data.Files(tmp_path)
     with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/1\{suffix}"):
         read(source)
     (tmp_path / f"0{suffix}").write_bytes(b"")
     (tmp_path / f"1{suffix}").unlink()
     with pytest.raises(km.errors.LogError, match=rf"{tmp_path}/0\{suffix}"):
-        km.Files(tmp_path)
+        km.data.Files(tmp_path)
 
 
 def ragged(path: Path) -> km.Episodes:
@@ -140,11 +142,11 @@ def ragged(path: Path) -> km.Episodes:
 
 
 def test_what_a_reader_raises_is_told_with_the_file(tmp_path: Path) -> None:
-    source = km.Files(folder_of(tmp_path, sets(2)), reader=ragged)
+    source = km.data.Files(folder_of(tmp_path, sets(2)), reader=ragged)
     with pytest.raises(km.errors.ShapeError, match=rf"{tmp_path}/1\.npz: U has 3 rows and X 9"):
         read(source)
     with pytest.raises(km.errors.DataError, match="reader of your own is given no dt; bind them with partial"):
-        km.Files(tmp_path, reader=ragged, dt=0.1)
+        km.data.Files(tmp_path, reader=ragged, dt=0.1)
 
 
 def test_a_file_of_another_plant_is_named(tmp_path: Path) -> None:
@@ -158,15 +160,15 @@ def test_a_file_of_another_plant_is_named(tmp_path: Path) -> None:
         folder_of(folder, [first])
         other.save(folder / f"{name}.npz")
         with pytest.raises(km.errors.DataError, match=told):
-            read(km.Files(folder))
+            read(km.data.Files(folder))
     with pytest.raises(km.errors.DataError, match=r"set 1 of the stream has dt = 0\.2 s, set 0 has 0\.1 s"):
-        read(km.Stream([first, km.Episodes(first.episodes, 0.2)]))
+        read(km.data.Stream([first, km.Episodes(first.episodes, 0.2)]))
 
 
 def test_clocks_that_round_are_one_sample_time(tmp_path: Path) -> None:
     first = sets(1)[0]
     folder_of(tmp_path, [first, km.Episodes(first.episodes, 0.1 * (1 + 1e-9))])
-    assert len(read(km.Files(tmp_path))) == 4
+    assert len(read(km.data.Files(tmp_path))) == 4
 
 
 def test_plain_tables_are_read_as_they_are_told(tmp_path: Path) -> None:
@@ -177,17 +179,19 @@ def test_plain_tables_are_read_as_they_are_told(tmp_path: Path) -> None:
         x = np.arange(6.0) + i
         pq.write_table(pa.table({"x [m]": x, "u [N]": -x}), tmp_path / f"{i}.parquet")
     how = {"dt": 0.1, "states": ["x [m]"], "inputs": ["u [N]"]}
-    assert [e.X[0, 0] for e in read(km.Files(tmp_path, **how))] == [0.0, 1.0]
-    assert read(km.Files(tmp_path, reader=partial(km.load_episodes, **how))) == read(km.Files(tmp_path, **how))
+    assert [e.X[0, 0] for e in read(km.data.Files(tmp_path, **how))] == [0.0, 1.0]
+    assert read(km.data.Files(tmp_path, reader=partial(km.load_episodes, **how))) == read(
+        km.data.Files(tmp_path, **how)
+    )
 
 
 def test_what_is_no_stream_of_episodes_is_refused() -> None:
     with pytest.raises(km.errors.DataError, match="the stream is empty"):
-        km.Stream(iter([]))
+        km.data.Stream(iter([]))
     lines = shown("""
-show(lambda: km.Stream(3))
-show(lambda: km.Stream([1]))
-show(lambda: list(km.Stream([km.Episodes([km.Episode(X=[[1], [2]])], 0.1), 1]).parts()))
+show(lambda: km.data.Stream(3))
+show(lambda: km.data.Stream([1]))
+show(lambda: list(km.data.Stream([km.Episodes([km.Episode(X=[[1], [2]])], 0.1), 1]).parts()))
 show(lambda: km.edmd([1], km.State()))
 """)
     assert lines == [
@@ -195,7 +199,7 @@ show(lambda: km.edmd([1], km.State()))
         "DataError set 0 of the stream is a int; pass Episodes([Episode(X=…, U=…)], dt)",
         "DataError set 1 of the stream is a int; pass Episodes([Episode(X=…, U=…)], dt)",
         "DataError episodes is a list; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, "
-        "Files(folder) or Stream(episodes)",
+        "km.data.Files(folder) or km.data.Stream(episodes)",
     ]
 
 
@@ -234,7 +238,7 @@ def test_a_folder_cuts_its_large_files_and_no_others(tmp_path: Path, monkeypatch
     for i, one in enumerate(sets):
         one.save(tmp_path / f"{i}.parquet")
     monkeypatch.setattr("koopmpc.data.files.storage._LARGE", 20_000)
-    source = km.Files(tmp_path)
+    source = km.data.Files(tmp_path)
     parts = source.parts()
     assert ["(rows " in str(part) for part in parts] == [False, True, True, True, True, False]
     assert str(parts[1]) == f"{tmp_path}/1.parquet (rows 0 to 1599)"
@@ -250,7 +254,7 @@ def test_a_large_file_is_never_held(tmp_path: Path) -> None:
     episode = km.Episode(X=rng.standard_normal((1_000_001, 4)), U=rng.standard_normal((1_000_000, 1)))
     km.Episodes([episode], 0.1).save(tmp_path / "a.parquet")  # 43 MB
     tracemalloc.start()
-    total = km.moments.second_moments(km.Files(tmp_path), km.State(), route="gram")
+    total = km.moments.second_moments(km.data.Files(tmp_path), km.State(), route="gram")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert total.samples == 1_000_000
@@ -269,17 +273,17 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     monkeypatch.setattr("koopmpc.data.files.storage._LARGE", 0)
     pq.write_table(pa.table({"time": [0.0, 0.1, 0.2], "x": [1.0, 2.0, 3.0], "u": [0.0, 1.0, 0.0]}), b)
     assert row_groups(b, 0, None) is None
-    assert [len(one) for part in km.Files(b).parts() for one in part.load()] == [2]
+    assert [len(one) for part in km.data.Files(b).parts() for one in part.load()] == [2]
     c.write_bytes(b"no table")
     with pytest.raises(km.errors.LogError, match=r"c\.parquet"):
-        km.Files(c)
+        km.data.Files(c)
     km.Episodes(data.episodes, 0.2).save(d)
     with pytest.raises(km.errors.DataError, match=r"d\.parquet has dt = 0\.2 s, .*a\.parquet has 0\.1 s"):
-        [part.load() for part in km.Files([a, d]).parts()]
+        [part.load() for part in km.data.Files([a, d]).parts()]
     pq.write_table(pq.read_table(a).take([*range(20), *range(21, 51)]), e)
     with pytest.raises(km.errors.LogError, match=r"e\.parquet \(rows 0 to 49\) holds .*: rows are missing"):
-        [part.load() for part in km.Files([a, e]).parts()]
-    parts = km.Files(a).parts()
+        [part.load() for part in km.data.Files([a, e]).parts()]
+    parts = km.data.Files(a).parts()
     a.write_bytes(b"")
     with pytest.raises(km.errors.LogError, match=r"a\.parquet \(rows 0 to 50\) holds no episodes that can be read"):
         parts[0].load()
@@ -303,10 +307,10 @@ def test_sample_times_agree_to_a_millionth(share: float) -> None:
     one = random_episodes(0, [5], 2, 1)
     other = km.Episodes(list(one), one.dt * (1 + share), one.states, one.inputs)
     if abs(share) < 1e-6:
-        assert len(read(km.Stream([one, other]))) == 2
+        assert len(read(km.data.Stream([one, other]))) == 2
     else:
         with pytest.raises(km.errors.DataError, match=r"has dt = .*; resample one of them"):
-            read(km.Stream([one, other]))
+            read(km.data.Stream([one, other]))
 
 
 def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(

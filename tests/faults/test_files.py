@@ -97,7 +97,7 @@ def test_a_link_to_a_log_of_another_name_stays_a_link_and_the_log_is_read_by_bot
     assert left(tmp_path) == ["last.rrd", "runs"]
     assert left(tmp_path / "runs") == ["monday.rrd"]
     with pytest.raises(km.errors.DataError, match="is given twice"):
-        km.Files([log, link])
+        km.data.Files([log, link])
 
 
 def flipped(data: bytes, rng: random.Random) -> bytes:

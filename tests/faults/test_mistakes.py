@@ -52,7 +52,7 @@ def stateful(model):
         "filtered": km.KoopmanMPC(model, cost, limits, 8, estimator=km.LiftedKalman(model.states)),
         "BilinearMPC": km.BilinearMPC(PLANT, cost, limits, 5),
         "NonlinearMPC": km.NonlinearMPC(PLANT, cost, limits, 3),
-        "Adaptive": km.Adaptive(km.KoopmanMPC(model, cost, limits, 8), online),
+        "Adaptive": km.control.Adaptive(km.KoopmanMPC(model, cost, limits, 8), online),
         "Guarded": km.control.Guarded(watched, km.LQR(model, cost)),
         "plant": km.plants.SimulatedPlant(PLANT),
     }
@@ -89,11 +89,11 @@ TAKES = {
     "lifting": lambda bad: replace(LIFTED, lifting=bad),
     "predictor": lambda bad: km.score(bad, EPISODES, 3),
     "episodes": lambda bad: km.score(LIFTED, bad, 3),
-    "data": lambda bad: km.eigenfunctions(bad, km.State()),
+    "data": lambda bad: km.identify.eigenfunctions(bad, km.State()),
     "embedding": lambda bad: km.edmd(EPISODES, km.State(), embedding=bad),
     "method": lambda bad: km.edmd(EPISODES, km.State(), method=bad),
     "towards": lambda bad: km.edmd(EPISODES, km.State(), towards=bad),
-    "kernel": lambda bad: km.kernel_edmd(EPISODES, bad),
+    "kernel": lambda bad: km.identify.kernel_edmd(EPISODES, bad),
     "noise": lambda bad: km.Feedback([[1.0, 2.0]], bad),
     "F": lambda bad: km.StepMap(bad, 0.1),
     "dynamics": lambda bad: km.discretize(bad, 0.1),
@@ -240,10 +240,10 @@ def test_one_absurd_cell_is_named_with_row_and_column(tmp_path: Path, value: flo
 def test_files_that_count_twice_are_named(tmp_path: Path):
     first = table(tmp_path / "a.csv")
     with pytest.raises(km.errors.DataError, match=r"a\.csv is given twice"):
-        km.Files([first, first])
+        km.data.Files([first, first])
     (tmp_path / "b.csv").write_bytes(first.read_bytes())
     with pytest.warns(km.FitWarning, match=r"b\.csv holds the same bytes as .*a\.csv"):
-        km.Files(tmp_path)
+        km.data.Files(tmp_path)
 
 
 def test_resampling_beyond_memory_is_refused_with_the_number(tmp_path: Path):

@@ -315,7 +315,7 @@ def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):
 def test_too_little_data_is_told(tmp_path):
     cart_pole(2, steps=20).save(tmp_path / "data.npz")
     with pytest.raises(km.errors.DataError, match="too few of 22 steps"):
-        divided(km.Files(tmp_path / "data.npz"), 20, np.random.default_rng(0), 10**9)
+        divided(km.data.Files(tmp_path / "data.npz"), 20, np.random.default_rng(0), 10**9)
 
 
 @pytest.mark.usefixtures("quick")
@@ -359,7 +359,7 @@ def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
     )
     assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", told[0])
     assert max(np.abs(e.X[:, 1]).max() for e in found.held_out) < 20
-    assert divided(km.Files(tmp_path / "in"), 10, np.random.default_rng(0), 10**9).delay == 3
+    assert divided(km.data.Files(tmp_path / "in"), 10, np.random.default_rng(0), 10**9).delay == 3
 
 
 @pytest.mark.usefixtures("quick")

@@ -1,4 +1,4 @@
-"""km.eigenfunctions: conserved quantities and eigenpairs from data, the effect of inputs, validation, bad input."""
+"""km.identify.eigenfunctions: conserved quantities and eigenpairs from data, the effect of inputs, validation, bad input."""
 
 import os
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ def named(phi):
 
 @pytest.mark.parametrize(("by", "exact"), [("steps", 1e-9), ("derivatives", 1e-5)])
 def test_one_trajectory_holds_its_energy_with_exact_ratios_and_no_other_observable(one, by, exact):
-    (H,) = km.eigenfunctions(one, QUARTIC, by=by)
+    (H,) = km.identify.eigenfunctions(one, QUARTIC, by=by)
     assert named(H) == pytest.approx(ENERGY, rel=exact)
     assert H.eigenvalue == 0
     assert H.error < exact
@@ -63,14 +63,14 @@ def test_one_trajectory_holds_its_energy_with_exact_ratios_and_no_other_observab
 
 
 def test_the_null_space_is_that_of_differences_of_the_library_by_numpy(one):
-    (H,) = km.eigenfunctions(one, QUARTIC, held_out=one)
+    (H,) = km.identify.eigenfunctions(one, QUARTIC, held_out=one)
     Z = QUARTIC.bind(one.states)(one[0].X)[:, :-1]  # without the constant
     null = np.linalg.svd(np.diff(Z, axis=0))[2][-1]
     np.testing.assert_allclose(H.coefficients[0, :-1], null / null[list(H.lifting.names).index("x2^2")], atol=2e-7)
 
 
 def test_values_and_gradient_are_those_of_the_formula(one):
-    (H,) = km.eigenfunctions(one, QUARTIC)
+    (H,) = km.identify.eigenfunctions(one, QUARTIC)
     X = np.random.default_rng(0).uniform(-2, 2, (20, 2))
     x, v = X.T
     np.testing.assert_allclose(H.values(X), v**2 - x**2 + x**4 / 2, rtol=1e-8, atol=1e-8)
@@ -84,7 +84,7 @@ def test_values_and_gradient_are_those_of_the_formula(one):
 
 def test_a_larger_library_holds_the_square_of_the_energy_too_and_both_are_sparse():
     data = free(np.random.default_rng(0).uniform(-1.5, 1.5, (12, 2)), 0.05, 60)
-    found = km.eigenfunctions(data, km.State() + km.Monomials(8))
+    found = km.identify.eigenfunctions(data, km.State() + km.Monomials(8))
     assert len(named(found[0])) == 3
     assert len(named(found[1])) <= 8 < 44 == found[1].lifting.nz
     X = np.random.default_rng(1).uniform(-1, 1, (50, 2))
@@ -96,12 +96,12 @@ def test_a_larger_library_holds_the_square_of_the_energy_too_and_both_are_sparse
 def test_identities_of_the_library_are_no_eigenfunctions():
     data = free(np.random.default_rng(0).uniform(-1.5, 1.5, (12, 2)), 0.05, 60)
     extra = km.Expressions(lambda x: [ca.sin(x[0]) ** 2, ca.cos(x[0]) ** 2], ["s2", "c2"])
-    (H,) = km.eigenfunctions(data, QUARTIC + extra)
+    (H,) = km.identify.eigenfunctions(data, QUARTIC + extra)
     assert named(H) == pytest.approx(ENERGY, rel=1e-6)
 
 
 def test_forced_data_hold_the_energy_and_how_the_input_moves_it(forced):
-    (H,) = km.eigenfunctions(forced, QUARTIC)
+    (H,) = km.identify.eigenfunctions(forced, QUARTIC)
     assert named(H) == pytest.approx(ENERGY, rel=1e-4)
     X = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     beta = H.lifting(X) @ H.drive[0].T
@@ -114,7 +114,7 @@ def test_the_explicit_regression_finds_eigenvalues_and_functions_of_the_slow_man
     plant = km.discretize(problem.dynamics, 0.05, km.RK4(2))
     data = km.collect(plant, km.Uniform([-2, -2], [2, 2]), km.Noise(-1, 1), episodes=20, steps=30)
     library = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x1²"]) + km.Constant()
-    found = km.eigenfunctions(data, library, eigenvalue=None)
+    found = km.identify.eigenfunctions(data, library, eigenvalue=None)
     by_rate = {round(phi.eigenvalue.real, 6): phi for phi in found}
     assert sorted(by_rate) == [-0.2, -0.1, 1.0]
     coefficients = by_rate[1.0].coefficients[0]
@@ -130,26 +130,26 @@ def test_a_complex_eigenfunction_turns_and_shrinks_as_its_eigenvalue_says():
     starts = np.random.default_rng(0).uniform(-1, 1, (6, 2))
     paths = [np.array([np.linalg.matrix_power(step, k) @ x for k in range(40)]) for x in starts]
     data = km.Episodes([km.Episode(X=X) for X in paths], 0.05)
-    (phi,) = km.eigenfunctions(data, km.State(), eigenvalue=None)
+    (phi,) = km.identify.eigenfunctions(data, km.State(), eigenvalue=None)
     assert phi.eigenvalue == pytest.approx(-0.1 + 2j, abs=1e-9)
     told = phi.values(paths[0])
     np.testing.assert_allclose(told, told[0] * np.exp(phi.eigenvalue * 0.05 * np.arange(40)), atol=1e-9)
     assert phi(paths[0]).shape == (40, 2)
     assert phi.gradient(paths[0]).shape == (40, 2)
-    size = km.eigenfunctions(data, km.State() + km.Monomials(2), eigenvalue=-0.2)
+    size = km.identify.eigenfunctions(data, km.State() + km.Monomials(2), eigenvalue=-0.2)
     assert named(size[0]) == pytest.approx({"x0^2": 1.0, "x1^2": 1.0})  # |φ|² has 2 Re λ
 
 
 def test_a_function_that_vanishes_on_the_data_is_none_of_any_eigenvalue(one):
     with pytest.warns(km.FitWarning, match="no eigenfunction predicts held-out data within"):
-        found = km.eigenfunctions(one, QUARTIC, eigenvalue=-0.7, tolerance=1e-3)
+        found = km.identify.eigenfunctions(one, QUARTIC, eigenvalue=-0.7, tolerance=1e-3)
     assert len(found) == 0
 
 
 def test_what_held_out_data_do_not_confirm_is_rejected():
     data = free(np.random.default_rng(0).uniform(-2, 2, (12, 2)), 0.05, 60)
     with pytest.warns(km.FitWarning, match="the best has an error of .*; pass a larger library or more data"):
-        found = km.eigenfunctions(data, km.State() + km.Monomials(2))
+        found = km.identify.eigenfunctions(data, km.State() + km.Monomials(2))
     assert len(found) == 0
     assert found.rejected
     assert min(phi.error for phi in found.rejected) > 0.05
@@ -157,7 +157,7 @@ def test_what_held_out_data_do_not_confirm_is_rejected():
 
 
 def test_an_eigenfunction_is_an_observable_of_models_and_comes_back_from_their_files(forced, tmp_path):
-    (H,) = km.eigenfunctions(forced, QUARTIC)
+    (H,) = km.identify.eigenfunctions(forced, QUARTIC)
     model = km.edmd(forced, km.State() + H)
     assert model.lifting.names == (*DoubleWell.states, "φ")
     model.save(tmp_path / "model.npz")
@@ -176,21 +176,21 @@ def test_bad_input_is_refused_in_a_sentence(one):
         ({"held_out": km.Episodes([km.Episode(X=np.zeros((9, 3)))], 0.01)}, "held_out has other states or inputs"),
     ):
         with pytest.raises(km.KoopmpcError, match=text):
-            km.eigenfunctions(one, QUARTIC, **options)
+            km.identify.eigenfunctions(one, QUARTIC, **options)
     with pytest.raises(km.KoopmpcError, match="the library is constant on the data"):
-        km.eigenfunctions(one, km.Constant())
+        km.identify.eigenfunctions(one, km.Constant())
     short = km.Episodes([km.Episode(X=one[0].X[:4])] * 4, 0.01)
     with pytest.raises(km.KoopmpcError, match='episode 0 has 4 samples; by="derivatives" needs five'):
-        km.eigenfunctions(short, QUARTIC, by="derivatives")
+        km.identify.eigenfunctions(short, QUARTIC, by="derivatives")
     with pytest.raises(km.KoopmpcError, match="too short to hold its last quarter out"):
-        km.eigenfunctions(km.Episodes([km.Episode(X=one[0].X[:2])], 0.01), QUARTIC)
-    (H,) = km.eigenfunctions(one, QUARTIC)
+        km.identify.eigenfunctions(km.Episodes([km.Episode(X=one[0].X[:2])], 0.01), QUARTIC)
+    (H,) = km.identify.eigenfunctions(one, QUARTIC)
     with pytest.raises(km.KoopmpcError, match="φ is of 2 states, and there are 3"):
         H.bind(("a", "b", "c"))
 
 
 def test_an_error_as_large_as_the_tolerance_is_within_it(one):
-    found = km.eigenfunctions(one, QUARTIC, tolerance=10.0)
-    again = km.eigenfunctions(one, QUARTIC, tolerance=found[0].error)
+    found = km.identify.eigenfunctions(one, QUARTIC, tolerance=10.0)
+    again = km.identify.eigenfunctions(one, QUARTIC, tolerance=found[0].error)
     assert again[0].error == found[0].error
     assert len(again) + len(again.rejected) == len(found) + len(found.rejected)

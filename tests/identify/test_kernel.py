@@ -32,7 +32,7 @@ def test_the_polynomial_kernel_has_the_eigenvalues_of_edmd_on_all_monomials(data
     monomials = km.State() + km.Monomials(degree) + km.Constant()
     full = km.edmd(data, monomials)
     for landmarks in (full.nz + 5, 10_000):
-        kernel = km.kernel_edmd(data, "polynomial", degree=degree, landmarks=landmarks)
+        kernel = km.identify.kernel_edmd(data, "polynomial", degree=degree, landmarks=landmarks)
         assert kernel.nz == full.nz
         assert _matched(kernel.eigenvalues, full.eigenvalues) < 1e-8
         U = np.random.default_rng(0).uniform(-1, 1, (10, 1))
@@ -41,7 +41,7 @@ def test_the_polynomial_kernel_has_the_eigenvalues_of_edmd_on_all_monomials(data
 
 def test_units_of_the_states_do_not_matter(data):
     large = km.Episodes([km.Episode(X=e.X * [1e3, 1e-3], U=e.U) for e in data], data.dt, data.states, data.inputs)
-    one, other = (km.kernel_edmd(d, "gaussian", landmarks=60, rank=20) for d in (data, large))
+    one, other = (km.identify.kernel_edmd(d, "gaussian", landmarks=60, rank=20) for d in (data, large))
     assert _matched(one.eigenvalues, other.eigenvalues) < 1e-6
 
 
@@ -58,7 +58,7 @@ def test_without_inputs_it_is_the_matrix_of_williams_et_al():
     values, Q = np.linalg.eigh(k(X, X))
     Q, sigma = Q[:, -8:], np.sqrt(values[-8:])
     K = (Q / sigma).T @ k(Y, X) @ (Q / sigma)  # eq. 19 of their paper
-    found = km.kernel_edmd(free, "gaussian", width=width, rank=8)
+    found = km.identify.kernel_edmd(free, "gaussian", width=width, rank=8)
     assert _matched(found.eigenvalues, np.linalg.eigvals(K)) < 1e-8
 
 
@@ -68,7 +68,7 @@ def test_more_landmarks_predict_better_and_a_controller_takes_the_model(data):
     def error(model: km.LinearPredictor) -> float:
         return float(np.mean([(model.rollout(e.X[0], e.U) - e.X) ** 2 for e in held]))
 
-    models = [km.kernel_edmd(data, landmarks=count, ridge=1e-10) for count in (6, 60)]
+    models = [km.identify.kernel_edmd(data, landmarks=count, ridge=1e-10) for count in (6, 60)]
     assert models[0].nz == 6
     assert error(models[1]) < 0.1 * error(models[0])
     cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-1, u_max=1)
@@ -86,7 +86,9 @@ def test_more_landmarks_predict_better_and_a_controller_takes_the_model(data):
 
 def test_files_and_data_in_memory_give_the_same_model_and_it_is_saved(data, tmp_path: Path):
     data.save(tmp_path / "data.npz")
-    held, read = (km.kernel_edmd(d, landmarks=40, rank=10) for d in (data, km.Files(tmp_path / "data.npz")))
+    held, read = (
+        km.identify.kernel_edmd(d, landmarks=40, rank=10) for d in (data, km.data.Files(tmp_path / "data.npz"))
+    )
     np.testing.assert_allclose(held.A, read.A, atol=1e-9)
     held.save(tmp_path / "model.npz")
     again = km.load_model(tmp_path / "model.npz")
@@ -94,13 +96,13 @@ def test_files_and_data_in_memory_give_the_same_model_and_it_is_saved(data, tmp_
 
 
 def test_what_it_cannot_take_is_told():
-    told = shown('show(lambda: km.kernel_edmd(km.Episodes([km.Episode(X=np.ones((5, 2)))], 0.1), "cubic"))')
+    told = shown('show(lambda: km.identify.kernel_edmd(km.Episodes([km.Episode(X=np.ones((5, 2)))], 0.1), "cubic"))')
     assert told == ['DataError kernel is \'cubic\'; pass "polynomial" or "gaussian"']
     still = km.Episodes([km.Episode(X=np.ones((5, 2)))], 0.1)
     with pytest.raises(km.errors.DataError, match="all one state"):
-        km.kernel_edmd(still)
+        km.identify.kernel_edmd(still)
 
 
 def test_a_stream_is_refused_because_it_is_read_twice(data: km.Episodes) -> None:
     with pytest.raises(km.errors.DataError, match="a stream is read once, and kernel_edmd needs it for its landmarks"):
-        km.kernel_edmd(km.Stream(iter([data])), landmarks=5)
+        km.identify.kernel_edmd(km.data.Stream(iter([data])), landmarks=5)

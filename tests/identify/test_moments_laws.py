@@ -13,7 +13,7 @@ LENGTHS = st.lists(st.integers(1, 60), min_size=2, max_size=6)
 ROUTES = pytest.mark.parametrize("route", ["gram", "qr"])
 
 
-def coefficients(episodes: km.Episodes | km.Stream, lifting: km.Lifting, route: str) -> np.ndarray:
+def coefficients(episodes: km.Episodes | km.data.Stream, lifting: km.Lifting, route: str) -> np.ndarray:
     """Return K of numpy.linalg.lstsq on the few rows that stand for all, columns of unit norm."""
     m = km.moments.second_moments(episodes, lifting, route=route)
     few = m.rows(m.columns.regressors, m.columns.targets)
@@ -53,7 +53,7 @@ def test_permuting_splitting_and_merging_change_nothing_but_rounding(
     random.shuffle(pieces)
     half = random.randint(1, len(pieces) - 1)
     sets = [km.Episodes(pieces[:half], data.dt), km.Episodes(pieces[half:], data.dt)]
-    for other in (km.Episodes(pieces, data.dt), km.Stream(iter(sets)), km.Stream(sets)):
+    for other in (km.Episodes(pieces, data.dt), km.data.Stream(iter(sets)), km.data.Stream(sets)):
         assert np.allclose(coefficients(other, LIFTING, route), K, rtol=0, atol=1e-9)
 
 

@@ -49,7 +49,7 @@ def close(a: np.ndarray, b: np.ndarray) -> bool:
 def test_here_on_processes_and_on_dask_the_moments_are_the_same_to_the_bit(
     folder: Path, sets: list[km.Episodes], route: str, lifting: km.State, scheduler: str
 ) -> None:
-    source = km.Files(folder)
+    source = km.data.Files(folder)
     here = km.moments.second_moments(source, lifting, route=route)
     told: list[tuple[int, int | None]] = []
     processes = km.moments.second_moments(
@@ -58,19 +58,19 @@ def test_here_on_processes_and_on_dask_the_moments_are_the_same_to_the_bit(
     assert processes == here
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert km.moments.second_moments(source, lifting, route=route, scheduler=scheduler) == here
-    assert km.moments.second_moments(km.Stream(iter(sets)), lifting, route=route, scheduler=scheduler) == here
+    assert km.moments.second_moments(km.data.Stream(iter(sets)), lifting, route=route, scheduler=scheduler) == here
     assert here.samples == sum(len(e) for one in sets for e in one)
     assert close(gram(here), gram(km.moments.second_moments(sets[0] + sets[1] + sets[2], lifting, route=route)))
 
 
 def test_parts_are_merged_in_the_order_of_the_source(folder: Path, sets: list[km.Episodes]) -> None:
     one, two, three = (km.moments.second_moments(part, LIFTING, route="qr") for part in sets)
-    assert km.moments.second_moments(km.Files(folder), LIFTING, route="qr") == one + two + three
+    assert km.moments.second_moments(km.data.Files(folder), LIFTING, route="qr") == one + two + three
 
 
 def test_a_worker_that_dies_while_it_reads_changes_nothing(folder: Path, scheduler: str) -> None:
-    here = km.moments.second_moments(km.Files(folder), LIFTING, route="gram")
-    source = km.Files(folder, reader=dying_reader)
+    here = km.moments.second_moments(km.data.Files(folder), LIFTING, route="gram")
+    source = km.data.Files(folder, reader=dying_reader)
     assert km.moments.second_moments(source, LIFTING, route="gram", workers=2) == here
     (folder / "1.died").unlink()
     assert km.moments.second_moments(source, LIFTING, route="gram", scheduler=scheduler) == here
@@ -79,7 +79,7 @@ def test_a_worker_that_dies_while_it_reads_changes_nothing(folder: Path, schedul
 
 def test_a_file_that_kills_each_worker_is_named(folder: Path) -> None:
     with pytest.raises(km.KoopmpcError, match=rf"task 1, {folder}/1\.npz: each worker that did it died"):
-        km.moments.second_moments(km.Files(folder, reader=always_dying), LIFTING, route="gram", workers=2)
+        km.moments.second_moments(km.data.Files(folder, reader=always_dying), LIFTING, route="gram", workers=2)
 
 
 @pytest.mark.parametrize(("where", "route"), [({}, "gram"), ({"workers": 2}, "qr")], ids=["here", "processes"])
@@ -89,14 +89,14 @@ def test_an_observable_that_is_not_finite_is_named_with_its_file(where: dict, ro
     km.Episodes([km.Episode(X=X, U=np.zeros((3, 1)))], 0.1).save(folder / "1.npz")
     inverse = km.State() + km.Expressions(lambda x: [1 / x[0]], ["1/x"])
     with pytest.raises(km.errors.DataError, match=rf"'1/x' is NaN, infinite or above 1e154 in {folder}/1\.npz; drop"):
-        km.moments.second_moments(km.Files(folder), inverse, route=route, **where)
+        km.moments.second_moments(km.data.Files(folder), inverse, route=route, **where)
 
 
 def test_a_stream_that_is_read_once_is_summed_in_qr_unless_told(sets: list[km.Episodes]) -> None:
-    assert km.moments.second_moments(km.Stream(iter(sets)), LIFTING).route == "qr"
-    assert km.moments.second_moments(km.Stream(iter(sets)), LIFTING, route="gram").route == "gram"
-    assert km.moments.second_moments(km.Stream(sets), LIFTING).route == "gram"
-    spent = km.Stream(iter(sets))
+    assert km.moments.second_moments(km.data.Stream(iter(sets)), LIFTING).route == "qr"
+    assert km.moments.second_moments(km.data.Stream(iter(sets)), LIFTING, route="gram").route == "gram"
+    assert km.moments.second_moments(km.data.Stream(sets), LIFTING).route == "gram"
+    spent = km.data.Stream(iter(sets))
     km.moments.second_moments(spent, LIFTING)
     with pytest.raises(km.errors.DataError, match="the stream was read already"):
         km.moments.second_moments(spent, LIFTING)
@@ -112,10 +112,10 @@ def test_a_folder_that_turns_out_worse_than_its_pilot_is_read_again_in_qr(
         X[50] = [1e9, 1e9] if i == 3 else X[50]
         km.Episodes([km.Episode(X=X)], 0.1).save(tmp_path / f"{i}.npz")
     passes: list[int] = []
-    total = km.moments.second_moments(km.Files(tmp_path), km.State(), progress=lambda done, _: passes.append(done))
+    total = km.moments.second_moments(km.data.Files(tmp_path), km.State(), progress=lambda done, _: passes.append(done))
     assert total.route == "qr"
     assert passes == [*range(9), *range(9)]
-    assert total == km.moments.second_moments(km.Files(tmp_path), km.State(), route="qr")
+    assert total == km.moments.second_moments(km.data.Files(tmp_path), km.State(), route="qr")
 
 
 class Counting:
@@ -135,7 +135,7 @@ def test_a_replayable_stream_of_unknown_length_has_a_pilot_at_its_start(
 ) -> None:
     monkeypatch.setattr("koopmpc.data.source._PART", 10)
     sets = Counting(20)
-    total = km.moments.second_moments(km.Stream(sets), LIFTING)
+    total = km.moments.second_moments(km.data.Stream(sets), LIFTING)
     assert total.samples == 1000
     assert total.route == "gram"
     assert sets.given <= 1 + 5 + 20  # the first set for the names, the pilot and one ahead, the whole
@@ -148,7 +148,7 @@ def test_every_fit_takes_a_source(folder: Path, sets: list[km.Episodes]) -> None
         lambda data, **how: km.bilinear_edmd(data, LIFTING, **how),
         lambda data, **how: km.dmdc(data, **how),
     ):
-        a, b = fit(km.Files(folder), workers=2), fit(whole)
+        a, b = fit(km.data.Files(folder), workers=2), fit(whole)
         assert np.allclose(a.A, b.A, rtol=0, atol=1e-10)
         assert np.allclose(a.B, b.B, rtol=0, atol=1e-10)
         assert (a.states, a.inputs, a.dt) == (b.states, b.inputs, b.dt)
@@ -178,7 +178,7 @@ def test_weights_are_a_number_an_episode_one_a_step_or_a_function(sets: list[km.
         == by_number
     )
     assert km.moments.second_moments(data, LIFTING, weights=by_first_state) == by_number
-    files = km.moments.second_moments(km.Files(folder), LIFTING, weights=by_first_state, workers=2)
+    files = km.moments.second_moments(km.data.Files(folder), LIFTING, weights=by_first_state, workers=2)
     assert close(files.sums, by_number.sums)
     assert files.weight == pytest.approx(by_number.weight)
 
@@ -242,4 +242,4 @@ def test_weights_that_do_not_fit_are_refused() -> None:
     with pytest.raises(
         km.errors.DataError, match="weights are a list, which only Episodes have an order for; pass a function"
     ):
-        km.moments.second_moments(km.Stream([data]), km.State(), weights=[1.0, 1.0])
+        km.moments.second_moments(km.data.Stream([data]), km.State(), weights=[1.0, 1.0])

@@ -1,4 +1,4 @@
-"""The regressions behind km.eigenfunctions against brute force on the samples themselves."""
+"""The regressions behind km.identify.eigenfunctions against brute force on the samples themselves."""
 
 import numpy as np
 import pytest
@@ -205,7 +205,7 @@ def turning(by, rate=-0.3 + 2j, nu=2):
 @pytest.mark.parametrize(("by", "exact"), [("steps", 1e-9), ("derivatives", 1e-5)])
 def test_a_complex_eigenfunction_has_the_effect_of_its_inputs(by, exact):
     data, b = turning(by)
-    found = km.eigenfunctions(data, ALL, eigenvalue=None, by=by, tolerance=10.0)
+    found = km.identify.eigenfunctions(data, ALL, eigenvalue=None, by=by, tolerance=10.0)
     phi = min(found, key=lambda each: abs(each.eigenvalue - (-0.3 + 2j)))  # the others are its products
     assert phi.eigenvalue == pytest.approx(-0.3 + 2j, abs=exact)
     c = phi.coefficients[0] + 1j * phi.coefficients[1]
@@ -243,7 +243,7 @@ def test_a_real_eigenvalue_stays_real_and_its_effect_takes_the_fewest_terms():
             x.append(np.exp(-0.5 * DT) * x[-1] + (np.exp(-0.5 * DT) - 1) / -0.5 * (0.7 * u[0] - 2 * u[1]))
         parts.append(km.Episode(X=np.column_stack([x, rng.normal(size=31)]), U=U))
     data = km.Episodes(parts, DT)
-    (phi,) = km.eigenfunctions(data, ALL, eigenvalue=None, count=1)
+    (phi,) = km.identify.eigenfunctions(data, ALL, eigenvalue=None, count=1)
     assert phi.rates == (pytest.approx(-0.5, abs=1e-9),)
     np.testing.assert_allclose(phi.coefficients, [[1, 0, 0, 0, 0, 0]], atol=1e-9)
     assert np.count_nonzero(phi.drive) == 2
@@ -255,17 +255,17 @@ def test_an_eigenfunction_is_zero_at_an_equilibrium_that_is_not(eigenvalue):
     """x₀ → 3 with the rate −1 has the eigenfunction x₀ − 3, which needs the Constant."""
     rng, t = np.random.default_rng(0), 0.1 * np.arange(40)
     some = [np.column_stack([3 + a * np.exp(-t), b * np.exp(-2.5 * t)]) for a, b in rng.normal(size=(8, 2))]
-    found = km.eigenfunctions(km.Episodes([km.Episode(X=X) for X in some], 0.1), ALL, eigenvalue=eigenvalue)
+    found = km.identify.eigenfunctions(km.Episodes([km.Episode(X=X) for X in some], 0.1), ALL, eigenvalue=eigenvalue)
     phi = next(each for each in found if abs(each.eigenvalue + 1) < 1e-9)
     np.testing.assert_allclose(phi.coefficients, [[-1 / 3, 0, 0, 0, 0, 1]], atol=1e-8)
     assert phi.error < 1e-8
 
 
 def test_a_growth_of_one_keeps_all_observables_and_all_terms_of_the_effect():
-    (phi,) = km.eigenfunctions(wandering(6), ALL, eigenvalue=-1.0, count=1, growth=1)
+    (phi,) = km.identify.eigenfunctions(wandering(6), ALL, eigenvalue=-1.0, count=1, growth=1)
     assert np.all(phi.coefficients != 0)
     assert np.all(phi.drive != 0)
-    (few,) = km.eigenfunctions(wandering(6), ALL, eigenvalue=-1.0, count=1)
+    (few,) = km.identify.eigenfunctions(wandering(6), ALL, eigenvalue=-1.0, count=1)
     assert np.count_nonzero(few.coefficients) < 6
     assert np.count_nonzero(few.drive) < 6
 
@@ -309,7 +309,7 @@ def wandering(count, steps=24, noise=1e-3):
 def test_the_residual_and_the_error_are_those_of_the_docstring():
     data, held = wandering(6), wandering(3, noise=1e-2)
     for eigenvalue in (-1.0, -3.0):
-        found = km.eigenfunctions(data, ALL, eigenvalue=eigenvalue, held_out=held, tolerance=10.0)
+        found = km.identify.eigenfunctions(data, ALL, eigenvalue=eigenvalue, held_out=held, tolerance=10.0)
         assert len(found)
         assert [phi.error for phi in found] == sorted(phi.error for phi in found)
         for phi in found:
@@ -340,14 +340,14 @@ def test_by_default_every_fourth_episode_is_held_out_or_the_last_quarter_of_each
     data = wandering(9)
     whole = list(data)
     train = data.with_episodes([e for i, e in enumerate(whole) if i not in (3, 7)])
-    own = km.eigenfunctions(data, ALL, eigenvalue=-1.0)
-    asked = km.eigenfunctions(train, ALL, eigenvalue=-1.0, held_out=data.with_episodes([whole[3], whole[7]]))
+    own = km.identify.eigenfunctions(data, ALL, eigenvalue=-1.0)
+    asked = km.identify.eigenfunctions(train, ALL, eigenvalue=-1.0, held_out=data.with_episodes([whole[3], whole[7]]))
     assert told(own) == told(asked)
     three = data.with_episodes(whole[:3])
     train = data.with_episodes([km.Episode(X=e.X[:19], U=e.U[:18]) for e in three])
     test = data.with_episodes([km.Episode(X=e.X[18:], U=e.U[18:]) for e in three])
-    asked = km.eigenfunctions(train, ALL, eigenvalue=-1.0, held_out=test)
-    assert told(km.eigenfunctions(three, ALL, eigenvalue=-1.0)) == told(asked)
+    asked = km.identify.eigenfunctions(train, ALL, eigenvalue=-1.0, held_out=test)
+    assert told(km.identify.eigenfunctions(three, ALL, eigenvalue=-1.0)) == told(asked)
 
 
 @pytest.mark.parametrize("by", ["steps", "derivatives"])

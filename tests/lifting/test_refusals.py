@@ -123,7 +123,9 @@ MISTAKES = [
     (
         DATA,
         r"a stream is read once, by the fit; take Standardized\.of from",
-        lambda: km.Standardized.of(km.Stream(iter([km.Episodes([km.Episode(X=np.zeros((4, 3)))], 0.1)])), km.State()),
+        lambda: km.Standardized.of(
+            km.data.Stream(iter([km.Episodes([km.Episode(X=np.zeros((4, 3)))], 0.1)])), km.State()
+        ),
     ),
     (DATA, "scale holds 0; it must be above zero for every state", lambda: km.Standardized(km.State(), [0, 0], [1, 0])),
     (SHAPE, r"scale has shape \(1,\), expected \(2,\)", lambda: km.Standardized(km.State(), [0, 0], [1])),

@@ -76,6 +76,6 @@ def test_files_are_read_part_by_part(tmp_path) -> None:
     data = _data(2.0, -3.0)
     for i, episode in enumerate(data):
         km.Episodes([episode], data.dt, data.states).save(tmp_path / f"{i:02d}.npz")
-    read, whole = km.Standardized.of(km.Files(tmp_path), km.State()), km.Standardized.of(data, km.State())
+    read, whole = km.Standardized.of(km.data.Files(tmp_path), km.State()), km.Standardized.of(data, km.State())
     assert read.mean == pytest.approx(whole.mean, rel=1e-13)
     assert read.scale == pytest.approx(whole.scale, rel=1e-13)

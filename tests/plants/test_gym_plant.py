@@ -1,4 +1,4 @@
-"""Gymnasium's environments as plants: km.GymPlant."""
+"""Gymnasium's environments as plants: km.plants.GymPlant."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def pendulum_step(x, u, dt=0.05):
 
 @pytest.fixture
 def pendulum():
-    return km.GymPlant("Pendulum-v1", **PENDULUM)
+    return km.plants.GymPlant("Pendulum-v1", **PENDULUM)
 
 
 def test_the_pendulum_moves_as_its_documentation_says_with_an_angle_that_never_jumps(pendulum):
@@ -70,29 +70,29 @@ def test_an_input_that_the_environment_would_cut_in_silence_is_refused(pendulum)
 )
 def test_what_does_not_fit_is_refused_with_the_name_of_the_environment(name, settings, message):
     with pytest.raises(km.KoopmpcError, match=message):
-        km.GymPlant(name, **settings)
+        km.plants.GymPlant(name, **settings)
 
 
 def test_what_is_no_environment_is_refused():
     with pytest.raises(km.KoopmpcError, match="env is a int, expected a Env"):
-        km.GymPlant(3)
+        km.plants.GymPlant(3)
 
 
 def test_an_x0_that_the_environment_cannot_take_is_refused_and_a_function_helps():
-    seen = km.GymPlant("Pendulum-v1")  # x is (cos, sin, rate), and the environment's own state has two entries
+    seen = km.plants.GymPlant("Pendulum-v1")  # x is (cos, sin, rate), and the environment's own state has two entries
     with pytest.raises(km.KoopmpcError, match="does not tell how to begin at x0"):
         seen.reset([1.0, 0.0, 0.5])
 
     def start(env, x0):
         env.unwrapped.state = np.array([np.arctan2(x0[1], x0[0]), x0[2]])
 
-    helped = km.GymPlant("Pendulum-v1", start=start)
+    helped = km.plants.GymPlant("Pendulum-v1", start=start)
     assert helped.reset([0.6, 0.8, 0.5]) == pytest.approx([0.6, 0.8, 0.5], abs=1e-6)
 
 
 def test_wrappers_of_observations_are_seen_in_the_first_observation_too():
     env = gymnasium.wrappers.TransformObservation(gymnasium.make("Pendulum-v1"), lambda y: y * [1, 1, 10], None)
-    plant = km.GymPlant(env, **PENDULUM)
+    plant = km.plants.GymPlant(env, **PENDULUM)
     with pytest.raises(km.KoopmpcError, match="was put into x0"):
         plant.reset([0.1, 0.5])
     assert plant.reset([0.1, 0.0]) == pytest.approx([0.1, 0.0], abs=1e-6)
@@ -118,7 +118,7 @@ class TestMujoco:
 
     @pytest.fixture
     def cart(self):
-        return km.GymPlant("InvertedPendulum-v5", states=("x [m]", "theta [rad]", "v [m/s]", "omega [rad/s]"))
+        return km.plants.GymPlant("InvertedPendulum-v5", states=("x [m]", "theta [rad]", "v [m/s]", "omega [rad/s]"))
 
     def test_an_episode_ends_where_the_pole_falls_and_the_next_begins_apart(self, cart):
         data = km.collect(cart, None, km.Noise(-3, 3), episodes=5, steps=300)

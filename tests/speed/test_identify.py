@@ -99,7 +99,7 @@ def test_a_stream_of_ten_million_rows_needs_no_memory_of_its_own(benchmark, rout
         for sets in (10, 100):
             gc.collect()
             tracemalloc.start()
-            km.moments.second_moments(km.Stream(one for _ in range(sets)), km.State(), route=route)
+            km.moments.second_moments(km.data.Stream(one for _ in range(sets)), km.State(), route=route)
             peaks[f"extra at {sets * 100_000} [MB]"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 2)
             tracemalloc.stop()
 
@@ -161,7 +161,7 @@ def test_two_dask_workers_against_one(benchmark, tmp_path: Path) -> None:
         episode = km.Episode(X=rng.standard_normal((240_001, 8)), U=rng.standard_normal((240_000, 1)))
         km.Episodes([episode], 0.1).save(tmp_path / f"{i:02}.npz")
     lifting = km.State() + km.Gaussian(rng.standard_normal((92, 8)), 2.0)
-    source, pairs = km.Files(tmp_path), []
+    source, pairs = km.data.Files(tmp_path), []
 
     with cluster(1) as one, cluster(2) as two:
         where = ({"scheduler": one}, {"scheduler": two})

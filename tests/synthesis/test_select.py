@@ -271,13 +271,13 @@ def test_workers_change_nothing_and_a_lifting_of_ones_own_reaches_them():
 def test_a_source_is_chosen_on_a_sample_and_fitted_to_all():
     sets = [episodes_of(quadratic, count=4, steps=20, seed=s) for s in range(12)]
     found = km.select(
-        km.Stream(sets), candidates=[SQUARES], horizon=5, delays=[0], sample=300, bilinear=False, ridges=[1e-6]
+        km.data.Stream(sets), candidates=[SQUARES], horizon=5, delays=[0], sample=300, bilinear=False, ridges=[1e-6]
     )
     assert found.predictor.report.samples == 12 * 4 * 20
     assert "chosen on" in found.notes[0]
     assert "fitted to all" in found.notes[0]
     with pytest.raises(km.errors.DataError, match="a selection reads its data several times"):
-        km.select(km.Stream(iter(sets)), candidates=[SQUARES])
+        km.select(km.data.Stream(iter(sets)), candidates=[SQUARES])
 
 
 def test_one_long_episode_is_cut_into_blocks_and_the_choice_says_so():
@@ -309,11 +309,11 @@ def test_whole_episodes_are_dealt_out_evenly_and_short_ones_are_counted():
 
 def test_a_sample_is_whole_episodes_or_the_beginning_of_one():
     data = episodes_of(linear, count=50, steps=20)
-    held, notes = sampled(km.Stream([data]), 200)
+    held, notes = sampled(km.data.Stream([data]), 200)
     assert sum(map(len, held)) == 200
     assert all(any(np.array_equal(one.X, e.X) for e in data) for one in held)
     assert notes
-    held, _ = sampled(km.Stream([episodes_of(linear, count=1, steps=500)]), 100)
+    held, _ = sampled(km.data.Stream([episodes_of(linear, count=1, steps=500)]), 100)
     assert [len(e) for e in held] == [100]
 
 

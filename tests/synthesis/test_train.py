@@ -148,7 +148,7 @@ def test_memory_goes_with_the_windows_and_not_with_the_data(tmp_path, monkeypatc
         for i, each in enumerate(sets[:count]):
             each.save(folder / f"{i}.npz")
         tracemalloc.start()
-        km.train(lifting, km.Files(folder), horizon=5, windows=100, iterations=2)
+        km.train(lifting, km.data.Files(folder), horizon=5, windows=100, iterations=2)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     one = sum(e.X.nbytes + e.U.nbytes for e in sets[0])
@@ -190,7 +190,7 @@ def test_bad_input_is_refused_in_a_sentence(data):
     with pytest.raises(km.errors.DataError, match="every width must be above zero"):
         km.Gaussian(CENTERS, [1.0, -1.0, 1, 1, 1, 1])
     with pytest.raises(km.errors.DataError, match="a stream is read once"):
-        km.train(lifting, km.Stream(iter([data])))
+        km.train(lifting, km.data.Stream(iter([data])))
     with pytest.raises(km.errors.DataError, match="too short to hold a part of them out"):
         km.train(lifting, data[:1], horizon=12)
 

@@ -121,5 +121,5 @@ def test_data_of_something_else_are_refused() -> None:
 def test_a_source_is_read_as_its_episodes_are() -> None:
     data = one_step_pairs(pendulum, 2, 1, 60)
     model = km.edmd(data, km.State())
-    streamed = km.validate.residual_dmd(model, km.Stream([data[:20], data[20:]]))
+    streamed = km.validate.residual_dmd(model, km.data.Stream([data[:20], data[20:]]))
     assert np.allclose(streamed.residuals, km.validate.residual_dmd(model, data).residuals, rtol=1e-10)

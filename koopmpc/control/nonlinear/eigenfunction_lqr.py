@@ -35,8 +35,8 @@ class EigenfunctionLQR(FeedbackLaw):
     Parameters
     ----------
     eigenfunction
-        A real one of `km.eigenfunctions`; or any bound lifting of one observable, ``km.Expressions(…).bind(states)``
-        say, with its `eigenvalue`.
+        A real one of `km.identify.eigenfunctions`; or any bound lifting of one observable,
+        ``km.Expressions(…).bind(states)`` say, with its `eigenvalue`.
     cost
         Q and R, and ``of`` this eigenfunction: the reference is φ_r. Q_N and tail have no meaning here.
     limits
@@ -76,7 +76,7 @@ class EigenfunctionLQR(FeedbackLaw):
         B: ArrayLike | Callable[[ca.SX], ca.SX] | None = None,
         eigenvalue: float | None = None,
     ) -> None:
-        checks.kind(eigenfunction, "eigenfunction", Lifting, "find one with km.eigenfunctions")
+        checks.kind(eigenfunction, "eigenfunction", Lifting, "find one with km.identify.eigenfunctions")
         if eigenfunction.nz != 1:
             raise DataError(
                 f"the eigenfunction has {eigenfunction.nz} observables ({', '.join(eigenfunction.names)}); pass a real"

@@ -59,7 +59,7 @@ def second_moments(
     Parameters
     ----------
     episodes
-        Episodes, or a Source: ``Files("logs")``, ``Stream(iterator)``.
+        Episodes, or a Source: ``km.data.Files("logs")``, ``km.data.Stream(iterator)``.
     lifting
         ψ; it is bound to the states, or to ζ of the embedding.
     embedding
