@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.monitor import _bounds
 from tests.bare import shown
 from tests.example_plants import Pendulum
 
@@ -244,23 +243,32 @@ def test_errors_near_rounding_count_as_a_billionth_of_the_states():
     np.testing.assert_allclose(got / np.trace(got), expected / np.trace(expected), rtol=1e-6)
 
 
+def watched(pairs, level):
+    """The monitor of x⁺ = 0 on pairs (x, x⁺), one an episode: x⁺ is all error."""
+    n = len(pairs[0][0])
+    still = km.LinearPredictor(np.zeros((n, n)), np.zeros((n, 0)), np.eye(n), km.State(), DT, tuple("abc")[:n], ())
+    rows = [km.Episode(X=np.array(pair), U=np.zeros((1, 0))) for pair in pairs]
+    return km.control.Monitor.of(still, km.Episodes(rows, DT, still.states, ()), level=level)
+
+
 def test_where_the_data_have_no_width_they_count_as_a_billionth_of_their_widest_direction():
     """Rows (a, a) in units of their size: along (1, 1) the second moment is 2, along (1, −1) it is 2e-9 in place of 0."""
     a = np.random.default_rng(0).standard_normal(50)
-    G = _bounds(np.column_stack([a, 3 * a]), 0.0, np.ones((1, 2)), 40)
+    L = watched([((x, 3 * x), (0.0, 0.0)) for x in a], 40 / 51).leverage
     size = np.sqrt(np.mean(a**2))
     inside = np.sort((a / size) ** 2)[39]  # (a, a) in units of the size, by the width along it
     across = np.array([1.0, -3.0]) * size
-    assert (G @ across) @ (G @ across) == pytest.approx(2 / 2e-9 / inside, rel=1e-4)
+    assert (L @ across) @ (L @ across) == pytest.approx(2 / 2e-9 / inside, rel=1e-4)
 
 
-def test_a_share_of_each_state_is_inside_whatever_the_errors_are():
-    """‖G v‖² is at most 1 where v is the share of one state, and 1 for the worst of these or the rank-th of the rows."""
+def test_a_billionth_of_each_state_is_inside_whatever_the_errors_are():
+    """‖W e‖² is at most 1 where e is 1e-9 of one state's size, and 1 for the worst of these or the rank-th of the errors."""
     rng = np.random.default_rng(0)
-    for spread in (0.01, 0.3, 10.0):
-        rows, of = spread * rng.standard_normal((60, 3)) @ rng.standard_normal((3, 3)), rng.standard_normal((60, 3))
-        G = _bounds(rows, 0.5, of * [1, 5, 0.2], 50)
-        shares = np.diag(0.5 * np.sqrt(np.mean((of * [1, 5, 0.2]) ** 2, axis=0)))
-        worst = max(float(np.sum((G @ v) ** 2)) for v in shares)
-        ranked = np.sort(np.sum((rows @ G.T) ** 2, axis=1))[49]
+    for spread in (0.02e-9, 0.6e-9, 20e-9):
+        errors = spread * rng.standard_normal((60, 3)) @ rng.standard_normal((3, 3))
+        X = rng.standard_normal((60, 3)) * [1, 5, 0.2]
+        W = watched(list(zip(X, errors, strict=True)), 50 / 61).band
+        shares = 1e-9 * np.diag(np.sqrt(np.mean(np.vstack([X, errors]) ** 2, axis=0)))
+        worst = max(float(np.sum((W @ v) ** 2)) for v in shares)
+        ranked = np.sort(np.sum((errors @ W.T) ** 2, axis=1))[49]
         assert max(worst, ranked) == pytest.approx(1.0)
