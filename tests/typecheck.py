@@ -9,15 +9,20 @@ Together they halve the time of the typed tests, and coverage has fewer calls to
 import dataclasses
 import functools
 import inspect
+import sys
+import typing
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 
 import jaxtyping
+import numpy as np
 from beartype import BeartypeConf, beartype
+from numpy._typing._array_like import _Buffer
 from numpy._typing._nested_sequence import _NestedSequence
 
 _NestedSequence.register(tuple)  # numpy takes a tuple as ArrayLike, though it has no __reversed__
+_Buffer.register(np.ndarray)  # an array is ArrayLike at the first try in Python 3.11 too, as in 3.12
 beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True))  # ints pass for floats
 
 _jaxtyped = jaxtyping.jaxtyped
@@ -31,6 +36,8 @@ _typed_before: dict[
 
 def hook() -> None:
     """Let every module of koopmpc that is imported from now on check its types."""
+    if sys.version_info < (3, 12):  # later versions ask a protocol once for its attributes, too
+        typing._get_protocol_attrs = functools.cache(typing._get_protocol_attrs)
     jaxtyping.jaxtyped = _checked  # the decorator that the import hook writes above each function and class
     jaxtyping.install_import_hook("koopmpc", "tests.typecheck.beartyped")
 

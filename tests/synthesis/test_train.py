@@ -136,23 +136,19 @@ def test_delays_and_few_episodes_are_trained_too():
 
 def test_memory_goes_with_the_windows_and_not_with_the_data(tmp_path, monkeypatch):
     lifting = km.State() + km.Gaussian(CENTERS, 0.8)
-    sets = [
-        km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-1, 1), episodes=4, steps=1000, rng=i)
-        for i in range(24)
-    ]
+    one = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-1, 1), episodes=4, steps=1000, rng=0)
     peaks = []
     monkeypatch.setattr("koopmpc.data.files.storage._PART", 100_000)  # bytes that are read at once
     for count in (4, 24):
         folder = tmp_path / str(count)
         folder.mkdir()
-        for i, each in enumerate(sets[:count]):
-            each.save(folder / f"{i}.npz")
+        for i in range(count):
+            km.Episodes([km.Episode(X=e.X[i:], U=e.U[i:]) for e in one], one.dt).save(folder / f"{i}.npz")
         tracemalloc.start()
         km.train(lifting, km.data.Files(folder), horizon=5, windows=100, iterations=2)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    one = sum(e.X.nbytes + e.U.nbytes for e in sets[0])
-    assert peaks[1] < peaks[0] + 4 * one  # 20 more were read
+    assert peaks[1] < peaks[0] + 4 * sum(e.X.nbytes + e.U.nbytes for e in one)  # 20 more were read
 
 
 def test_ctrl_c_stops_it(data, monkeypatch):
