@@ -23,7 +23,8 @@ from numpy._typing._nested_sequence import _NestedSequence
 
 _NestedSequence.register(tuple)  # numpy takes a tuple as ArrayLike, though it has no __reversed__
 _Buffer.register(np.ndarray)  # an array is ArrayLike at the first try in Python 3.11 too, as in 3.12
-beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True))  # ints pass for floats
+# Ints pass for floats; what does not fit is a TypeError, as jaxtyping's own errors are.
+beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError))
 
 _jaxtyped = jaxtyping.jaxtyped
 _SHAPES = _jaxtyped(
