@@ -20,20 +20,25 @@ if MODE == "typed":
     tests.typecheck.hook()
 
 LONGEST = [
-    "fitting/test_fit.py",
     "synthesis/test_design.py",
+    "fitting/test_goal.py",
     "validate/logs/test_audit.py",
+    "fitting/test_fit.py",
+    "synthesis/test_stabilise.py",
     "faults/test_sweeps.py",
     "test_parallel.py",
     "bench/test_problems.py",
-    "codegen/test_export.py",
-    "codegen/test_bilinear.py",
     "bench/test_sweep.py",
     "bench/test_store.py",
     "bench/test_shipped.py",
+    "codegen/test_export.py",
+    "codegen/test_bilinear.py",
+    "control/test_adaptive.py",
+    "faults/test_glitches.py",
     "faults/test_logs.py",
     "test_first_edition.py",
     "test_cli.py",
+    "synthesis/test_train.py",
     "identify/test_moments_sources.py",
     "control/test_koopman_mpc.py",
 ]  # files that take a process 8 s and more
