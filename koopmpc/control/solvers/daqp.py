@@ -38,7 +38,7 @@ _STEEP = 1e-8  # smallest over largest eigenvalue of AᵀA of the hard rows belo
 _DAMPING, _EASING, _MOST_DAMPING, _PASSES = 1e7, 10.0, 1e9, 20
 _LEAST = np.full(1, 1e-300)
 _SLOW = 0.1  # share of what the step before missed above which the weight is eased
-_CURVED = 1e-6  # least curvature of a price by its slope, per unit of a row: DAQP divides by it
+_CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DAQP divides by it, and with 1e-10 it errs
 
 FEW = 20  # active rows up to which the next solve goes on from them
 _MANY = 16  # iterations of a solve that tell how long one takes

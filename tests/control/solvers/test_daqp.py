@@ -123,6 +123,16 @@ def test_linear_slacks_solve_warm_as_they_do_cold():
             assert exactness(moved, solution.v, solution.y) < 1e-6
 
 
+@pytest.mark.parametrize(("quadratic", "far"), [(1e-8, 5000.0), (0.0, 50.0)])
+def test_a_soft_row_far_beyond_what_v_reaches_costs_its_price_and_no_more(quadratic, far):
+    """½ |v|² + p ε + q ε² with ε = a·v + far has its minimum at v = −a (p + 2 q far) / (1 + 2 q |a|²)."""
+    a, p = np.array([0.8, 0.1]), 0.4
+    price = Softness(np.array([p]), np.array([quadratic]), np.zeros(1))
+    solution = solved(DAQP(QP(EYE, 0 * ONE, a[None], np.array([-1e20]), np.array([-far]), price)), 2, 1)
+    assert solution.status is km.Status.OPTIMAL
+    np.testing.assert_allclose(solution.v, -a * (p + 2 * quadratic * far) / (1 + 2 * quadratic * a @ a), rtol=1e-6)
+
+
 def test_limits_are_as_they_were_after_the_wider_second_solve():
     apart = np.vstack([EYE, EYE[:1]])
     solver = DAQP(QP(EYE, -3 * ONE, apart, -np.ones(3), np.ones(3)))
