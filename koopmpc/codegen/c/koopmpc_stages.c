@@ -340,11 +340,11 @@ static koopmpc_real interior(koopmpc_state *s, koopmpc_real mu, koopmpc_real sig
   return length;
 }
 
-/** The mean curvature of the cost along the span of an input. */
+/** The mean curvature of the cost along the span of an input, or its size where it has no limits. */
 static koopmpc_real unit_of(const koopmpc_state *s) {
   koopmpc_real span[NV], sum = 0;
   int count = 0;
-  koopmpc_fill(span, 1, NV);
+  koopmpc_copy(span, koopmpc_input_sizes, NV);
   for (int i = 0; i < SIDES; i++)
     if (koopmpc_side_row[i] < NV) span[koopmpc_side_row[i]] = koopmpc_side_span[i];
   for (int k = 0; k < STEPS; k++)

@@ -271,9 +271,9 @@ class RealTimeIteration:
         return np.matmul(self._dX[:, None, :], self._G)[:, 0]
 
     def _unit(self) -> float:
-        """Return the mean curvature of the cost along the span of an input."""
+        """Return the mean curvature of the cost along the span of an input, or its size where it has no limits."""
         s, nu = self._sides, self._shape[2]
-        span = np.ones(nu)
+        span = self._input_sizes.copy()
         mine = s.row < nu
         span[s.row[mine]] = s.span[mine]
         return max(float(np.mean(self._curvature[self._free_stages] * span**2)), 1e-300)
