@@ -52,8 +52,9 @@ class Cost(Value):
         Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
         was fitted to data until the gain rests as far as the model is accurate, that is, until a further step changes
         the gain by a smaller share than the model misses of its states in one step: a longer tail would only add the
-        errors of such a model. BilinearMPC and NonlinearMPC have no tail by default: without Q_N and tail their end
-        costs the Riccati solution at the equilibrium nearest to r_N.
+        errors of such a model. Of that length, its halves, N and none the shortest is taken whose loop on the model
+        itself, with inputs half a step late, costs within 0.5 % of the least. BilinearMPC and NonlinearMPC have no
+        tail by default: without Q_N and tail their end costs the Riccati solution at the equilibrium nearest to r_N.
 
     Raises
     ------

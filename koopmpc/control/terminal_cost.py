@@ -34,10 +34,11 @@ ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or 
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
 GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row come out as 1 ± 1e-8, three as 1 ± 1e-5
 APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
-AXES, LOOPS, FARTHEST = 8, 3, 20.0  # of trial loops: axes of starts, horizons, standard deviations that states go
+AXES, FARTHEST = 8, 20.0  # of trial loops: axes of starts, standard deviations that states go
 ALIKE = 0.01  # share of a law, over the data, by which others may differ and need no trial
-WORTH = 1.05  # cost of a trial loop by the least up to which the longer tail is taken
-AHEAD = 10  # horizons within which the gain of a learned model rests, or else its tail is as long as the horizon
+LATE, WORTH = 0.5, 0.005  # steps that an input comes late; share that a trial loop with a shorter tail may cost more
+LITTLE = 1e-3  # share of that which a step may cost when a trial loop is at rest
+AHEAD, SHORT = 10, 20  # horizons of a trial loop, and within which a gain is to rest; the least N that counts there
 
 
 def terminal_of(
@@ -172,63 +173,78 @@ def learned_steps(
     plant does not have grow in it until they rule the plan. Both shares are root mean squares over the data, about
     their mean: that of the change is ‖Lᵀ(K⁺ − K)(z − z̄)‖ over ‖LᵀK⁺(z − z̄)‖, S = L Lᵀ, so that inputs count by what
     they cost. The gain rests when the change is so small for as many steps in a row as ψ has arguments, for a weight
-    may take that long to reach an input. The tail has N steps where this takes more than 10 N, and where the
-    model does not know its errors. It is shortened to a half, a quarter or none of that where the loop is better off
-    on the re-lifted model, see `believed_steps`. `inverse` takes z into the coordinates of the stage, where these are
-    others.
+    may take that long to reach an input; it is waited for T = 10 N steps, 200 at least. The tail is shortened where the
+    loop on the re-lifted model does not gain by its length, see `believed_steps`. Models of delays and of fewer
+    coordinates than their lifting has are not tried so; where their gain does not rest, and where a model does not know
+    its errors, the tail has N steps. `inverse` takes z into the coordinates of the stage, where these are others.
     """
     scale = predictor.scale
     if predictor.report is None or scale is None:
         return N
     back = np.eye(len(scale)) if inverse is None else inverse
-    return believed_steps(stage, predictor, N, _rested_steps(stage, predictor, N, back), back)
+    rested = _rested_steps(stage, predictor, N, back)
+    if predictor.embedding is not None or predictor.lifting.nz != len(scale):
+        return rested or N
+    return believed_steps(stage, predictor, N, rested or _ahead(N), back)
 
 
 def believed_steps(
     stage: Stage, predictor: LinearPredictor, N: int, most: int, inverse: Float[np.ndarray, "nz nz"]
 ) -> int:
-    """Return the longest tail of `most` steps, a half, a quarter or none whose loop costs at most 5 % above the least.
+    """Return the shortest tail of none, N, `most`, a half, a quarter … of these steps, down to N/4, that is as good.
 
     Without limits, N planned steps and a tail are a law u = −K z. Each law steers the re-lifted model
-    x⁺ = C (A ψ(x) + B u) for 3 N steps. Modes of A that the lifted states do not have grow in a long tail until they
-    rule the law; in these trials such a law costs what it would on the plant, for states that are lifted afresh do not
-    have the mode. States, z and u are deviations from the mean of the data, which is taken to be at rest. The trials
-    start a standard deviation from it, along the first eight principal axes of the states in units of their standard
-    deviations. The tail has `most` steps where all laws are alike, and on a model of delays or of fewer coordinates
-    than its lifting has.
+    x⁺ = C (A ψ(x) + B u) for T steps. Modes of A that the lifted states do not have grow in a
+    long tail until they rule the law; in these trials such a law costs what it would on the plant, for states that are
+    lifted afresh do not have the mode. States, z and u are deviations from the mean of the data, which is taken to be
+    at rest. The trials start a standard deviation from it, along the first eight principal axes of the states in units
+    of their standard deviations. The inputs act half a step late, u = (−K z_k − K z_{k−1})/2: a law that leans on fast
+    modes, those of the model's errors above all, pays for that, a good one hardly. What little a longer tail gains on
+    the model need not be gained on the plant: a trial is as good as the best one up to 0.5 % above it. Both, the
+    lateness and this share, go to zero with (T m)² where the share m that the model misses of its states in a step is
+    small: a model without errors is believed. The tail has `most` steps where all laws are alike.
     """
     scale, lifting = predictor.scale, predictor.lifting
-    if scale is None or predictor.embedding is not None or lifting.nz != len(scale):
+    if scale is None:
         return most
     C, nz, constant = predictor.C, len(scale), lifting.constant_index
-    lengths = sorted({most, most // 2, most // 4, 0}, reverse=True)
+    halves = max(2, (4 * most // N).bit_length() - 1)
+    lengths = sorted({0, min(N, most), *(most >> i for i in range(halves + 1))})
     laws = _laws(stage, [n + N for n in lengths])
     seen = scale @ inverse.T
-    if max(np.linalg.norm(seen @ (law - laws[0])[:nz]) for law in laws) <= ALIKE * np.linalg.norm(seen @ laws[0][:nz]):
+    if max(np.linalg.norm(seen @ (law - laws[-1])[:nz]) for law in laws) <= ALIKE * np.linalg.norm(
+        seen @ laws[-1][:nz]
+    ):
         return most
     center = np.zeros(len(C)) if constant is None else C @ (scale.T @ scale[:, constant])
-    spread = C @ scale.T @ scale @ C.T - np.outer(center, center)
+    apart = _spread(predictor, scale) @ C.T
+    spread = apart.T @ apart
     sizes = np.sqrt(np.where(spread.diagonal() > 0, spread.diagonal(), 1.0))
     values, axes = np.linalg.eigh(spread / np.outer(sizes, sizes))
     ways = (sizes[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))[:, ::-1][:, :AXES].T
     X = np.tile(center + np.vstack([ways, -ways]), (len(laws), 1, 1))
     V, cost = np.zeros((*X.shape[:2], stage.B.shape[1])), np.zeros(len(laws))
     CA, CB = C @ predictor.A, np.linalg.solve(inverse.T, C.T).T @ stage.B[:nz]
-    rest = lifting(center[None])
+    rest, steps = lifting(center[None]), _ahead(N)
+    unsure = min(1.0, (steps * _missed(predictor, scale)) ** 2 / WORTH)
     with np.errstate(all="ignore"):
-        for _ in range(LOOPS * N):
+        for _ in range(steps):
             moved = lifting(X.reshape(-1, len(center))).reshape(*X.shape[:2], nz) - rest
             xi = moved @ inverse.T
             if len(stage.A) > nz:  # the last input is beside z
                 xi = np.concatenate([xi, V], axis=2)
-            V = -xi @ laws
-            cost += ((xi @ stage.Q) * xi).sum(axis=(1, 2)) + ((V @ stage.R) * V).sum(axis=(1, 2))
+            V_before, V = V, -xi @ laws
+            spent = ((xi @ stage.Q) * xi).sum(axis=(1, 2)) + ((V @ stage.R) * V).sum(axis=(1, 2))
             if stage.M is not None:
-                cost += 2 * ((xi @ stage.M) * V).sum(axis=(1, 2))
-            ahead = np.nan_to_num((moved @ CA.T + V @ CB.T) / sizes, nan=FARTHEST)
+                spent += 2 * ((xi @ stage.M) * V).sum(axis=(1, 2))
+            cost += spent
+            if not (spent > LITTLE * WORTH * unsure * cost).any():  # all loops are at rest, or beyond all numbers
+                break
+            acts = V + LATE * unsure * (V_before - V)
+            ahead = np.nan_to_num((moved @ CA.T + acts @ CB.T) / sizes, nan=FARTHEST)
             X = center + sizes * np.clip(ahead, -FARTHEST, FARTHEST)
     cost = np.where(np.isfinite(cost), cost, np.inf)
-    return next(n for n, each in zip(lengths, cost, strict=True) if each <= WORTH * cost.min())
+    return next(n for n, each in zip(lengths, cost, strict=True) if each <= (1 + WORTH * unsure) * cost.min())
 
 
 def _laws(stage: Stage, steps: list[int]) -> Float[np.ndarray, "laws nx nu"]:
@@ -245,22 +261,15 @@ def _laws(stage: Stage, steps: list[int]) -> Float[np.ndarray, "laws nx nu"]:
 
 
 def _rested_steps(stage: Stage, predictor: LinearPredictor, N: int, inverse: Float[np.ndarray, "nz nz"]) -> int:
-    """Return the steps until the gain rests as far as the model is accurate, or N."""
-    report, scale = predictor.report, predictor.scale
-    if report is None or scale is None:
-        return N
-    spread, constant = scale, predictor.lifting.constant_index
-    if constant is not None:
-        one = scale[:, [constant]] / np.linalg.norm(scale[:, constant])
-        spread = scale - one @ (one.T @ scale)
-    sizes: Float[np.ndarray, " nx"] = np.linalg.norm(spread @ predictor.C.T, axis=0)
-    missed: Float[np.ndarray, " n"] = report.residual[sizes > 0] / sizes[sizes > 0]
-    enough = max(float(np.sqrt(np.mean(missed**2))) if missed.size else 0.0, SETTLED)
-    spread = spread @ inverse.T
+    """Return the steps until the gain rests as far as the model is accurate, 0 where it does not."""
+    scale = predictor.scale
+    if scale is None:
+        return 0
+    enough, spread = max(_missed(predictor, scale), SETTLED), _spread(predictor, scale) @ inverse.T
     P = _last(stage)
-    (nz, _), needed, rested = scale.shape, len(predictor.lifting.bound or ()), 0
+    nz, needed, rested = len(scale), len(predictor.lifting.bound or ()), 0
     K = np.zeros(stage.B.T.shape)
-    for n in range(1, AHEAD * N + 1):
+    for n in range(1, _ahead(N) + 1):
         try:
             K_next, L, P = step(stage, P)
         except DefinitenessError:  # P has lost its digits
@@ -271,7 +280,29 @@ def _rested_steps(stage: Stage, predictor: LinearPredictor, N: int, inverse: Flo
         K, rested = K_next, rested + 1 if moved <= enough * whole else 0
         if rested >= needed:
             return n
-    return N
+    return 0
+
+
+def _ahead(N: int) -> int:
+    """Return T, the steps of a trial loop, within which the gain is to rest."""
+    return AHEAD * max(N, SHORT)
+
+
+def _spread(predictor: LinearPredictor, scale: Float[np.ndarray, "nz nz"]) -> Float[np.ndarray, "nz nz"]:
+    """Return S for which SᵀS is the covariance of z over the data; of `scale` SᵀS is the mean of z zᵀ."""
+    constant = predictor.lifting.constant_index
+    if constant is None:
+        return scale
+    one = scale[:, [constant]] / np.linalg.norm(scale[:, constant])
+    return scale - one @ (one.T @ scale)
+
+
+def _missed(predictor: LinearPredictor, scale: Float[np.ndarray, "nz nz"]) -> float:
+    """Return what the model misses of its states in a step, as a share of what they vary, root mean square."""
+    sizes: Float[np.ndarray, " nx"] = np.linalg.norm(_spread(predictor, scale) @ predictor.C.T, axis=0)
+    if predictor.report is None or not (sizes > 0).any():
+        return 0.0
+    return float(np.sqrt(np.mean((predictor.report.residual[sizes > 0] / sizes[sizes > 0]) ** 2)))
 
 
 def _last(stage: Stage) -> Float[np.ndarray, "nx nx"]:

@@ -88,7 +88,8 @@ def tail(model, cost, r, u_r, push=None, C=None, steps=600):
 def end_of(model, cost, targets, rows, push=None, C=None):
     """(F, h) of the terminal cost ‖F ξ_N − h‖²: a Q_N on the state or on z, or the tail."""
     if cost.Q_N is None:
-        steps = cost.tail if cost.tail is not None else 600 if model.report is None else len(rows) - 1
+        assert cost.tail is not None or model.report is None  # a learned model has a default of its own
+        steps = 600 if cost.tail is None else cost.tail
         return tail(model, cost, rows[-1], targets[-1][1], push, C, steps)
     P = np.asarray(cost.Q_N)
     root = scipy.linalg.sqrtm(np.diag(P) if P.ndim == 1 else P).real

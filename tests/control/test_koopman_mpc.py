@@ -90,7 +90,7 @@ def test_limits_on_observables_equal_cvxpy():
     plant, model = lifted_model()
     of = km.Fourier(1, states="theta")
     H = np.eye(model.nz)[[model.lifting.names.index(name) for name in of.bind(model.states).names]]
-    cost = km.Cost(Q=[5, 1], R=0.05)
+    cost = km.Cost(Q=[5, 1], R=0.05, tail=10)
     limits = km.Limits(-15, 15, of=of, y_min=[-0.5, -np.inf], y_max=[0.5, np.inf], slack=(1e4, 1e2))
     mpc = km.KoopmanMPC(model, cost, limits, 10, settings=PRECISE)
     x, reference, seen = np.array([0.3, 0.9]), np.zeros(2), set()

@@ -221,10 +221,10 @@ def test_a_model_without_errors_has_the_tail_of_a_given_one():
         X[k + 1] = A @ X[k] + B @ U[k] if k % 6 else rng.normal(size=3)
     parts = [km.Episode(X=X[k + 1 : k + 6], U=U[k + 1 : k + 5]) for k in range(0, 54, 6)]
     fitted = km.edmd(km.Episodes(parts, 0.1), km.State())
-    cost = km.Cost(Q=[1, 2, 0.5], R=0.3)
-    x, r = [1.0, -0.5, 0.2], [0.3, 0.0, 0.0]
-    short, given = (km.KoopmanMPC(model, cost, horizon=4)(x, r).u for model in (fitted, linear(A, B)))
-    np.testing.assert_allclose(short, given, rtol=1e-6)
+    cost, x = km.Cost(Q=[1, 2, 0.5], R=0.3), [1.0, -0.5, 0.2]
+    for r, rtol in ([0.0, 0.0, 0.0], 1e-5), ([0.3, 0.0, 0.0], 1e-3):  # the gain rests before the feedforward does
+        short, given = (km.KoopmanMPC(model, cost, horizon=4)(x, r).u for model in (fitted, linear(A, B)))
+        np.testing.assert_allclose(short, given, rtol=rtol)
 
 
 def test_update_goes_on_with_the_tail_of_the_new_model():
@@ -459,13 +459,47 @@ def test_the_tail_of_a_learned_model_is_as_long_as_helps_on_the_model_itself(dt,
     assert costs[0] < 1.2 * costs[1]
 
 
-def test_tails_of_all_steps_half_a_quarter_and_none_of_them_are_tried_and_the_longest_good_one_is_taken(monkeypatch):
-    """Each trial is a law u = −K z; those before the good ones push the wrong way."""
+def tried(monkeypatch, model, found, most=18):
+    """Return the tail behind 10 steps that is taken, where the trial of each length has its own law u = −K z."""
+    nx, nz = model.C.shape
+    stage, asked = tail_stage(model.A, model.B, np.zeros((nz, 0)), model.C, np.eye(nx), 0.01 * np.eye(1), None), []
+    monkeypatch.setattr(terminal_cost, "_laws", lambda _, steps: asked.append(steps) or np.array(found))
+    taken = believed_steps(stage, model, 10, most, np.eye(nz))
+    return taken, [n - 10 for n in asked.pop()]
+
+
+def test_the_shortest_tail_that_is_good_on_the_model_is_taken(monkeypatch):
+    """Laws before the good ones push the wrong way; one that costs a few thousandths more than the best is good too."""
     model, _ = learned(0, 1e-3, km.State() + km.Constant())
-    stage = tail_stage(model.A, model.B, np.zeros((3, 0)), model.C, np.eye(2), np.eye(1), None)
-    good, lengths, asked = terminal_cost.stationary(stage, 1000).K.T, [18, 9, 4, 0], []
-    for best in range(4):
-        found = np.array([-good] * best + [good] * (4 - best))
-        monkeypatch.setattr(terminal_cost, "_laws", lambda _, steps, found=found: asked.append(steps) or found)
-        assert believed_steps(stage, model, 10, 18, np.eye(3)) == lengths[best]
-        assert asked.pop() == [n + 10 for n in lengths]
+    stage = tail_stage(model.A, model.B, np.zeros((3, 0)), model.C, np.eye(2), 0.01 * np.eye(1), None)
+    good, lengths = terminal_cost.stationary(stage, 1000).K.T, [0, 4, 9, 10, 18]
+    for best in range(1, 5):
+        assert tried(monkeypatch, model, [-good] * best + [good] * (5 - best)) == (lengths[best], lengths)
+    assert tried(monkeypatch, model, [1.05 * good] + [good] * 4)[0] == 0
+    assert tried(monkeypatch, model, [2.0 * good] + [good] * 4)[0] == 4
+
+
+def test_a_horizon_of_three_steps_does_not_shorten_the_tail_of_an_unstable_plant():
+    """The gain of x⁺ = 1.02 x + 0.02 u rests after more than thirty steps, ten horizons; with three steps it is far from it."""
+    rng = np.random.default_rng(0)
+    U = rng.uniform(-1, 1, (20, 30, 1))
+    X = np.zeros((20, 31, 1))
+    X[:, 0] = rng.uniform(-1, 1, (20, 1))
+    for k in range(30):
+        X[:, k + 1] = 1.02 * X[:, k] + 0.02 * U[:, k]
+    data = km.Episodes([km.Episode(X=x, U=u) for x, u in zip(X, U, strict=True)], 0.1)
+    model = km.edmd(data, km.State() + km.Constant(), ridge=1e-9)
+    cost = km.Cost(Q=1, R=10)
+    mpc, lqr = km.KoopmanMPC(model, cost, km.Limits(), 3), km.LQR(model, cost)
+    assert mpc([0.1], [0.0]).u == pytest.approx(lqr([0.1], [0.0]).u, rel=1e-2)
+
+
+@pytest.mark.parametrize(("noise", "taken"), [(0.0, 0), (1e-3, 4)])
+def test_a_law_that_suffers_from_late_inputs_is_good_on_a_model_without_errors_alone(monkeypatch, noise, taken):
+    """x⁺ = x + u under u = −1.2 x comes to rest sooner than under −0.6 x, but not where half of u comes a step late."""
+    rng = np.random.default_rng(0)
+    U = rng.uniform(-1, 1, (30, 5, 1))
+    X = np.concatenate([np.zeros((30, 1, 1)), np.cumsum(U, axis=1)], axis=1) + rng.uniform(-1, 1, (30, 1, 1))
+    X += noise * rng.normal(size=X.shape)
+    model = km.edmd(km.Episodes([km.Episode(X=x, U=u) for x, u in zip(X, U, strict=True)], 0.1), km.State())
+    assert tried(monkeypatch, model, [[[1.2]]] + 4 * [[[0.6]]])[0] == taken
