@@ -162,7 +162,9 @@ def test_a_model_fitted_in_other_units_gives_the_same_inputs(name, units):
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-@pytest.mark.parametrize("seed", [*range(8), 99])  # 99 has R_delta and soft limits
+@pytest.mark.parametrize(
+    "seed", [*range(8), 99, 259]
+)  # 99 has R_delta and soft limits, 259 a choice of inputs at a limit
 def test_units_of_states_inputs_and_cost_change_no_input_and_no_status(name, seed):
     """Factors of 1e-6 to 1e6 on states and inputs, the cost a million times as large."""
     gap, statuses = gap_of(name, seed)

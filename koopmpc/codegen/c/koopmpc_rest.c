@@ -122,10 +122,12 @@ static void residual(const koopmpc_real *row, const koopmpc_real *of, const koop
 /** to = least |W (free to') - left|, to = free to': (SIZE) from left (LEFT); `back` (SIZE, LEFT) is that map. */
 static void least(const koopmpc_real *W, const koopmpc_real *null, int count, koopmpc_real *back) {
   koopmpc_real turned[LEFT * SIZE], inverted[SIZE * LEFT];
+  const koopmpc_real rounding = RANK * largest_of(W, LEFT * SIZE); /* what the outputs miss would move inputs along it */
   for (int i = 0; i < LEFT; i++)
     for (int j = 0; j < count; j++) {
       turned[i * count + j] = 0;
       for (int m = 0; m < SIZE; m++) turned[i * count + j] += W[i * SIZE + m] * null[m * SIZE + j];
+      if (i < ROWS_R && koopmpc_abs(turned[i * count + j]) < rounding) turned[i * count + j] = 0;
     }
   koopmpc_fill(back, 0, SIZE * LEFT);
   if (!count) return;

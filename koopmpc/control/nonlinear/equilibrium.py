@@ -141,7 +141,7 @@ class Equilibria:
         nx, size = len(at.A), self.size
         gain, free = _inverse(np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None])
         W = self._residuals(at)
-        beta = np.linalg.lstsq(W @ free, W @ gain, rcond=None)[0]
+        beta = np.linalg.lstsq(self._along(W, free), W @ gain, rcond=None)[0]
         return size[nx:, None] * (free @ beta - gain)[nx:] / size[:nx]
 
     def near(
@@ -174,7 +174,7 @@ class Equilibria:
             W = self._residuals(at)
             left = np.concatenate([self._weight @ (row - at.of), -self._small * s])
             step = -gain @ missed
-            step += free @ np.linalg.lstsq(W @ free, left - W @ step, rcond=None)[0]
+            step += free @ np.linalg.lstsq(self._along(W, free), left - W @ step, rcond=None)[0]
             if not np.isfinite(step).all():
                 return None
             reach = 1 + np.abs(s).max()
@@ -224,7 +224,7 @@ class Equilibria:
         at = self.linearise(here.x, here.u)
         gain, free = _inverse(np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None])
         W = self._residuals(at)
-        back = free @ np.linalg.pinv(W @ free)
+        back = free @ np.linalg.pinv(self._along(W, free))
         limited = np.zeros((nu + len(at.G), nx + nu))
         limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
         return Chord(s, back @ W @ gain - gain, back, limited * size)
@@ -284,6 +284,13 @@ class Equilibria:
         reach = _AT * (limit_size + np.abs(values))
         above = (values >= self._high - reach).astype(np.intp)
         return Equilibrium(x, u, np.where(values <= self._low + reach, -1, above))
+
+    def _along(self, W: Float[np.ndarray, "n m"], free: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "n k"]:
+        """Return W free with zeros where it is rounding: else what the outputs miss would move inputs along that."""
+        product, nr = W @ free, len(self._weight)
+        outputs = product[:nr]
+        outputs[np.abs(outputs) < RANK * np.abs(W).max()] = 0.0
+        return product
 
     def _residuals(self, at: Linearisation) -> Float[np.ndarray, "n m"]:
         """Return the matrix of the residuals on (x, u) by sizes: of(x) first, then (x, u) at next to no weight."""
