@@ -173,11 +173,15 @@ def export(
     from koopmpc.bench.controllers import Prepared
     from koopmpc.bench.library import load_problem
     from koopmpc.codegen.export import export as write
-    from koopmpc.synthesis.designed import load_controller
+    from koopmpc.synthesis.designed import SavedDesign, made, saved_controller
 
     example: dict[str, Any] = {}
     with friendly():
-        loaded = load_controller(controller)
+        saved = saved_controller(controller)
+        loaded = made(saved, controller)
+        if isinstance(saved, SavedDesign):  # the model itself, from a start of the design to its reference
+            asked = saved.evidence.asked
+            example = {"x0": asked.starts[0], "reference": asked.reference if asked.moves else asked.reference[:1]}
         if problem is not None:
             given = load_problem(problem)
             name, case = next(iter(given.cases.items()))

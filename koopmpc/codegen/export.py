@@ -66,7 +66,8 @@ def export(
     plant
         What `example.c` controls; by default the controller's own model, lifted afresh each step.
     x0, reference
-        Where the example starts, and the row that it holds; by default one root mean square of the data, and zero.
+        Where the example starts, and the row or rows that it follows; by default one root mean square of the data,
+        and zero. A model with delays starts as if x0 and the least input had been held.
     steps
         How long the example runs.
 
@@ -159,8 +160,12 @@ def _plant(
     measured = _measured(controller, step_map, x, sizes["NY"])
     step = traced(step_map.F, "the plant")
     look = traced(ca.Function("measure", [x], [measured]), "what the plant measures")
-    start = _start(model, nx) if x0 is None else checks.array(x0, "x0", (nx,))
+    past = None if plant is not None or isinstance(model, StepMap) else model.embedding
+    size = nx if past is None else len(past.states)
+    start = _start(model, size) if x0 is None else checks.array(x0, "x0", (size,))
     rest = np.clip(np.zeros(nu), tables.limits["input_low"], tables.limits["input_high"])
+    if past is not None:  # the plant is the model of ζ: it has been in x0 under this input
+        start = past.held(start, rest)
     arrays = "".join(
         language.array(name, values).replace("static const", "const") + "\n"
         for name, values in (("plant_x0", start), ("plant_u0", rest), ("plant_reference", held))

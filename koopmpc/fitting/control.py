@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc import checks, disk
+from koopmpc import checks
+from koopmpc.errors import DataError
 from koopmpc.fitting.audited import Data, evenly
 from koopmpc.fitting.fit import Say, guessed, logs_of, silent, understood
-from koopmpc.fitting.goal import Goal, goal_template, read_goal
+from koopmpc.fitting.goal import Goal, goal_template, inputs_of, read_goal
 from koopmpc.fitting.repair import IN_MEMORY, Divided, divided, noted, shortened
 from koopmpc.parallel import StageProgress
 from koopmpc.recording.page import Page
@@ -69,7 +70,7 @@ def design_data(
     bilinear, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
     reading
-        Keywords of `load_episodes` for plain tables.
+        Keywords of `load_episodes` for plain tables; without ``inputs`` the inputs of the goal are inputs.
 
     Raises
     ------
@@ -80,8 +81,11 @@ def design_data(
     """
     place, draw = Path(folder), checks.generator(rng)
     tell = silent if say is None else say
-    disk.existing(goal, "koopmpc fit LOGS --goal-template writes one")
+    pushed = inputs_of(goal)
     split, notes = _read(data, memory, draw, reading)
+    missed = tuple(name for name in pushed if name in split.seen.states)
+    if missed and reading.get("inputs") is None:  # the goal knows inputs that no name in the logs shows
+        split, notes = _read(data, memory, draw, {**reading, "inputs": (*split.seen.inputs, *missed)})
     about = understood(split, notes)
     tell(about)
     asked = read_goal(goal, split.seen)
@@ -121,8 +125,16 @@ def design_data(
 
 
 def template_of(data: Data, *, memory: int = IN_MEMORY, **reading: Any) -> str:
-    """Return the text of a goal file for the plant of some logs, with the ranges found."""
-    split, _ = _read(data, memory, checks.generator(0), reading)
+    """Return the text of a goal file for the plant of some logs, with the ranges found.
+
+    Raises
+    ------
+    DataError
+        No column is an input.
+    """
+    split, notes = _read(data, memory, checks.generator(0), reading)
+    if not split.seen.nu:
+        raise DataError("\n".join(["the logs have no input, so nothing can be controlled; pass --inputs u,v", *notes]))
     return goal_template(split.seen.with_episodes([*split.seen, *split.held_out]))
 
 

@@ -89,6 +89,27 @@ def goal_template(data: Episodes) -> str:
     return "\n".join(lines) + "\n"
 
 
+def inputs_of(path: str | PathLike[str]) -> tuple[str, ...]:
+    """Return the names of the inputs that a goal file has sections for."""
+    given = _tree(Path(path)).get("inputs", {})
+    return tuple(cast("dict[str, Any]", given)) if isinstance(given, dict) else ()
+
+
+def _tree(file: Path) -> dict[str, Any]:
+    """Return the content of a TOML file.
+
+    Raises
+    ------
+    LogError
+        The file is missing or no TOML.
+    """
+    disk.existing(file, "koopmpc fit LOGS --goal-template writes one")
+    try:
+        return tomllib.loads(file.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LogError(f"{file} is no TOML: {error}; koopmpc fit LOGS --goal-template shows one") from error
+
+
 def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     """Return the goal in a file, for the plant of these data.
 
@@ -101,11 +122,7 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         state with a weight.
     """
     file = Path(path)
-    disk.existing(file, "koopmpc fit LOGS --goal-template writes one")
-    try:
-        tree = tomllib.loads(file.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LogError(f"{file} is no TOML: {error}; koopmpc fit LOGS --goal-template shows one") from error
+    tree = _tree(file)
     _known(tree, _TOP, str(file))
     states = _sections(tree, "states", data.states, _STATE, file)
     inputs = _sections(tree, "inputs", data.inputs, _INPUT, file)

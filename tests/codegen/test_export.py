@@ -62,6 +62,18 @@ def test_the_example_closes_the_loop_as_python_does_with_inputs_that_act_late(ex
         x, acting = plant(x, acting), move.u
 
 
+def test_the_example_of_a_model_with_delays_starts_as_if_its_state_had_been_held(pendulum, tmp_path):
+    plant, _ = pendulum
+    data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=40, steps=30, rng=0)
+    model = km.edmd(data, km.State(), embedding=km.Delay(2))
+    controller = km.KoopmanMPC(model, COST, km.Limits(u_min=2.0, u_max=25.0), 10, solver="daqp")
+    folder = km.export(controller, tmp_path / "c", x0=[0.3, -0.2], reference=[0.1, 0.0], steps=3)
+    rows = table(make(folder, "run").stdout)
+    np.testing.assert_allclose(rows[0, 1:9], [0.3, -0.2, 2.0, 0.3, -0.2, 2.0, 0.3, -0.2], rtol=1e-8)
+    x = model.step_map()(rows[0, 1:9], rows[0, 9:10])
+    np.testing.assert_allclose(rows[1, 1:9], x, rtol=1e-6)
+
+
 def test_no_object_calls_the_heap_a_file_or_a_clock(exported):
     folder = exported[2]
     assert make(folder, "libkoopmpc.a").returncode == 0

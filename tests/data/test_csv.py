@@ -117,6 +117,18 @@ def test_columns_that_say_nothing_are_named(tmp_path: Path) -> None:
         km.load_episodes(text(tmp_path / "free.csv", "t,x,y\n0,1,5\n1,2,3\n"))
 
 
+def test_columns_that_hold_their_value_are_named_where_no_name_says_input(tmp_path: Path) -> None:
+    rows = [f"{k},{k * k},{k // 5},{k // 7}" for k in range(40)]
+    file = text(tmp_path / "tank.csv", "\n".join(["time [s],level [m],pump [V],valve (%)", *rows]) + "\n")
+    with pytest.warns(km.FitWarning, match=r"of these pump \[V\], valve \(%\) hold their value .*: pass inputs="):
+        assert km.load_episodes(file).nu == 0
+    read = km.load_episodes(file, states=("Level",), inputs=("pump", "valve"))
+    assert (read.states, read.inputs) == (("level [m]",), ("pump [V]", "valve (%)"))
+    twins = text(tmp_path / "twins.csv", "t,x [m],x [mm],u\n0,1,2,0\n1,2,4,0\n2,4,9,1\n")
+    with pytest.raises(km.errors.DataError, match="has no column 'x'"):
+        km.load_episodes(twins, states=("x",))
+
+
 @pytest.mark.parametrize(
     ("content", "error", "said"),
     [

@@ -53,6 +53,22 @@ def made(tmp_path_factory):
     return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
 
 
+def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for i, episode in enumerate(logs()):
+        rows = np.column_stack([0.1 * np.arange(40), episode.X[:-1], episode.U])
+        head = "time [s],position [m],speed [m/s],pump [V]"
+        np.savetxt(f"{i}.csv", rows, delimiter=",", header=head, comments="")
+    refused = CliRunner().invoke(app, ["fit", ".", "--goal-template"])
+    assert refused.exit_code == 2
+    assert "no input, so nothing can be controlled; pass --inputs" in refused.stderr
+    assert "pump [V] holds its value" in " ".join(refused.stderr.split())
+    written = CliRunner().invoke(app, ["fit", ".", "--inputs", "pump", "--goal-template"])
+    assert written.exit_code == 0
+    found = design_data(".", "goal.toml", "out", bilinear=False).design.controller
+    assert (found.predictor.states, found.predictor.inputs) == (NAMES[0], ("pump [V]",))
+
+
 def goal_of(text, tmp_path):
     (tmp_path / "goal.toml").write_text(text)
     return read_goal(tmp_path / "goal.toml", logs(4))

@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -143,6 +143,24 @@ class Told:
         """True where the caller gives nothing."""
         return all(value is None for value in vars(self).values())
 
+    def named_as(self, names: Sequence[str]) -> "Told":
+        """Return the copy with names as a table writes them: ``"pump"`` means ``"pump [V]"`` where no other fits."""
+        stems = [_stem(name) for name in names]
+
+        def own(name: str) -> str:
+            once = name not in names and stems.count(name.strip().lower()) == 1
+            return names[stems.index(name.strip().lower())] if once else name
+
+        given = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
+        return replace(
+            self,
+            **{
+                what: tuple(map(own, some))
+                for what, some in given.items()
+                if some is not None and not isinstance(some, str)
+            },
+        )
+
     @property
     def columns(self) -> set[str]:
         """The columns that the caller names."""
@@ -169,7 +187,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         A role or the sample time is neither given nor inferable, a column is missing or holds a cell that is no
         number, or the rows are no whole episodes.
     """
-    where = str(file)
+    where, told = str(file), told.named_as(names)
     rows = len(next(iter(columns.values()))) if columns else 0
     if rows == 0:
         raise DataError(f"{where} has columns and no row in them; leave the file out")
@@ -275,9 +293,14 @@ def _affordable(parts: list[Signals], dt: float, columns: int, where: str) -> No
 def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
     """Warn of roles that may be guessed wrongly, and of columns that are constant or repeat another."""
     if alone:
+        stepped = [name for name in found.states if _stepped(table[name])]
+        advice = "pass inputs= if some of them are inputs"
+        if 0 < len(stepped) < len(found.states):
+            hold = "holds its" if len(stepped) == 1 else "hold their"
+            advice = f"of these {', '.join(stepped)} {hold} value from row to row, as inputs do: pass inputs="
         warnings.warn(
             f"{where}: no column is named as an input, so the plant is taken to run by itself; its states are "
-            f"{', '.join(found.states)}; pass inputs= if some of them are inputs",
+            f"{', '.join(found.states)}; {advice}",
             FitWarning,
             stacklevel=3,
         )
@@ -297,6 +320,12 @@ def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: boo
                     ColumnWarning,
                     stacklevel=3,
                 )
+
+
+def _stepped(column: Float[np.ndarray, " M"]) -> bool:
+    """Return True for a column that changes, and repeats its last value in more than half of the rows."""
+    changes = np.diff(column[np.isfinite(column)])
+    return 0 < int(np.count_nonzero(changes)) < len(changes) / 2
 
 
 def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:
