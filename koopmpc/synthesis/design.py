@@ -26,7 +26,7 @@ from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, 
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
-from koopmpc.synthesis.folds import Folds, folded, only, sampled, without
+from koopmpc.synthesis.folds import Folds, folded, only, sampled, smoothed, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
 from koopmpc.synthesis.select import RIDGES
 from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
@@ -54,6 +54,7 @@ def design(
     delays: Sequence[int] = (0, 1, 2),
     bilinear: bool = True,
     tighten: bool = True,
+    smooth: bool = True,
     sample: int = 30_000,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -103,6 +104,8 @@ def design(
     tighten
         Give every controller limits that are `tightened` by its model's errors on the fold that it does not know, by at
         most half of the way from the reference to the limit.
+    smooth
+        Where the states hold noise, learn from smoothed states, see `select`; the surrogates measure with that noise.
     sample
         Snapshot pairs to judge on, about.
     workers, scheduler
@@ -137,9 +140,13 @@ def design(
     if left:
         held = held.with_episodes([episode for k, episode in enumerate(held) if k not in left])
         asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
-        source = held
+        source = source_of(held)
         if notes:
             notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
+    noise = np.zeros(held.nx)
+    if smooth:
+        source, held, noise, said = smoothed(source, held)
+        notes = (*notes, *said)
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)
@@ -158,7 +165,7 @@ def design(
     with Workers(workers, scheduler) as pool:
         results = pool.map(tried, trials, _stage(progress, "models"), size=lambda trial: trial.candidate.size)
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-        test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, pool)
+        test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, noise, pool)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
@@ -186,7 +193,7 @@ def design(
         return None
 
     turned: list[str] = []
-    sets = [source, folds.episodes] if any(len(one) < forecast + first for one in held) else [source]
+    sets = [source, source_of(folds.episodes)] if any(len(one) < forecast + first for one in held) else [source]
     controller, best = _first(made, rows, best)
     simple, linear = (controller, best) if linear == best else _first(made, rows, linear)
     if controller is None or best is None:
@@ -250,7 +257,12 @@ def _models(
 
 
 def _test(
-    folds: Folds, asked: Asked, pair: Sequence[Recipe], tighten: bool, pool: Workers
+    folds: Folds,
+    asked: Asked,
+    pair: Sequence[Recipe],
+    tighten: bool,
+    noise: Float[np.ndarray, " nx"],
+    pool: Workers,
 ) -> tuple[LoopTest, list[str], bool]:
     """Return the conditions of all closed loops, doubts about what is asked, and whether the goal can be held.
 
@@ -274,7 +286,7 @@ def _test(
     ]
     surrogates: list[Surrogate] = []
     conditions = list(wanted)
-    for places, (one, inputs) in zip(mine, pool.map(partial(_stood_in, folds, asked), tasks), strict=True):
+    for places, (one, inputs) in zip(mine, pool.map(partial(_stood_in, folds, asked, noise), tasks), strict=True):
         surrogates.append(one)
         for j, rows in zip(places, inputs, strict=True):
             conditions[j] = replace(wanted[j], u_reference=rows)
@@ -285,7 +297,7 @@ def _test(
     tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
     low, high = asked.hull(free, tracked)
     room = margin_room(asked, data) if tighten else None
-    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, room)
+    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, room, noise)
     unreachable = unheld(surrogates[0], asked)
     holds = not asked.moves and not unreachable
     return test, [*unreachable, *outside_limits(asked, data), *outside_data(asked, data, tracked, free)], holds
@@ -299,10 +311,12 @@ class _StandIn(NamedTuple):
     runs: tuple[tuple[float, int], ...]
 
 
-def _stood_in(folds: Folds, asked: Asked, task: _StandIn) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
+def _stood_in(
+    folds: Folds, asked: Asked, noise: Float[np.ndarray, " nx"], task: _StandIn
+) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
     """Return the surrogate, and for each run the inputs that cost nothing: those of `Condition.u_reference`."""
     data, fold = folds.episodes, folds.fold
-    one = surrogate(task.recipe, without(data, fold, task.out), only(data, fold, task.out))
+    one = surrogate(task.recipe, without(data, fold, task.out), only(data, fold, task.out), noise)
     steps, nu, cost = asked.steps, data.nu, asked.cost
     given = cost.given_inputs(nu)
     inputs: list[Float[np.ndarray, "T nu"]] = []

@@ -5,11 +5,14 @@ from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes, joined
-from koopmpc.data.source import Source
+from koopmpc.data.smoother import Smoother
+from koopmpc.data.source import Changed, Held, Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import spread
+from koopmpc.validate.text import quantity
 
 _PARTS = 16  # of a source that a sample is taken from
 _AHEAD = 20  # steps of the default horizon
@@ -61,6 +64,41 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     return result, (
         f"chosen on {steps} steps in {len(result)} episodes, evenly spread over the data, and fitted to all",
     )
+
+
+class Smoothed(NamedTuple):
+    """Data whose states are freed of noise, where there is any, and a sentence that says so.
+
+    `noise` is the (nx,) standard deviation of what was taken out, zero where that is nothing.
+    """
+
+    source: Source
+    held: Episodes
+    noise: Float[np.ndarray, " nx"]
+    notes: tuple[str, ...]
+
+
+def smoothed(source: Source, held: Episodes) -> Smoothed:
+    """Return the source and the episodes `held` of it with smoothed states, or as they are where no noise is found.
+
+    The smoother is found on `held`; where that is not all of the source, its parts are smoothed as they are read.
+    """
+    try:
+        smoother = Smoother.of(held)
+    except DataError:  # too few data to tell noise from the plant, or too many states
+        smoother = None
+    if smoother is None or not smoother.found.any():
+        return Smoothed(source, held, np.zeros(held.nx), ())
+    clean = smoother(held)
+    whole = isinstance(source, Held) and source.episodes is held
+    changed = Changed(source, smoother, held.states, held.inputs, held.disturbances)
+    told = ", ".join(
+        quantity(name, f"{size:.2g}")
+        for name, size, found in zip(held.states, smoother.noise, smoother.found, strict=True)
+        if found
+    )
+    note = f"the measurements hold noise, of standard deviation {told}: models are of smoothed states (smooth=False)"
+    return Smoothed(Held(clean) if whole else changed, clean, smoother.noise, (note,))
 
 
 def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ...]]:

@@ -30,6 +30,7 @@ FREE = 0.005  # violation that costs nothing, as a share of the limits' range
 PRICE = 10.0  # a violation of 1 % beyond costs a tenth of the cost
 LITTLE = 0.01  # of the usual cost: so much more is no loss, as where a run starts at its goal
 _WEIGHTED = 4  # times as long takes a recipe with weights, for its models are fitted and judged again
+_NINETY = 1.645  # standard deviations within which 90 % of normal errors are
 _BAND = 5  # steps ahead of the errors that tighten limits
 CONFIRMED = 1.25  # times the cost of the fold's controllers that the one of all data may cost on the same surrogates
 BROKEN = 1e-3  # share of the range beyond which a step counts as one that violates
@@ -68,7 +69,7 @@ class LoopTest:
     """The task, the data in folds, the surrogates and the conditions, which all runs share.
 
     A run that leaves the box from `low` to `high` is lost. Controllers have margins to the limits, of at most `room`
-    (nx,); None for no margins.
+    (nx,); None for no margins. `noise` is the (nx,) standard deviation of measurements that the data no longer hold.
     """
 
     asked: Asked
@@ -79,6 +80,7 @@ class LoopTest:
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
     room: Float[np.ndarray, " nx"] | None
+    noise: Float[np.ndarray, " nx"]
 
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
         """Return the limits that a controller gets if its model has these errors."""
@@ -217,7 +219,7 @@ def _fitted(test: LoopTest, recipe: Recipe, near: Nearness | None = None) -> _Mo
     folds = range(max(test.fold) + 1)
     models = [recipe.fit(without(test.episodes, test.fold, k), near) for k in folds]
     bands = [error_band(model, only(test.episodes, test.fold, k)) for k, model in enumerate(models)]
-    return _Models(tuple(models), np.max(bands, axis=0))
+    return _Models(tuple(models), np.hypot(np.max(bands, axis=0), _NINETY * test.noise))
 
 
 def _joined(first: Outcome, rest: Outcome) -> Outcome:

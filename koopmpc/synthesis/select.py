@@ -16,10 +16,10 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import StageProgress, map_tasks
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate, expanded, jumps, still, usual
 from koopmpc.synthesis.cross_validation import EXACT, LEAST, Trial, ridges_of, tried
-from koopmpc.synthesis.folds import folded, sampled, usual_horizon
+from koopmpc.synthesis.folds import folded, sampled, smoothed, usual_horizon
 from koopmpc.synthesis.selection import LeaderboardRow, Selection, choice, row_of
 from koopmpc.validate.scoring import AnyPredictor
 
@@ -37,6 +37,7 @@ def select(
     delays: Sequence[int] = (0, 1, 2),
     bilinear: bool = True,
     relift: bool = True,
+    smooth: bool = True,
     sample: int = 30_000,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -87,6 +88,9 @@ def select(
         and `score(relift=True)` measures; then errors below 1 % of the spread are all alike, for a controller corrects
         them at the next step, and small models go wrong less where there are few data. False: by forecasts in z, as
         `rollout` predicts and a linear model is judged, and as exactly as the data allow.
+    smooth
+        Where the states hold noise, free them of it first with a `Smoother`: least squares on noisy states makes an
+        unstable plant look tame, and so do forecasts that begin at them. The notes tell how much noise was found.
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
@@ -133,6 +137,9 @@ def select(
             FitWarning,
             stacklevel=2,
         )
+    if smooth:
+        source, held, _, told_noise = smoothed(source, held)
+        notes = (*notes, *told_noise)
     both = bilinear and source.nu > 0 and source.nw == 0
     given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
     first = max(one.delays for one in given)
@@ -168,6 +175,9 @@ def select(
 
     predictor = refit(rows[chosen])
     best_linear = predictor if linear == chosen else refit(rows[linear])
+    best_bilinear = predictor
+    if rows[chosen].kind == "linear" and any(row.bilinear for row in rows):
+        best_bilinear = refit(rows[choice(rows, "bilinear", alike)])
     return Selection(
         predictor=predictor,
         linear=best_linear if isinstance(best_linear, LinearPredictor) else None,
@@ -177,4 +187,5 @@ def select(
         horizon=ahead,
         folds=data.number,
         notes=(*notes, *short, *data.notes),
+        bilinear=best_bilinear if isinstance(best_bilinear, BilinearPredictor) else None,
     )

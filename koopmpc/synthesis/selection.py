@@ -8,7 +8,7 @@ from rich.console import RenderableType
 from koopmpc.data.delay import Delay
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import eigen
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.cross_validation import EXACT, HALF, Tried
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.validate.text import table, written
@@ -97,6 +97,8 @@ class Selection(Value):
     linear
         The best linear model, fitted to all data: `predictor` itself where that is linear; None where no linear one was
         tried.
+    bilinear
+        The best bilinear model, fitted to all data; None where no bilinear one was tried.
     leaderboard
         All candidates, the least error in its worst fold first.
     chosen, chosen_linear
@@ -115,6 +117,7 @@ class Selection(Value):
     horizon: int
     folds: int
     notes: tuple[str, ...]
+    bilinear: BilinearPredictor | None = None
 
     @property
     def best(self) -> LeaderboardRow:

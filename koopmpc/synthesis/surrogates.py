@@ -40,7 +40,8 @@ class Surrogate(Value):
     middle, w
         (nu,) u_0 and (nw,) the measured disturbances that act: the means of the data.
     noise
-        (nx,) standard deviation of the measurements: the model's one-step error over √2, of noise and misfit.
+        (nx,) standard deviation of the measurements: the model's one-step error over √2, of noise and misfit, and what
+        a smoother took out of the data.
     """
 
     model: AnyPredictor
@@ -125,12 +126,15 @@ def stand_ins(results: Sequence[Tried], floor: float) -> list[Recipe]:
     return [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in (first, second)]
 
 
-def surrogate(recipe: Recipe, fitted: Episodes, held_out: Episodes) -> Surrogate:
-    """Return the surrogate of a recipe that is fitted to some episodes; its noise is measured on others."""
+def surrogate(recipe: Recipe, fitted: Episodes, held_out: Episodes, smoothed: Float[np.ndarray, " nx"]) -> Surrogate:
+    """Return the surrogate of a recipe that is fitted to some episodes; its noise is measured on others.
+
+    `smoothed` is the (nx,) standard deviation of the noise that these data no longer hold.
+    """
     model = recipe.fit(fitted)
     driven = np.concatenate([np.hstack([episode.U, episode.W]) for episode in fitted]).mean(axis=0)
     error = score(model, held_out, 1, relift=True).rmse[0]
-    noise = np.where(np.isfinite(error), error, 0.0) / np.sqrt(2)
+    noise = np.hypot(np.where(np.isfinite(error), error, 0.0) / np.sqrt(2), smoothed)
     return Surrogate(model, driven[: fitted.nu], driven[fitted.nu :], noise)
 
 

@@ -46,11 +46,8 @@ class Parts:
 
     @cached_property
     def bilinear(self) -> km.BilinearPredictor:
-        """The best bilinear model: what was chosen, or else the first of its kind on the leaderboard."""
-        if isinstance(self.selection.predictor, km.BilinearPredictor):
-            return self.selection.predictor
-        row = next(row for row in self.selection.leaderboard if row.bilinear)
-        return km.bilinear_edmd(self.data, row.lifting, embedding=row.embedding, ridge=row.ridge, difference=True)
+        """The best bilinear model."""
+        return self.selection.bilinear
 
     def cost(self, **more: Any) -> km.Cost:
         """Return the cost as a controller is given it."""

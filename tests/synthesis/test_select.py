@@ -351,12 +351,13 @@ def test_the_only_model_whose_forecasts_last_is_taken_however_small_the_error_of
 
 
 def test_a_ridge_is_never_below_its_floor_nor_below_what_the_misfit_of_a_step_supports():
-    """Noise of a share s of the state's size is worth a ridge of s²."""
+    """Noise of a share s of the state's size, where it is not smoothed away, is worth a ridge of s²."""
     clean = episodes_of(quadratic)
     given = km.select(clean, candidates=[SQUARES], horizon=6, delays=[0], bilinear=False, ridges=[0.0])
     assert {row.ridge for row in given.leaderboard} == {1e-9}
     size = 0.03 * np.sqrt(np.mean(np.concatenate([e.X for e in clean]) ** 2))
-    found = km.select(noisy(clean, size), candidates=[SQUARES], horizon=6, delays=[0, 1], bilinear=False)
+    rough, options = noisy(clean, size), {"horizon": 6, "delays": [0, 1], "bilinear": False}
+    found = km.select(rough, candidates=[SQUARES], smooth=False, **options)
     assert min(row.ridge for row in found.leaderboard) == pytest.approx(1e-3)
 
 

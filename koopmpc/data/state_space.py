@@ -1,0 +1,218 @@
+"""Filter, smoother and expectation–maximisation of the state-space model behind `Smoother`, states in unit variance."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+DELAYS = (0, 1, 2)  # past steps that a model may have
+_ITERATIONS = 40
+_FEWEST = 10
+_GAIN = 2.0  # of the log-likelihood in one iteration; with less the fit ends
+_LEAST = 1e-10  # variance of either noise
+_ROUNDING = 1e-13  # added to variances before they are inverted
+_SETTLED = 1e-12  # change of a variance from step to step after which the gains stay
+
+
+class StateSpace(NamedTuple):
+    """The model of a `Smoother`, of states and inputs in standard deviations; s_k = [x_k … x_{k−d}]."""
+
+    delays: int
+    products: bool
+    K: Float[np.ndarray, "n nx"]
+    V: Float[np.ndarray, "nx nx"]
+    R: Float[np.ndarray, " nx"]
+    start: Float[np.ndarray, " N"]
+    start_spread: Float[np.ndarray, "N N"]
+
+    @property
+    def F(self) -> Float[np.ndarray, "N N"]:
+        """Of s_{k+1} = F s_k + [drive, 0], s_k = [x_k … x_{k−d}]."""
+        N, nx = len(self.start), len(self.V)
+        return np.vstack([self.K[:N].T, np.eye(N)[: N - nx]])
+
+    def regressors(self, S: Float[np.ndarray, "E L N"], U: Float[np.ndarray, "E T nu"]) -> Float[np.ndarray, "E _ m"]:
+        """Return what drives s_{k+1} besides s_k: inputs, 1, and the products."""
+        d, steps, nx = self.delays, U.shape[1], len(self.V)
+        x = S[:, :-1, :nx]
+        columns = [U[:, d - j : steps - j] for j in range(d + 1)] + [np.ones((*x.shape[:2], 1))]
+        if self.products:
+            i, j = np.triu_indices(nx)
+            columns += [x[..., i] * x[..., j], (U[:, d:, :, None] * x[:, :, None, :]).reshape(*x.shape[:2], -1)]
+        return np.concatenate(columns, axis=-1)
+
+    def drive(self, S: Float[np.ndarray, "E L N"], U: Float[np.ndarray, "E T nu"]) -> Float[np.ndarray, "E _ nx"]:
+        """Return x_{k+1} − Σ A_j x_{k−j} without noise, products at the states S."""
+        return self.regressors(S, U) @ self.K[len(self.start) :]
+
+
+class Stretches(NamedTuple):
+    """Measurements and inputs in standard deviations, and the number of steps of each; shorter ones end in zeros."""
+
+    X: Float[np.ndarray, "E T+1 nx"]
+    U: Float[np.ndarray, "E T nu"]
+    last: Int[np.ndarray, " E"]
+
+
+class SmootherGains(NamedTuple):
+    """Of filter and smoother, of s_d, s_{d+1} …; the last ones serve all later steps."""
+
+    filter: list[Float[np.ndarray, "N _"]]
+    back: list[Float[np.ndarray, "N _"]]
+    before: list[Float[np.ndarray, "N _"]]  # covariance of s_k given y_0 … y_{k−1}
+    after: list[Float[np.ndarray, "N _"]]  # and given y_k too
+
+
+def gains_of(model: StateSpace, length: int) -> SmootherGains:
+    """Return the gains of `length` steps s_d … s_T. They depend on no measurement, so all episodes share them."""
+    N, nx, F = len(model.start), len(model.V), model.F
+    one, V = np.eye(N), np.zeros((N, N))
+    V[:nx, :nx] = model.V
+    P, result = model.start_spread, SmootherGains([], [], [], [])
+    for k in range(length):
+        H, R = (one, np.tile(model.R, N // nx)) if k == 0 else (one[:nx], model.R)  # s_d is measured as a whole
+        K = np.linalg.solve(H @ P @ H.T + np.diag(R), H @ P).T
+        result.before.append(P)
+        result.filter.append(K)
+        P = (one - K @ H) @ P @ (one - K @ H).T + (K * R) @ K.T
+        result.after.append(P)
+        ahead = F @ P @ F.T + V
+        ahead = (ahead + ahead.T) / 2
+        result.back.append(np.linalg.solve(ahead + _ROUNDING * one, F @ P).T)
+        if k > 0 and np.abs(ahead - result.before[-1]).max() < _SETTLED:
+            break
+        P = ahead
+    return result
+
+
+def smoothed(
+    model: StateSpace, gains: SmootherGains, given: Stretches, drive: Float[np.ndarray, "E _ nx"]
+) -> Float[np.ndarray, "E L N"]:
+    """Return E[s_k | y_0 … y_T] of each episode: forward with the filter, then back (Rauch, Tung & Striebel)."""
+    before, after, _ = _filtered(model, gains, given, drive)
+    return _back(gains, before, after, given.last - model.delays)
+
+
+def _filtered(
+    model: StateSpace, gains: SmootherGains, given: Stretches, drive: Float[np.ndarray, "E _ nx"]
+) -> tuple[Float[np.ndarray, "L E N"], Float[np.ndarray, "L E N"], list[Float[np.ndarray, "E nx"]]]:
+    """Return E[s_k | y_0 … y_{k−1}], E[s_k | y_0 … y_k], and what each measurement after the first missed."""
+    X, d, nx, F = given.X, model.delays, len(model.V), model.F
+    E, length = len(X), X.shape[1] - d
+    before, after = np.empty((2, length, E, len(model.start)))
+    gaps: list[Float[np.ndarray, "E nx"]] = []
+    m = np.broadcast_to(model.start, before.shape[1:])
+    for k in range(length):
+        before[k] = m
+        gap = stacked(X[:, : d + 1], d)[:, 0] - m if k == 0 else X[:, k + d] - m[:, :nx]
+        if k:
+            gaps.append(gap)
+        after[k] = m + gap @ gains.filter[min(k, len(gains.filter) - 1)].T
+        if k < length - 1:
+            m = after[k] @ F.T
+            m[:, :nx] += drive[:, k]
+    return before, after, gaps
+
+
+def _back(
+    gains: SmootherGains,
+    before: Float[np.ndarray, "L E N"],
+    after: Float[np.ndarray, "L E N"],
+    last: Int[np.ndarray, " E"],
+) -> Float[np.ndarray, "E L N"]:
+    states = after.copy()
+    for k in range(len(after) - 2, -1, -1):
+        step = (states[k + 1] - before[k + 1]) @ gains.back[min(k, len(gains.back) - 1)].T
+        states[k] += np.where((k < last)[:, None], step, 0.0)
+    return states.transpose(1, 0, 2)
+
+
+def _covariances(gains: SmootherGains, length: int) -> tuple[Float[np.ndarray, "L N N"], Float[np.ndarray, "N N"]]:
+    """Return cov(s_k) of each step and Σ_k cov(s_{k+1}, s_k), both given all measurements."""
+    last = len(gains.before) - 1
+    P = [gains.after[last]] * length
+    lag = np.zeros_like(P[0])
+    for k in range(length - 2, -1, -1):
+        G = gains.back[min(k, last)]
+        P[k] = gains.after[min(k, last)] + G @ (P[k + 1] - gains.before[min(k + 1, last)]) @ G.T
+        lag += P[k + 1] @ G.T
+    return np.array(P), lag
+
+
+def fitted(given: Stretches, delays: int, *, products: bool) -> tuple[float, StateSpace]:
+    """Return the log-likelihood for each number that was measured, and the model, by expectation–maximisation.
+
+    The likelihoods of models with other delays are of the same measurements, those from step 3 on.
+    """
+    X, U = given.X, given.U
+    nx, S = X.shape[2], stacked(X, delays)
+    N = S.shape[2]
+    flat = S.reshape(-1, N)
+    spread = np.cov(flat.T).reshape(N, N) + 1e-6 * np.eye(N)
+    model = StateSpace(delays, products, np.zeros((N, nx)), np.eye(nx), np.ones(nx), flat.mean(axis=0), spread)
+    D = model.regressors(S, U)
+    rows, ahead = _rows(S, D), S[:, 1:, :nx].reshape(-1, nx)
+    K = np.linalg.lstsq(rows, ahead, rcond=1e-9)[0]
+    missed = ahead - rows @ K
+    V = missed.T @ missed / (2 * len(rows)) + _LEAST * np.eye(nx)  # half of it is noise, for a start
+    model = model._replace(K=K, V=V, R=np.diag(V) / 2)
+    reached: list[float] = []
+    for _ in range(_ITERATIONS):
+        model, likelihood, D = _improved(model, given, D)
+        reached.append(likelihood)
+        if len(reached) > _FEWEST and reached[-1] < reached[-2] + _GAIN:
+            break
+    numbers = X.shape[0] * (X.shape[1] - 1 - max(DELAYS)) * nx
+    return reached[-1] / numbers, model
+
+
+def _improved(
+    model: StateSpace, given: Stretches, D: Float[np.ndarray, "E _ m"]
+) -> tuple[StateSpace, float, Float[np.ndarray, "E _ m"]]:
+    """One iteration: smooth with the model, then fit it to the smoothed states and their covariances.
+
+    Returns the model, the log-likelihood of the model before it, and the regressors of the smoothed states.
+    """
+    X, d, nx, N = given.X, model.delays, len(model.V), len(model.start)
+    E, length = len(X), X.shape[1] - d
+    gains = gains_of(model, length)
+    before, after, gaps = _filtered(model, gains, given, D @ model.K[N:])
+    S = _back(gains, before, after, given.last - d)
+    total, lag = _covariances(gains, length)
+    likelihood = 0.0
+    for k, gap in enumerate(gaps, 1):
+        if k + d > max(DELAYS):
+            W = gains.before[min(k, len(gains.before) - 1)][:nx, :nx] + np.diag(model.R)
+            likelihood -= (np.sum(gap * np.linalg.solve(W, gap.T).T) + E * np.linalg.slogdet(W)[1]) / 2
+    D = model.regressors(S, given.U)
+    rows, ahead = _rows(S, D), S[:, 1:, :nx].reshape(-1, nx)
+    square, cross = rows.T @ rows, rows.T @ ahead
+    square[:N, :N] += E * total[:-1].sum(axis=0)
+    cross[:N] += E * lag[:nx].T
+    weight = 1e-9 * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))
+    K = np.linalg.solve(square + weight, cross)
+    V = ahead.T @ ahead + E * total[1:, :nx, :nx].sum(axis=0) - K.T @ cross - cross.T @ K + K.T @ square @ K
+    sizes, axes = np.linalg.eigh((V + V.T) / (2 * len(rows)))
+    V = (axes * np.maximum(sizes, _LEAST)) @ axes.T
+    left = np.sum((X - unstacked(S, d, nx)) ** 2, axis=(0, 1))
+    own = np.diagonal(total, axis1=1, axis2=2)
+    left += E * (own[:, :nx].sum(axis=0) + own[0, nx:].reshape(d, nx).sum(axis=0))
+    better = model._replace(K=K, V=V, R=left / (E * X.shape[1]) + _LEAST)
+    return better, float(likelihood), D
+
+
+def _rows(S: Float[np.ndarray, "E L N"], D: Float[np.ndarray, "E _ m"]) -> Float[np.ndarray, "M n"]:
+    """Return the regressors [s_k, drive] of all episodes, a row each."""
+    return np.concatenate([S[:, :-1], D], axis=-1).reshape(-1, S.shape[2] + D.shape[2])
+
+
+def stacked(X: Float[np.ndarray, "E T nx"], delays: int) -> Float[np.ndarray, "E L N"]:
+    """Return s_k = [x_k … x_{k−d}] of k = d … T."""
+    steps = X.shape[1]
+    return np.concatenate([X[:, delays - j : steps - j] for j in range(delays + 1)], axis=-1)
+
+
+def unstacked(S: Float[np.ndarray, "E L N"], delays: int, nx: int) -> Float[np.ndarray, "E T nx"]:
+    """Return x_0 … x_T of s_d … s_T; the first ones are those that s_d holds."""
+    first = S[:, 0].reshape(len(S), delays + 1, nx)[:, :0:-1]
+    return np.concatenate([first, S[:, :, :nx]], axis=1)
