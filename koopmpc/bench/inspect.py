@@ -192,20 +192,25 @@ def worst_moments(run: Run) -> tuple[Moment, ...]:
 
 
 def inspection_table(found: Sequence[Inspected]) -> Table:
-    """Return one line for each log."""
+    """Return one line for each log; logs of one name are told apart by their folders."""
+    names = [each.path.name for each in found]
+    shown = [
+        f"{each.path.parent.name}/{name}" if names.count(name) > 1 else name
+        for each, name in zip(found, names, strict=True)
+    ]
     lines = plain_table(f"{len(found)} logs", ())
     lines.add_column("log", overflow="fold")
     for heading in ("cost", "violation", "late", "fell back", "slowest", ""):
         lines.add_column(heading, justify="right", no_wrap=True)
-    for each in found:
+    for each, name in zip(found, shown, strict=True):
         if each.refused is not None:
-            lines.add_row(each.path.name, "refused", style="red")
+            lines.add_row(name, "refused", style="red")
         elif each.metrics is None:
-            lines.add_row(each.path.name, *("–",) * 5, "model")
+            lines.add_row(name, *("–",) * 5, "model")
         else:
             own = each.metrics
             cells = (f"{own.cost:.5g}", f"{own.violation:.2g}", str(own.late), str(each.values["fallbacks"]))
-            lines.add_row(each.path.name, *cells, duration(own.solve_time_max), "cut" if each.cut else "")
+            lines.add_row(name, *cells, duration(own.solve_time_max), "cut" if each.cut else "")
     return lines
 
 

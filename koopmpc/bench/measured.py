@@ -119,7 +119,7 @@ def in_words(problem: str) -> str:
     if found is None or best is None:
         return ""
     own = found[best]
-    time = f"1/{1 / own.time:.0f} of its time" if own.time < 0.7 else f"{own.time:.1f} of its time"
+    time = f"1/{1 / own.time:.0f} of its time" if own.time < 0.7 else f"{own.time:.1f} × its time"
     return f"{best}: {own.ratio:.3f} × the cost of {baseline_of(found)}, in {time}"
 
 

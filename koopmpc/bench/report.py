@@ -125,6 +125,7 @@ def _pair(row: RunRow) -> tuple[Any, ...]:
 
 
 _HEADINGS = ("controller", "condition", "runs", "reach", "cost", "ratio", "over", "fell back", "p50", "p99", "cold")
+_WHOLE = ("controller", "runs", "reach", "p50", "p99", "cold")  # columns of a terminal that are not wrapped
 
 
 def _cells(own: Summary) -> tuple[str, ...]:
@@ -152,12 +153,17 @@ def _cells(own: Summary) -> tuple[str, ...]:
 
 
 def summary_table(rows: Sequence[RunRow]) -> Group:
-    """Return the summaries as tables for a terminal, one for each case."""
+    """Return the summaries as tables for a terminal, one for each case; columns in which all is 0 or – are left out."""
     parts: list[Table] = []
     for case, group in groupby(summaries(rows), key=lambda each: each.case):
-        lines = plain_table(case, _HEADINGS[:2], _HEADINGS[2:], padding=(0, 0, 0, 1))
-        for own in group:
-            lines.add_row(*_cells(own), style="red" if own.failed else None)
+        found = list(group)
+        cells = np.array([_cells(own) for own in found])
+        told = [i for i in range(len(_HEADINGS)) if i == 0 or not np.isin(cells[:, i], ("0", "–")).all()]
+        lines = plain_table(case, (), padding=(0, 0, 0, 1))
+        for i in told:
+            lines.add_column(_HEADINGS[i], justify="right" if i > 1 else "left", no_wrap=_HEADINGS[i] in _WHOLE)
+        for own, row in zip(found, cells[:, told], strict=True):
+            lines.add_row(*row, style="red" if own.failed else None)
         parts.append(lines)
     return Group(*parts)
 
@@ -228,7 +234,11 @@ def _pictures(own: Sequence[RunRow], usual: Sequence[RunRow], folder: Path) -> I
         states: list[str] = [*named, *(f"state {k}" for k in range(len(named), len(spread)))]
         reached = {name: np.array([row.reached for row in measured[name]]) for name in starts}
         mapped = {name: (values[:, [i, j]], reached[name]) for name, values in starts.items()}
-        yield (svg(attraction(mapped, [states[i], states[j]])), "Initial states that reach their reference, and not.")
+        alone = "" if len(usual) == len(own) else ", without noise and with the plant as it is"
+        yield (
+            svg(attraction(mapped, [states[i], states[j]])),
+            f"Initial states that reach their reference, and not{alone}.",
+        )
     if runs:
         yield svg(trajectories(runs)), "The case's own start."
 

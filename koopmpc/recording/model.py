@@ -26,7 +26,7 @@ from koopmpc.scene import Color
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.report import TrustReport
 from koopmpc.validate.scoring import AnyPredictor, Score, score
-from koopmpc.validate.text import markdown_table
+from koopmpc.validate.text import markdown_table, observable
 
 _TRUTH: Color = (225, 228, 232)
 _PREDICTED = color(0)
@@ -207,7 +207,7 @@ def _facts(predictor: AnyPredictor) -> dict[str, str]:
         "kind": type(predictor).__name__,
         "inputs": ", ".join(predictor.inputs) or "none",
         "sampling time": f"{predictor.dt:g} s",
-        "observables": f"{predictor.nz}: {', '.join(predictor.lifting.names[:12])}"
+        "observables": f"{predictor.nz}: {', '.join(map(observable, predictor.lifting.names[:12]))}"
         + (" …" if predictor.nz > 12 else ""),
         "spectral radius": f"{abs(predictor.eigenvalues[0]):.6g}",
     }

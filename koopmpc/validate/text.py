@@ -6,7 +6,7 @@ from io import StringIO
 from typing import Any
 
 from rich import box
-from rich.console import Console, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Column, Table
 
 WIDTH = 100  # columns of a report
@@ -50,7 +50,16 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1)
 def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = (), **settings: Any) -> Table:
     """Return an empty table with its title at the left, one rule below the headings, and numbers to the right."""
     headers = [*words, *(Column(heading, justify="right") for heading in numbers)]
-    return Table(*headers, title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, **settings)
+    return _Plain(*headers, title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, **settings)
+
+
+class _Plain(Table):
+    """A table whose columns stand closer where the terminal is narrow."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if options.max_width < WIDTH:
+            self.padding = 0
+        yield from super().__rich_console__(console, options)
 
 
 def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

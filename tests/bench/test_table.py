@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 
 import koopmpc as km
+from koopmpc.bench.report import summary_table
 
 GOOD = km.loop.Metrics(
     cost=120.5,
@@ -41,6 +42,18 @@ def rows():
         km.bench.RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True),
         km.bench.RunRow("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
     ]
+
+
+def test_nothing_is_cut_in_a_terminal_of_80_columns():
+    text = printed(km.bench.results_table(rows()), 80)
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    assert " 2.4e+06 " in text
+    starts = [replace(rows()[3], start=k, metrics=replace(GOOD, cost=100.1 + k), x0=(0.1, k)) for k in range(9)]
+    text = printed(summary_table([*starts, *(replace(row, noise=0.01) for row in starts)]), 80)
+    assert "…" not in text
+    assert all(f" {word} " in text for word in ("nonlinear-mpc", "100.1", "13 µs", "4.2 ms", "100 %"))
+    assert "over" not in text  # a column of zeros
 
 
 def test_each_row_says_how_it_went():
