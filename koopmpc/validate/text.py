@@ -1,12 +1,12 @@
 """Text of reports: tables, labelled lines and paragraphs in 100 columns by rich; tables in Markdown."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
 from typing import Any
 
 from rich import box
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Column, Table
 
 WIDTH = 100  # columns of a report
@@ -56,7 +56,7 @@ def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = (), *
 class _Plain(Table):
     """A table whose columns stand closer where the terminal is narrow."""
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
         if options.max_width < WIDTH:
             self.padding = 0
         yield from super().__rich_console__(console, options)
