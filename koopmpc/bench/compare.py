@@ -71,7 +71,7 @@ class Compared:
 
 
 def compared(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bool = False) -> Compared:
-    """Compare the runs that two sweeps, or two logs, have in common.
+    """Compare the runs that two sweeps, or two logs, have in common; two logs of one case may be of two controllers.
 
     B is worse where the median of its cost over A's exceeds 1 + threshold, and a two-sided Wilcoxon signed-rank test
     of the logarithms of these ratios gives p < 0.05 where there are at least six pairs; or where a run no longer
@@ -93,9 +93,14 @@ def compared(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bo
     """
     checks.positive(1.0 + threshold, "1 + threshold", "")
     first, second = _rows(Path(a)), _rows(Path(b))
+    if not Path(a).is_dir() and not Path(b).is_dir():
+        first, second = _told_apart(*first.values(), *second.values())
     both = sorted(first.keys() & second.keys(), key=str)
     if not both:
-        raise LogError(f"{a} and {b} have no run in common: same problem, case, controller, start, seed and noise")
+        raise LogError(
+            f"{a} and {b} have no run in common: two sweeps need the same problem, case, controller, "
+            "start, seed and noise, two logs the same problem and case"
+        )
     found: list[Pairs] = []
     for group, keys in groupby(both, key=lambda key: key[:6]):
         pairs = [(first[key], second[key]) for key in keys]
@@ -115,6 +120,13 @@ def _rows(path: Path) -> dict[tuple[Any, ...], RunRow]:
         problem or "run", case, controller, metrics(run), reached(run), fault=None if fault is None else str(fault)
     )
     return {row.key: row}
+
+
+def _told_apart(a: RunRow, b: RunRow) -> tuple[dict[tuple[Any, ...], RunRow], dict[tuple[Any, ...], RunRow]]:
+    """Return the runs of two logs by their problem and case, and by what B and A are, where these differ."""
+    of_a, of_b = (" ".join(filter(None, (row.controller, row.fault))) for row in (a, b))
+    which = of_a if of_a == of_b else f"{of_b or 'B'} / {of_a or 'A'}"
+    return {(a.problem, a.case, which): a}, {(b.problem, b.case, which): b}
 
 
 def _compared(what: str, figure: str, pairs: list[tuple[RunRow, RunRow]], threshold: float) -> Pairs:

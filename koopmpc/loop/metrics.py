@@ -87,9 +87,10 @@ class Metrics(Value):
         """Return each figure in words by its name; those of a tracked output in a line of its own, if named."""
         settles = f"{self.settling_time:.3g} s" if np.isfinite(self.settling_time) else "does not settle"
         times = (self.solve_time_p50, self.solve_time_p99, self.solve_time_max)
-        given = not np.isnan(self.cost) or np.isnan(self.final_error).any()
+        missed = np.isnan(self.final_error).any() or np.isnan(self.tracking_rmse).any()
+        cost = "unknown, a state was not measured" if missed else "none was given"
         return {
-            "cost": f"{self.cost:.6g}" if given else "none was given",
+            "cost": cost if np.isnan(self.cost) else f"{self.cost:.6g}",
             **_by_output("tracking rmse", self.tracking_rmse, tracked),
             **_by_output("final error", self.final_error, tracked),
             "violation": f"{self.violation:.3g}"

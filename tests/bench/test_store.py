@@ -180,5 +180,9 @@ def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, t
 def test_two_logs_are_compared_and_strangers_are_refused(whole):
     log = whole[1] / "tiny-near-lqr.rrd"
     assert not km.bench.compared(log, log).regressions
+    other = whole[1] / next(row.log.name for row in whole[0] if row.log and row.key[:3] == ("tiny", "near", TWO[1]))
+    (pair,) = km.bench.compared(log, other, threshold=1e6).pairs
+    assert pair.what == f"tiny near {TWO[1]} / lqr"
+    assert pair.ratio == pytest.approx(km.metrics(km.load_run(other)).cost / km.metrics(km.load_run(log)).cost)
     with pytest.raises(km.errors.LogError, match="have no run in common"):
         km.bench.compared(log, whole[1] / "tiny-far-lqr.rrd")
