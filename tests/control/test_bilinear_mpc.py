@@ -242,3 +242,19 @@ def test_a_step_that_fails_without_a_plan_takes_the_clipped_optimum() -> None:
             state = plant(state, move.u)
         assert move.fallback is km.control.Fallback.NONE
         assert np.abs(state).max() < 0.01
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("tracked", [km.State(["x1"]), None])
+def test_of_the_states_that_hold_a_reference_the_one_near_the_data_is_taken(side, tracked):
+    """x1⁺ = x1 + 0.1 (x2² − x1), x2⁺ = x2 + 0.1 (u − x2) rests at x1 = 1 with x2 = u = 1, and with −1."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    step = ca.vertcat(x[0] + 0.1 * (x[1] ** 2 - x[0]), x[1] + 0.1 * (u - x[1]))
+    plant = km.StepMap(ca.Function("F", [x, u], [step]), 0.1, states=["x1", "x2"], inputs=["u"])
+    starts = km.Uniform(*np.sort([[0.5, 0.6 * side], [1.5, 1.4 * side]], axis=0))
+    data = km.collect(plant, starts, km.Noise(*np.sort([0.6 * side, 1.4 * side])), episodes=20, steps=20)
+    model = km.bilinear_edmd(data, km.State() + km.Constant() + km.Monomials(2), ridge=1e-9)
+    cost = km.Cost(Q=[1] if tracked else [1, 0], R=0.1, of=tracked or km.State())
+    mpc = km.BilinearMPC(model, cost, km.Limits(u_min=-3, u_max=3), 10)
+    run = km.simulate(plant, mpc, x0=[1.2, 1.1 * side], reference=[1] if tracked else [1, 0], steps=80, cost=cost)
+    np.testing.assert_allclose(run.X[-1], [1, side], atol=1e-3)

@@ -90,6 +90,7 @@ class Equilibria:
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking) -> None:
         self.model, self._cost, self._outputs, o = model, cost, outputs, outputs
         self.of_state = isinstance(cost.of, State) and cost.of.whole
+        self._names = model.model.states
         x, u, theta = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("t", len(model.theta))
         F, of, g = model.F(x, u, theta), o.tracked(x), o.limited(x)
         found = [F, ca.jacobian(F, x), ca.jacobian(F, u), of, ca.jacobian(of, x), g, ca.jacobian(g, x)]
@@ -231,13 +232,43 @@ class Equilibria:
 
     def guess(self, row: Float[np.ndarray, " nr"]) -> Equilibrium:
         """Return where the search for the equilibrium of a row begins: the state that it names, inputs at zero."""
-        model, u = self.model, np.clip(np.zeros(self.model.nu), *self._outputs.inputs)
+        model, u, of = self.model, np.clip(np.zeros(self.model.nu), *self._outputs.inputs), self._cost.of
         x = np.zeros(model.nx)
-        if self.of_state:
-            weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
-            x = row if center is None else np.where(weighed, row, center)
-            x = x if model.embedding is None else model.embedding.held(x, u)
+        if isinstance(of, State):
+            y, weighed = (
+                model.center,
+                np.atleast_1d(self._outputs.Q.any(axis=0)),
+            )  # of other states a reference may say nothing
+            if self.of_state:
+                y = row if y is None else np.where(weighed, row, y)
+            else:
+                y = np.zeros(model.ny) if y is None else y.copy()
+                for i, value, counts in zip(cast("State", of.bind(self._names)).chosen, row, weighed, strict=True):
+                    y[i] = value if counts else y[i]
+            x = y if model.embedding is None else model.embedding.held(y, u)
         return Equilibrium(x, u, np.zeros(len(self._low), dtype=np.intp))
+
+    def _guesses(self, row: Float[np.ndarray, " nr"]) -> list[Float[np.ndarray, " n"]]:
+        """Return where to begin: at `guess`, there with inputs amid their limits, anywhere if neither tells a state."""
+        x, u, _ = self.guess(row)
+        low, high = self._outputs.inputs
+        both, amid = np.isfinite(low) & np.isfinite(high), u.copy()
+        amid[both] = (low[both] + high[both]) / 2
+        guesses = [np.concatenate([x, u])]
+        if self.model.center is not None and not np.array_equal(amid, u):
+            guesses.append(np.concatenate([x, amid]))
+        named = isinstance(self._cost.of, State) and (self.of_state or self.model.center is not None)
+        if not named:  # the nearest stationary point may be wrong: hanging, not upright
+            scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, self.model.nx))
+            guesses += [np.concatenate([x, u]) for x in scatter]
+        return guesses
+
+    def _away(self, x: Float[np.ndarray, " nx"]) -> float:
+        """Return how far x is from the mean of the data that the model knows, by sizes; 0 where that is not known."""
+        model = self.model
+        if model.center is None:
+            return 0.0
+        return round(float(np.linalg.norm((x[: model.ny] - model.center) / self.size[: model.ny])), 3)
 
     def find(
         self,
@@ -245,20 +276,19 @@ class Equilibria:
         e: Float[np.ndarray, " nx"] | None = None,
         near: Equilibrium | None = None,
     ) -> Equilibrium | None:
-        """Return the equilibrium that holds a row, by ipopt, from `near` or several guesses, or None."""
+        """Return the equilibrium that holds a row, by ipopt, from `near` or several guesses, or None.
+
+        A learned model may hold a row at several states; the one nearest to the mean of its data is taken.
+        """
         model, inputs, box = self.model, self._outputs.inputs, self._outputs.outputs
-        x, u, _ = self.guess(row)
         nx, e = model.nx, np.zeros(model.nx) if e is None else e
         size, limit_size = self.size, self._limit_size
-        guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
-        if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
-            scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, nx))
-            guesses += [np.concatenate([x, u]) for x in scatter]
+        guesses = self._guesses(row) if near is None else [np.concatenate([near.x, near.u])]
         unlimited = np.full(len(box.low), np.inf)
         good = _MISSED * float(row @ self._outputs.Q @ row) / self._scale
-        best = None
+        best: Float[np.ndarray, " n"] | None = None
         for limits in (box, Interval(-unlimited, unlimited)):
-            found, least = None, np.inf
+            found, least = None, (np.inf, np.inf)
             for guess in guesses:
                 bounds = {
                     "lbx": np.concatenate([np.full(nx, -np.inf), inputs.low / size[nx:]]),
@@ -270,9 +300,9 @@ class Equilibria:
                 with listening():
                     solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
                     success, f, s = self._solver.stats()["success"], float(solved["f"]), solved["x"].full().ravel()
-                if success and f < least:
-                    found, least = s * size, f
-                if least <= good:
+                if success and (rank := (max(f, good), self._away(s[:nx] * size[:nx]))) < least:
+                    found, least = s * size, rank
+                if least[0] <= good and model.center is None:
                     break
             if found is not None:
                 best = found
