@@ -85,7 +85,7 @@ def error(
             )
             band(panel, ahead, low, high, j, f"{name} 5 to 95 %".strip())
             panel.plot(ahead, rmse, **line(j, score.horizon), label=f"{name} RMSE".strip())
-        panel.set(ylabel=f"error of {first.states[i]}", xlim=(1, max(s.horizon for s in named.values())))
+        panel.set(ylabel=f"error of\n{first.states[i]}", xlim=(1, max(s.horizon for s in named.values())))
         panel.set_ylim(*_error_interval([_extent(score, i) for score in named.values()]))
     for empty in axes.flat[len(chosen) :]:
         empty.remove()

@@ -242,7 +242,7 @@ def _blueprint(
     for r in range(len(ahead)):
         plots = [plot(f"rollout/{r}/state/{i}", name, legend=i == 0) for i, name in states]
         if predictor.nu:
-            plots.append(plot(f"rollout/{r}/inputs", ", ".join(predictor.inputs), legend=False))
+            plots.append(plot(f"rollout/{r}/inputs", ", ".join(predictor.inputs), legend=predictor.nu > 1))
         tabs.append(rrb.Vertical(*plots, name=f"Forecast of episode {r}"))
     errors = [plot(f"error/{i}", f"Error of {name}, by time ahead", legend=i == 0) for i, name in states]
     left = rrb.Tabs(*tabs, rrb.Vertical(*errors, name="Error by time ahead"))

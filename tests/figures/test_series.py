@@ -81,7 +81,7 @@ def test_the_plotted_error_is_the_score() -> None:
             ahead, rmse = curve(axes, f"{name} RMSE")
             assert np.array_equal(ahead, np.arange(1, one.horizon + 1))
             assert np.array_equal(rmse, one.rmse[:, i])
-        assert axes.get_ylabel() == f"error of {STATES[i]}"
+        assert axes.get_ylabel() == f"error of\n{STATES[i]}"
         lower, upper = _filled(axes)
         assert lower[:, 1] == pytest.approx(scores["good"].low[:, i])
         assert upper[:, 1] == pytest.approx(scores["good"].high[:, i])
