@@ -73,7 +73,7 @@ class Smoother(Value):
     ... )
     >>> smoother = km.data.Smoother.of(noisy)
     >>> smoother.noise.round(2)
-    array([0.05, 0.2 ])
+    array([0.04, 0.19])
     >>> data = smoother(noisy)
     >>> errors = [np.std(np.concatenate([a.X - b.X for a, b in zip(each, clean)]), axis=0) for each in (noisy, data)]
     >>> (errors[1] < errors[0] / 2).all()
