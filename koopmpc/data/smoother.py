@@ -76,7 +76,7 @@ class Smoother(Value):
     array([0.04, 0.19])
     >>> data = smoother(noisy)
     >>> errors = [np.std(np.concatenate([a.X - b.X for a, b in zip(each, clean)]), axis=0) for each in (noisy, data)]
-    >>> (errors[1] < errors[0] / 2).all()
+    >>> bool((errors[1] < errors[0] / 2).all())
     True
     """
 
