@@ -104,7 +104,8 @@ def require_plant(plant: object) -> None:
         )
     advice = (
         "a Plant has dt [s], states, inputs and outputs (names), state (x, or None where it is hidden), "
-        "reset(x0, rng) -> y and step(u) -> y; or pass a StepMap"
+        "reset(x0, rng) -> y and step(u) -> y; or pass a StepMap, or km.black_box(f, dt=…, states=…, inputs=…) of "
+        "a function x⁺ = f(x, u)"
     )
     needed = ("dt", "states", "inputs", "outputs", "state", "reset", "step")
     checks.members(plant, "the plant", needed, advice)

@@ -216,6 +216,9 @@ class SimulatedPlant:
     """x⁺ = F(x, u) + w, y = h(x): a `StepMap`, or the map of a `black_box`, that remembers its state."""
 
     def __init__(self, step_map: Transition) -> None:
+        checks.members(
+            step_map, "the step map", ("dt", "nx", "measure"), "discretize dynamics; a Plant is one as it is"
+        )
         self.step_map, self.dt, self.scene = step_map, step_map.dt, step_map.scene
         self.states, self.inputs, self.outputs = step_map.states, step_map.inputs, step_map.outputs
         self._x: Float[np.ndarray, " nx"] | None = None

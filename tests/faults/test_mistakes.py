@@ -272,3 +272,14 @@ def test_what_is_no_path_is_said_by_everything_that_reads_or_writes(model, bad, 
     for call in (*readers, *writers):
         with pytest.raises(km.errors.DataError, match=" is no path; pass "):
             call(bad)
+
+
+def test_a_function_is_told_how_to_become_a_plant():
+    def tank(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return x + 0.1 * u
+
+    with pytest.raises(km.errors.DataError, match=r"km.black_box\(f, dt=…, states=…, inputs=…\)"):
+        km.collect(tank, km.Uniform(0, 1), km.Noise(0, 1), episodes=1, steps=2)
+    plant = km.black_box(tank, dt=0.1, states=["level [m]"], inputs=["inflow [m³/s]"])
+    with pytest.raises(km.errors.DataError, match=r"the step map .* has no nx, measure; .* a Plant is one as it is"):
+        km.plants.SimulatedPlant(plant)
