@@ -117,6 +117,19 @@ def test_columns_that_say_nothing_are_named(tmp_path: Path) -> None:
         km.load_episodes(text(tmp_path / "free.csv", "t,x,y\n0,1,5\n1,2,3\n"))
 
 
+def test_the_index_that_pandas_writes_is_no_state_and_a_clock_of_another_name_is_told(tmp_path: Path) -> None:
+    rows = [f"{k},{0.1 * k:.1f},{k * k},{k % 3}" for k in range(20)]
+    file = text(tmp_path / "pandas.csv", "\n".join([",time,x,u", *rows]) + "\n")
+    with pytest.warns(km.FitWarning, match=r"'' numbers the rows and is left out"):
+        assert km.load_episodes(file).states == ("x",)
+    own = [row.partition(",")[2] for row in rows]
+    file = text(tmp_path / "zeit.csv", "\n".join(["Zeit,x,u", *own]) + "\n")
+    with pytest.warns(km.FitWarning, match="'Zeit' grows by the same in each row"):
+        assert km.load_episodes(file, dt=0.1).states == ("Zeit", "x")
+    with pytest.warns(km.FitWarning), pytest.raises(km.errors.DataError, match="'Zeit' looks like it; its columns"):
+        km.load_episodes(file)
+
+
 def test_columns_that_hold_their_value_are_named_where_no_name_says_input(tmp_path: Path) -> None:
     rows = [f"{k},{k * k},{k // 5},{k // 7}" for k in range(40)]
     file = text(tmp_path / "tank.csv", "\n".join(["time [s],level [m],pump [V],valve (%)", *rows]) + "\n")

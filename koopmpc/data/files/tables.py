@@ -21,6 +21,7 @@ _INPUT = re.compile(
     r"u\d*|u_.*|(input|inputs|control|command|cmd|action|force|torque|thrust|voltage|steering|throttle|duty)"
     r"([\W_\d].*)?|.*_(cmd|command|input|ref_input)"
 )
+_COUNTER = re.compile(r"|unnamed: \d+|index|idx|row|sample|count|counter")
 _DISTURBANCE = re.compile(r"w\d*|w_.*|disturbance([\W_\d].*)?")
 _PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 
@@ -202,6 +203,8 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
     table = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
     for name, column in table.items():
         _plausible(column, name, where)
+    if told.states is None:
+        found = _without_counters(found, table, where)
     kinds = {name: columns[name].dtype.kind for name in names if name in columns}
     text = [name for name, kind in kinds.items() if every and kind == "O" and not label(name)]
     if text:
@@ -235,8 +238,9 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
     dt = told.resample if told.resample is not None else told.dt
     if dt is None:
         if time is None:
+            clock = next((f"; {name!r} looks like it" for name in found.states if _even(table[name])), "")
             raise DataError(
-                f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'; its columns are "
+                f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'{clock}; its columns are "
                 f"{', '.join(names)}"
             )
         dt = sample_time([part.time for part in parts if part.time is not None], where)
@@ -320,6 +324,28 @@ def _doubt(found: Roles, table: dict[str, np.ndarray], where: str, *, alone: boo
                     ColumnWarning,
                     stacklevel=3,
                 )
+
+
+def _without_counters(found: Roles, table: dict[str, np.ndarray], where: str) -> Roles:
+    """Return the roles without states that number the rows, such as the index that pandas writes."""
+    for name in found.states:
+        if _COUNTER.fullmatch(_stem(name)) and len(found.states) > 1 and (np.diff(table[name]) == 1).all():
+            warnings.warn(f"{where}: {name!r} numbers the rows and is left out", FitWarning, stacklevel=3)
+            found = replace(found, states=tuple(other for other in found.states if other != name))
+        elif found.time is None and _even(table[name]):
+            warnings.warn(
+                f"{where}: {name!r} grows by the same in each row and is taken for a state; where it is time, name it "
+                "'time [s]'",
+                FitWarning,
+                stacklevel=3,
+            )
+    return found
+
+
+def _even(column: Float[np.ndarray, " M"]) -> bool:
+    """Return True for ten rows or more that grow by the same, as time does."""
+    changes = np.diff(column)
+    return len(changes) >= 9 and bool((changes > 0).all() and np.ptp(changes) <= 1e-3 * changes.max())
 
 
 def _stepped(column: Float[np.ndarray, " M"]) -> bool:
