@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,6 +15,7 @@ from koopmpc.values import Value
 
 _LARGEST = 30  # entries of x_k … x_{k−d}: the work grows with their third power
 _WINDOW, _WINDOWS = 60, 100  # steps and number of the stretches that a model is fitted to, at most
+_BLOCK, _OVERLAP = 1000, 200  # rows of a part of a long episode, and rows more at either end
 _EACH = 10  # snapshot pairs for each regressor, at least
 _BETTER = 0.05  # of the log-likelihood for each number: what is missed is 5 % smaller
 _PASSES = 4  # the products are those of the smoothed states, which the first pass does not have
@@ -104,26 +107,15 @@ class Smoother(Value):
         both = np.concatenate([np.hstack([episode.X[:-1], episode.U]) for episode in data])
         mean, scale = both.mean(axis=0), both.std(axis=0)
         scale = np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
-        windows = _windows(data, mean, scale)
-        pairs = windows.U.shape[0] * windows.U.shape[1]
-        fits: list[tuple[float, StateSpace]] = []
-        for delays in DELAYS:
-            size = data.nx * (delays + 1)
-            linear = size + data.nu * (delays + 1) + 1
-            if size > _LARGEST or pairs < _EACH * linear:
-                continue
-            products = pairs >= _EACH * (linear + data.nx * (data.nx + 1) // 2 + data.nx * data.nu)
-            fits.append(fitted(windows, delays, products=products))
-        if not fits:
-            raise DataError(
-                f"{pairs} steps of {data.nx} states are no data for a smoother: it needs {_EACH} steps for each "
-                f"regressor and takes {_LARGEST} states at most"
-            )
-        best = max(likelihood for likelihood, _ in fits)
-        model = next(model for likelihood, model in fits if likelihood > best - _BETTER)
+        return cls.made(state_space(data, mean, scale), mean, scale)
+
+    @classmethod
+    def made(cls, model: StateSpace, mean: Float[np.ndarray, " nxu"], scale: Float[np.ndarray, " nxu"]) -> "Smoother":
+        """Return the smoother with this model of data that are standardized so."""
+        size = scale[: len(model.V)]
         return cls(
-            noise=np.sqrt(model.R) * scale[: data.nx],
-            missed=np.sqrt(np.diag(model.V)) * scale[: data.nx],
+            noise=np.sqrt(model.R) * size,
+            missed=np.sqrt(np.diag(model.V)) * size,
             delays=model.delays,
             products=model.products,
             gains=model.K,
@@ -135,46 +127,97 @@ class Smoother(Value):
         )
 
     @property
+    def model(self) -> StateSpace:
+        """The model of standardized data."""
+        R = (self.noise / self.scale[: len(self.noise)]) ** 2
+        return StateSpace(self.delays, self.products, self.gains, self.spread, R, self.start, self.start_spread)
+
+    @property
     def found(self) -> Bool[np.ndarray, " nx"]:
         """(nx,) True for each state with noise that can be told from what the model misses, and from rounding."""
         return (self.noise > _SHARE * self.missed) & (self.noise > _SMALL * self.scale[: len(self.noise)])
 
     def __call__(self, episodes: Episodes) -> Episodes:
         """Return the episodes with smoothed states; an episode of d steps or fewer stays as it is."""
-        nx, d = len(self.noise), self.delays
         data = episodes_of(episodes)
-        model = StateSpace(
-            delays=d,
-            products=self.products,
-            K=self.gains,
-            V=self.spread,
-            R=(self.noise / self.scale[:nx]) ** 2,
-            start=self.start,
-            start_spread=self.start_spread,
-        )
-        driven, changed = data.driven(), list(data)
+        nx, changed = data.nx, [episode.X.copy() for episode in data]
+        for pieces, given in self.stretches(data):
+            found = unstacked(self.states(given), self.delays, nx) * self.scale[:nx] + self.mean[:nx]
+            for row, piece in zip(found, pieces, strict=True):
+                changed[piece.episode][piece.low : piece.high] = row[piece.low - piece.first : piece.high - piece.first]
+        return data.with_episodes([Episode(X=X, U=e.U, W=e.W) for X, e in zip(changed, data, strict=True)])
+
+    def states(self, given: Stretches) -> Float[np.ndarray, "E L N"]:
+        """Return E[s_k | all measurements]; products are those of the smoothed states."""
+        model = self.model
+        gains, states = gains_of(model, given.X.shape[1] - self.delays), stacked(given.X, self.delays)
+        for _ in range(_PASSES if self.products else 1):
+            states = smoothed(model, gains, given, model.drive(states, given.U))
+        return states
+
+    def stretches(self, data: Episodes) -> Iterator[tuple[list["Piece"], Stretches]]:
+        """Yield pieces of about one length, standardized, which together hold each row of each episode once.
+
+        What is further away than the overlap of two pieces does not count. Episodes of d steps or fewer are left out.
+
+        Raises
+        ------
+        DataError
+            The data have other numbers of states and inputs.
+        """
+        nx, driven = len(self.noise), data.driven()
         if (driven.nx, driven.nx + driven.nu) != (nx, len(self.mean)):
             raise DataError(
                 f"the smoother is of {nx} states and {len(self.mean) - nx} inputs, the data have {driven.nx} and "
                 f"{driven.nu}"
             )
-        for places in _alike([len(episode) for episode in driven], d):
-            steps = np.array([len(driven[i]) for i in places])
-            X = np.zeros((len(places), steps.max() + 1, nx))
-            U = np.zeros((len(places), steps.max(), driven.nu))
-            for row, (i, length) in enumerate(zip(places, steps, strict=True)):
-                X[row, : length + 1] = (driven[i].X - self.mean[:nx]) / self.scale[:nx]
-                U[row, :length] = (driven[i].U - self.mean[nx:]) / self.scale[nx:]
-            gains, given = gains_of(model, int(steps.max()) - d + 1), Stretches(X, U, steps)
-            states = stacked(X, d)
-            for _ in range(_PASSES if model.products else 1):
-                states = smoothed(model, gains, given, model.drive(states, U))
-            found = unstacked(states, d, nx)
-            for row, (i, length) in enumerate(zip(places, steps, strict=True)):
-                own = data[i]
-                X_own = found[row, : length + 1] * self.scale[:nx] + self.mean[:nx]
-                changed[i] = Episode(X=X_own, U=own.U, W=own.W)
-        return data.with_episodes(changed)
+        for pieces in _alike([len(episode) for episode in driven], self.delays):
+            steps = np.array([piece.last - piece.first - 1 for piece in pieces])
+            X = np.zeros((len(pieces), steps.max() + 1, nx))
+            U = np.zeros((len(pieces), steps.max(), driven.nu))
+            for row, (i, a, b, _, _) in enumerate(pieces):
+                X[row, : b - a] = (driven[i].X[a:b] - self.mean[:nx]) / self.scale[:nx]
+                U[row, : b - a - 1] = (driven[i].U[a : b - 1] - self.mean[nx:]) / self.scale[nx:]
+            yield pieces, Stretches(X, U, steps)
+
+
+class Piece(NamedTuple):
+    """Rows `first` to `last` of an episode, of which those from `low` to `high` count; the ends are one beyond."""
+
+    episode: int
+    first: int
+    last: int
+    low: int
+    high: int
+
+
+def state_space(
+    data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], *, products: bool = True
+) -> StateSpace:
+    """Return the model of episodes without disturbances: of 0, 1 and 2 delays the fewest that are within 5 %.
+
+    Raises
+    ------
+    DataError
+        As `Smoother.of`.
+    """
+    windows = _windows(data, mean, scale)
+    pairs = windows.U.shape[0] * windows.U.shape[1]
+    fits: list[tuple[float, StateSpace]] = []
+    for delays in DELAYS:
+        size = data.nx * (delays + 1)
+        linear = size + data.nu * (delays + 1) + 1
+        if size > _LARGEST or pairs < _EACH * linear:
+            continue
+        enough = pairs >= _EACH * (linear + data.nx * (data.nx + 1) // 2 + data.nx * data.nu)
+        fits.append(fitted(windows, delays, products=products and enough))
+    if not fits:
+        raise DataError(
+            f"{pairs} steps of {data.nx} states are no data for a smoother: it needs {_EACH} steps for each "
+            f"regressor and takes {_LARGEST} states at most"
+        )
+    best = max(likelihood for likelihood, _ in fits)
+    return next(model for likelihood, model in fits if likelihood > best - _BETTER)
 
 
 def _windows(data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]) -> Stretches:
@@ -198,10 +241,15 @@ def _windows(data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndar
     return Stretches((X - mean[:nx]) / scale[:nx], (U - mean[nx:]) / scale[nx:], np.full(len(X), steps))
 
 
-def _alike(lengths: Sequence[int], delays: int) -> Iterator[list[int]]:
-    """Yield the places of episodes of about one length, which are smoothed together; too short ones are left out."""
-    groups: dict[int, list[int]] = {}
+def _alike(lengths: Sequence[int], delays: int) -> Iterator[list[Piece]]:
+    """Yield pieces of about one length, which are smoothed together: whole episodes, and parts of long ones."""
+    groups: dict[int, list[Piece]] = {}
     for i, length in enumerate(lengths):
-        if length > delays:
-            groups.setdefault(length.bit_length(), []).append(i)
+        if length <= delays:
+            continue
+        count = 1 if length < 2 * _BLOCK else length // _BLOCK
+        ends = [(length + 1) * k // count for k in range(count + 1)]
+        for low, high in pairwise(ends):
+            piece = Piece(i, max(low - _OVERLAP, 0), min(high + _OVERLAP, length + 1), low, high)
+            groups.setdefault((piece.last - piece.first).bit_length(), []).append(piece)
     yield from groups.values()

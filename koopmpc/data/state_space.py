@@ -11,6 +11,7 @@ _FEWEST = 10
 _GAIN = 2.0  # of the log-likelihood in one iteration; with less the fit ends
 _LEAST = 1e-10  # variance of either noise
 _ROUNDING = 1e-13  # added to variances before they are inverted
+_ROUND = 1e-6  # least share of a variance that is not rounding
 _SETTLED = 1e-12  # change of a variance from step to step after which the gains stay
 
 
@@ -137,6 +138,27 @@ def _covariances(gains: SmootherGains, length: int) -> tuple[Float[np.ndarray, "
         P[k] = gains.after[min(k, last)] + G @ (P[k + 1] - gains.before[min(k + 1, last)]) @ G.T
         lag += P[k + 1] @ G.T
     return np.array(P), lag
+
+
+def left_out(
+    model: StateSpace, gains: SmootherGains, given: Stretches, states: Float[np.ndarray, "E L N"]
+) -> tuple[Float[np.ndarray, "E T nx"], Float[np.ndarray, "E T nx"]]:
+    """Return for each measurement by how much it misses what all others say of it, and that by its standard deviation.
+
+    With x̂ and P of all measurements, (y − x̂) / (1 − h) is the difference to the estimate without y, of variance
+    R / (1 − h), h = P / R. Rows beyond the end of an episode are zero.
+    """
+    d, nx = model.delays, len(model.V)
+    gap, size = given.X - unstacked(states, d, nx), np.ones_like(given.X)
+    for steps in np.unique(given.last):
+        own = np.array([np.diag(P) for P in _covariances(gains, int(steps) + 1 - d)[0]])
+        first = own[0].reshape(d + 1, nx)[:0:-1]
+        free = np.maximum(1 - np.concatenate([first, own[:, :nx]]) / model.R, _ROUND)
+        of = given.last == steps
+        gap[of, : steps + 1] /= free
+        gap[of, steps + 1 :] = 0.0
+        size[of, : steps + 1] = np.sqrt(model.R / free)
+    return gap, np.abs(gap) / size
 
 
 def fitted(given: Stretches, delays: int, *, products: bool) -> tuple[float, StateSpace]:

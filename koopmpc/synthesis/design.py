@@ -26,7 +26,7 @@ from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, 
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
-from koopmpc.synthesis.folds import Folds, folded, only, sampled, smoothed, without
+from koopmpc.synthesis.folds import Folds, folded, mended, only, sampled, smoothed, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
 from koopmpc.synthesis.select import RIDGES
 from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
@@ -105,7 +105,8 @@ def design(
         Give every controller limits that are `tightened` by its model's errors on the fold that it does not know, by at
         most half of the way from the reference to the limit.
     smooth
-        Where the states hold noise, learn from smoothed states, see `select`; the surrogates measure with that noise.
+        Replace glitches, and where the states hold noise, learn from smoothed states, see `select`; the surrogates
+        measure with that noise.
     sample
         Snapshot pairs to judge on, about.
     workers, scheduler
@@ -135,6 +136,9 @@ def design(
     if source.nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
     held, notes = sampled(source, checks.count(sample, "sample"))
+    if smooth:
+        source, held, replaced = mended(source, held)
+        notes = (*notes, *replaced)
     asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
     left = strays(held, asked)
     if left:
@@ -145,8 +149,8 @@ def design(
             notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
     noise = np.zeros(held.nx)
     if smooth:
-        source, held, noise, said = smoothed(source, held)
-        notes = (*notes, *said)
+        (source, held, freed), noise = smoothed(source, held)
+        notes = (*notes, *freed)
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)

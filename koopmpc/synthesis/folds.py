@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.mender import Mender
 from koopmpc.data.smoother import Smoother
-from koopmpc.data.source import Changed, Held, Source
+from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import spread
 from koopmpc.validate.text import quantity
@@ -66,39 +67,63 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     )
 
 
-class Smoothed(NamedTuple):
-    """Data whose states are freed of noise, where there is any, and a sentence that says so.
+_TOLD = 3  # glitches that a note names
 
-    `noise` is the (nx,) standard deviation of what was taken out, zero where that is nothing.
-    """
+
+class Cleaned(NamedTuple):
+    """A source, the episodes that are held of it, and what was done to them, in sentences."""
 
     source: Source
     held: Episodes
-    noise: Float[np.ndarray, " nx"]
     notes: tuple[str, ...]
 
 
-def smoothed(source: Source, held: Episodes) -> Smoothed:
-    """Return the source and the episodes `held` of it with smoothed states, or as they are where no noise is found.
+def mended(source: Source, held: Episodes) -> Cleaned:
+    """Return the source and the episodes `held` of it with glitches replaced, or as they are where there is none."""
+    try:
+        mender = Mender.of(held)
+    except DataError:  # too few data to tell a glitch from the plant, or too many states
+        return Cleaned(source, held, ())
+    found = mender.glitches(held)
+    if not found:
+        return Cleaned(source, held, ())
+    named = [
+        f"{quantity(held.states[one.state], f'{one.was:.4g}')} in row {one.row} of episode {one.episode}, "
+        f"now {one.now:.4g}"
+        for one in found[:_TOLD]
+    ]
+    rest = f", and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
+    note = f"measurements that fit neither those before nor those after were replaced: {'; '.join(named)}{rest}"
+    return Cleaned(*_changed(source, held, mender), (note,))
 
-    The smoother is found on `held`; where that is not all of the source, its parts are smoothed as they are read.
+
+def smoothed(source: Source, held: Episodes) -> tuple[Cleaned, Float[np.ndarray, " nx"]]:
+    """Return source and episodes with smoothed states, or as they are where no noise is found, and its size.
+
+    The size is the (nx,) standard deviation of what was taken out, zero where that is nothing. The smoother is found
+    on `held`; where that is not all of the source, its parts are smoothed as they are read.
     """
+    nothing = Cleaned(source, held, ()), np.zeros(held.nx)
     try:
         smoother = Smoother.of(held)
-    except DataError:  # too few data to tell noise from the plant, or too many states
-        smoother = None
-    if smoother is None or not smoother.found.any():
-        return Smoothed(source, held, np.zeros(held.nx), ())
-    clean = smoother(held)
-    whole = isinstance(source, Held) and source.episodes is held
-    changed = Changed(source, smoother, held.states, held.inputs, held.disturbances)
+    except DataError:
+        return nothing
+    if not smoother.found.any():
+        return nothing
     told = ", ".join(
         quantity(name, f"{size:.2g}")
         for name, size, found in zip(held.states, smoother.noise, smoother.found, strict=True)
         if found
     )
-    note = f"the measurements hold noise, of standard deviation {told}: models are of smoothed states (smooth=False)"
-    return Smoothed(Held(clean) if whole else changed, clean, smoother.noise, (note,))
+    note = f"the measurements hold noise, of standard deviation {told}: models are of smoothed states"
+    return Cleaned(*_changed(source, held, smoother), (note,)), smoother.noise
+
+
+def _changed(source: Source, held: Episodes, change: EpisodesMap) -> tuple[Source, Episodes]:
+    changed = change(held)
+    if isinstance(source, Held) and source.episodes is held:
+        return Held(changed), changed
+    return Changed(source, change, held.states, held.inputs, held.disturbances), changed
 
 
 def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ...]]:

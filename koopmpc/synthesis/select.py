@@ -19,7 +19,7 @@ from koopmpc.parallel import StageProgress, map_tasks
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate, expanded, jumps, still, usual
 from koopmpc.synthesis.cross_validation import EXACT, LEAST, Trial, ridges_of, tried
-from koopmpc.synthesis.folds import folded, sampled, smoothed, usual_horizon
+from koopmpc.synthesis.folds import folded, mended, sampled, smoothed, usual_horizon
 from koopmpc.synthesis.selection import LeaderboardRow, Selection, choice, row_of
 from koopmpc.validate.scoring import AnyPredictor
 
@@ -89,8 +89,9 @@ def select(
         them at the next step, and small models go wrong less where there are few data. False: by forecasts in z, as
         `rollout` predicts and a linear model is judged, and as exactly as the data allow.
     smooth
-        Where the states hold noise, free them of it first with a `Smoother`: least squares on noisy states makes an
-        unstable plant look tame, and so do forecasts that begin at them. The notes tell how much noise was found.
+        Replace glitches with a `Mender`, and where the states hold noise, free them of it with a `Smoother`. Least
+        squares on noisy states makes an unstable plant look tame, and so do forecasts that begin at them. The notes
+        tell what was found.
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
@@ -138,8 +139,9 @@ def select(
             stacklevel=2,
         )
     if smooth:
-        source, held, _, told_noise = smoothed(source, held)
-        notes = (*notes, *told_noise)
+        source, held, replaced = mended(source, held)
+        (source, held, freed), _ = smoothed(source, held)
+        notes = (*notes, *replaced, *freed)
     both = bilinear and source.nu > 0 and source.nw == 0
     given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
     first = max(one.delays for one in given)
