@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.data.smoother import Piece, Smoother, state_space
+from koopmpc.data.smoother import Passage, Smoother, state_space
 from koopmpc.data.state_space import Stretches, gains_of, left_out
 from koopmpc.values import Value
 
@@ -107,7 +107,7 @@ class Mender(Value):
                 found.append(Glitch(piece.episode, place, i, float(data[piece.episode].X[place, i]), now))
         return sorted(found)
 
-    def _searched(self, pieces: list[Piece], given: Stretches) -> list[tuple[int, int, int, float]]:
+    def _searched(self, pieces: list[Passage], given: Stretches) -> list[tuple[int, int, int, float]]:
         """Return (piece, row, state, what stands there now) of each glitch."""
         Y, model = given.X.copy(), self.smoother.model
         gains = gains_of(model, Y.shape[1] - model.delays)

@@ -155,7 +155,7 @@ class Smoother(Value):
             states = smoothed(model, gains, given, model.drive(states, given.U))
         return states
 
-    def stretches(self, data: Episodes) -> Iterator[tuple[list["Piece"], Stretches]]:
+    def stretches(self, data: Episodes) -> Iterator[tuple[list["Passage"], Stretches]]:
         """Yield pieces of about one length, standardized, which together hold each row of each episode once.
 
         What is further away than the overlap of two pieces does not count. Episodes of d steps or fewer are left out.
@@ -181,7 +181,7 @@ class Smoother(Value):
             yield pieces, Stretches(X, U, steps)
 
 
-class Piece(NamedTuple):
+class Passage(NamedTuple):
     """Rows `first` to `last` of an episode, of which those from `low` to `high` count; the ends are one beyond."""
 
     episode: int
@@ -241,15 +241,15 @@ def _windows(data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndar
     return Stretches((X - mean[:nx]) / scale[:nx], (U - mean[nx:]) / scale[nx:], np.full(len(X), steps))
 
 
-def _alike(lengths: Sequence[int], delays: int) -> Iterator[list[Piece]]:
+def _alike(lengths: Sequence[int], delays: int) -> Iterator[list[Passage]]:
     """Yield pieces of about one length, which are smoothed together: whole episodes, and parts of long ones."""
-    groups: dict[int, list[Piece]] = {}
+    groups: dict[int, list[Passage]] = {}
     for i, length in enumerate(lengths):
         if length <= delays:
             continue
         count = 1 if length < 2 * _BLOCK else length // _BLOCK
         ends = [(length + 1) * k // count for k in range(count + 1)]
         for low, high in pairwise(ends):
-            piece = Piece(i, max(low - _OVERLAP, 0), min(high + _OVERLAP, length + 1), low, high)
+            piece = Passage(i, max(low - _OVERLAP, 0), min(high + _OVERLAP, length + 1), low, high)
             groups.setdefault((piece.last - piece.first).bit_length(), []).append(piece)
     yield from groups.values()

@@ -88,7 +88,7 @@ def mended(source: Source, held: Episodes) -> Cleaned:
     if not found:
         return Cleaned(source, held, ())
     named = [
-        f"{quantity(held.states[one.state], f'{one.was:.4g}')} in row {one.row} of episode {one.episode}, "
+        f"{quantity(held.states[one.state], f'= {one.was:.4g}')} in row {one.row} of episode {one.episode}, "
         f"now {one.now:.4g}"
         for one in found[:_TOLD]
     ]
@@ -111,11 +111,11 @@ def smoothed(source: Source, held: Episodes) -> tuple[Cleaned, Float[np.ndarray,
     if not smoother.found.any():
         return nothing
     told = ", ".join(
-        quantity(name, f"{size:.2g}")
+        quantity(name, f"± {size:.2g}")
         for name, size, found in zip(held.states, smoother.noise, smoother.found, strict=True)
         if found
     )
-    note = f"the measurements hold noise, of standard deviation {told}: models are of smoothed states"
+    note = f"the measurements hold noise (standard deviations): {told}; models are of smoothed states"
     return Cleaned(*_changed(source, held, smoother), (note,)), smoother.noise
 
 

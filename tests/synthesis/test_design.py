@@ -272,10 +272,10 @@ def test_no_margin_excludes_a_reference_inside_the_limits_and_advice_says_what_w
 
 
 def far_away(kick, push=1.0):
-    """The data, and one episode more whose sensor jumps by `kick` and whose inputs are `push` times as large."""
+    """The data, and one episode more whose sensor jumps by `kick` and stays there, and whose inputs are `push` times as large."""
     last = data(12)[11]
     X = np.array(last.X)
-    X[10, 1] += kick
+    X[10:, 1] += kick
     return data(12).with_episodes([*list(data(12))[:11], km.Episode(X=X, U=push * np.asarray(last.U))])
 
 
@@ -324,3 +324,14 @@ def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
     model = found.controller.predictor
     wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)
     assert not room.confirmed(test[-1], wrong, outcome)
+
+
+def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():
+    last = data(12)[11]
+    X = np.array(last.X)
+    X[10, 1] += 50.0
+    spoilt = data(12).with_episodes([*list(data(12))[:11], km.Episode(X=X, U=last.U)])
+    found = designed(spoilt)
+    assert any("x1 = " in note and "row 10 of episode 11" in note for note in found.notes)
+    assert not any("is left out" in sentence for sentence in found.advice)
+    assert found.best.recipe.candidate == designed(data(12)).best.recipe.candidate
