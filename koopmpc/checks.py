@@ -1,6 +1,7 @@
 """Checks of arguments, with the messages about shapes, dtypes, NaN and definiteness."""
 
-from collections.abc import Iterable, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from typing import cast
 
@@ -193,6 +194,16 @@ def kind(value: object, name: str, wanted: type | tuple[type, ...], advice: str)
         classes = wanted if isinstance(wanted, tuple) else (wanted,)
         names = " or a ".join(each.__name__ for each in classes)
         raise DataError(f"{name} is a {type(value).__name__}, expected a {names}; {advice}")
+
+
+def takes(function: Callable[..., object], name: str, count: int, advice: str) -> None:
+    """Raise where a function cannot be called with `count` arguments; one that does not tell is let through."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except TypeError:
+        raise DataError(f"{name} does not take {count} arguments; {advice}") from None
+    except ValueError:  # built in C
+        return
 
 
 def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:

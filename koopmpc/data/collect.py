@@ -167,6 +167,7 @@ def _start(excitation: Excitation | InputFunction, steps: int, dt: float, nu: in
     if isinstance(excitation, Excitation):
         return excitation.start(steps, dt, rng)
     checks.members(excitation, "excitation", ("__call__",), "pass Noise(low, high), or a function (k, y, rng) -> u")
+    checks.takes(excitation, "excitation", 3, "pass a function (k, y, rng) -> u")
     return lambda k, y: checks.vector(excitation(k, y, rng), "the excitation's u", nu)
 
 

@@ -131,6 +131,8 @@ def simulate(
     if nu != len(inputs):
         raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(inputs)} ({inputs})")
     rows = rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
+    if cost is not None:
+        checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…)")
     nr = rows.shape[1] if cost is None else cost.of.bind(states).nz
     if rows.shape[1] != nr:
         raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
@@ -103,6 +104,7 @@ def expanded(
 
     A lifting that can be of the states alone, one with centres for example, is tried only without delays.
     """
+    checks.kind(given, "candidates", Sequence, "pass liftings or Candidates in a list")
     found: list[Candidate] = []
     for i, one in enumerate(given):
         if isinstance(one, Candidate):

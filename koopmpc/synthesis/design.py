@@ -151,6 +151,7 @@ def design(
     if smooth:
         (source, held, freed), noise = smoothed(source, held)
         notes = (*notes, *freed)
+    checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)

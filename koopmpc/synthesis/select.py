@@ -121,6 +121,7 @@ def select(
     source, draw = source_of(episodes), checks.generator(rng)
     weights = RIDGES if ridges is None else ridges_of(ridges)
     folds = checks.count(folds, "folds", 2)
+    checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     if not past:
         raise DataError("delays is empty; pass 0 for a model without an embedding")
@@ -142,6 +143,7 @@ def select(
         source, held, replaced = mended(source, held)
         (source, held, freed), _ = smoothed(source, held)
         notes = (*notes, *replaced, *freed)
+    checks.kind(bilinear, "bilinear", bool, "pass True or False")
     both = bilinear and source.nu > 0 and source.nw == 0
     given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
     first = max(one.delays for one in given)

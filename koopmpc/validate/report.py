@@ -119,7 +119,7 @@ def trust(
         raise DataError("there is 1 held-out episode; the conformal band needs 2 or more")
     band = conformal(predictor, held_out, horizon, level=level, rng=source)
     total = moments_of(held_out, predictor)
-    fitted = held_out if train is None else train
+    fitted = held_out if train is None else episodes_of(train)
     low, high = _range(held_out)
     seen = coverage(fitted) if train is None else coverage(fitted, low=low, high=high)
     total_fitted = total if train is None else moments_of(train, predictor)

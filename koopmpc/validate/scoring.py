@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.predict.spectrum import same_names
@@ -126,7 +126,9 @@ def score(predictor: AnyPredictor, episodes: Episodes, horizon: int, *, stride: 
 
 def comparable(predictor: AnyPredictor, episodes: Episodes, horizon: int) -> Episodes:
     """Return the episodes of what ψ acts on; raise where one is too short for `horizon` steps from any start."""
-    same_names(predictor, episodes)
+    models = LinearPredictor, BilinearPredictor
+    checks.kind(predictor, "predictor", models, "pass what a fit returns; of a controller its .predictor")
+    same_names(predictor, episodes_of(episodes))
     points = predictor.embed(episodes)
     for i, episode in enumerate(points):
         if len(episode) < horizon:

@@ -79,6 +79,10 @@ GARBAGE = [None, 7, float("nan"), object(), [1, 2], [[1], [2, 3]], np.full((2, 2
 KEPT = {  # what is no garbage in some places: a function for an excitation, None for what may be left out
     "excitation": [len],
     "noise": [None],
+    "trust train": [None],
+    "simulate cost": [None],
+    "candidates": [None],
+    "delays": [GARBAGE[4]],
     "embedding": [None],
 }
 EPISODES = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=4, steps=8)
@@ -88,6 +92,15 @@ TAKES = {
     "inputs": lambda bad: replace(LIFTED, inputs=bad),
     "lifting": lambda bad: replace(LIFTED, lifting=bad),
     "predictor": lambda bad: km.score(bad, EPISODES, 3),
+    "held_out": lambda bad: km.score(LIFTED, bad, 3),
+    "trust train": lambda bad: km.trust(LIFTED, EPISODES, 3, train=bad),
+    "simulate cost": lambda bad: km.simulate(
+        PLANT, km.LQR(LIFTED, PENDULUM.cost), x0=[0, 0], reference=[0, 0], steps=2, cost=bad
+    ),
+    "candidates": lambda bad: km.select(EPISODES, candidates=bad, horizon=2, folds=2),
+    "delays": lambda bad: km.select(EPISODES, candidates=[km.State()], delays=bad, horizon=2, folds=2),
+    "smoother": lambda bad: km.data.Smoother.of(bad),
+    "mender": lambda bad: km.data.Mender.of(bad),
     "episodes": lambda bad: km.score(LIFTED, bad, 3),
     "data": lambda bad: km.identify.eigenfunctions(bad, km.State()),
     "embedding": lambda bad: km.edmd(EPISODES, km.State(), embedding=bad),
