@@ -3,6 +3,7 @@
 Near a guess it is found by Gauss–Newton steps that hold the active limits; from afar, or where these fail, by ipopt.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
@@ -29,6 +30,7 @@ _AT = 1e-6  # share of a limit's size and value within which ipopt ends at a lim
 _BESIDE = 0.3  # share of a reference row within which the next one is sought from its equilibrium
 _STARTS = 12  # guesses of an equilibrium where the reference is not of the state
 _MISSED = 1e-6  # share of ‖r‖²_Q that a good equilibrium may leave
+_FAR = 3.0  # standard deviations from the mean of the data, beyond which another equilibrium is looked for
 _MOST = 10_000  # terminal targets remembered before the memory starts anew
 
 
@@ -232,43 +234,13 @@ class Equilibria:
 
     def guess(self, row: Float[np.ndarray, " nr"]) -> Equilibrium:
         """Return where the search for the equilibrium of a row begins: the state that it names, inputs at zero."""
-        model, u, of = self.model, np.clip(np.zeros(self.model.nu), *self._outputs.inputs), self._cost.of
+        model, u = self.model, np.clip(np.zeros(self.model.nu), *self._outputs.inputs)
         x = np.zeros(model.nx)
-        if isinstance(of, State):
-            y, weighed = (
-                model.center,
-                np.atleast_1d(self._outputs.Q.any(axis=0)),
-            )  # of other states a reference may say nothing
-            if self.of_state:
-                y = row if y is None else np.where(weighed, row, y)
-            else:
-                y = np.zeros(model.ny) if y is None else y.copy()
-                for i, value, counts in zip(cast("State", of.bind(self._names)).chosen, row, weighed, strict=True):
-                    y[i] = value if counts else y[i]
-            x = y if model.embedding is None else model.embedding.held(y, u)
+        if self.of_state:
+            weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
+            x = row if center is None else np.where(weighed, row, center)
+            x = x if model.embedding is None else model.embedding.held(x, u)
         return Equilibrium(x, u, np.zeros(len(self._low), dtype=np.intp))
-
-    def _guesses(self, row: Float[np.ndarray, " nr"]) -> list[Float[np.ndarray, " n"]]:
-        """Return where to begin: at `guess`, there with inputs amid their limits, anywhere if neither tells a state."""
-        x, u, _ = self.guess(row)
-        low, high = self._outputs.inputs
-        both, amid = np.isfinite(low) & np.isfinite(high), u.copy()
-        amid[both] = (low[both] + high[both]) / 2
-        guesses = [np.concatenate([x, u])]
-        if self.model.center is not None and not np.array_equal(amid, u):
-            guesses.append(np.concatenate([x, amid]))
-        named = isinstance(self._cost.of, State) and (self.of_state or self.model.center is not None)
-        if not named:  # the nearest stationary point may be wrong: hanging, not upright
-            scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, self.model.nx))
-            guesses += [np.concatenate([x, u]) for x in scatter]
-        return guesses
-
-    def _away(self, x: Float[np.ndarray, " nx"]) -> float:
-        """Return how far x is from the mean of the data that the model knows, by sizes; 0 where that is not known."""
-        model = self.model
-        if model.center is None:
-            return 0.0
-        return round(float(np.linalg.norm((x[: model.ny] - model.center) / self.size[: model.ny])), 3)
 
     def find(
         self,
@@ -278,17 +250,63 @@ class Equilibria:
     ) -> Equilibrium | None:
         """Return the equilibrium that holds a row, by ipopt, from `near` or several guesses, or None.
 
-        A learned model may hold a row at several states; the one nearest to the mean of its data is taken.
+        A learned model may hold a row at several states. Where the one that is found first lies outside its data, one
+        among them is looked for.
         """
+        x, u, _ = self.guess(row)
+        guesses = [np.concatenate([x, u] if near is None else [near.x, near.u])]
+        if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
+            scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, self.model.nx))
+            guesses += [np.concatenate([x, u]) for x in scatter]
+        first = self._solved(row, e, guesses)
+        if near is not None or first is None or not self._outside(first.x):
+            return first
+        others = [self._solved(row, e, [guess]) for guess in self._among(row, u)]
+        held = [each for each in others if each is not None and self._missed(each.x, row) <= self._missed(first.x, row)]
+        return min([first, *held], key=lambda each: self._outside(each.x))
+
+    def _among(self, row: Float[np.ndarray, " nr"], u: Float[np.ndarray, " nu"]) -> list[Float[np.ndarray, " n"]]:
+        """Return two guesses among the data, with the inputs u and with inputs amid their limits."""
+        model, of, (low, high) = self.model, self._cost.of, self._outputs.inputs
+        assert model.center is not None, "outside of data that are known"
+        y, both, amid = model.center.copy(), np.isfinite(low) & np.isfinite(high), u.copy()
+        if isinstance(of, State):
+            chosen = cast("State", of.bind(self._names)).chosen
+            weighed = [bool(column.any()) for column in self._outputs.Q.T]
+            for i, value, counts in zip(chosen, row, weighed, strict=True):
+                y[i] = value if counts else y[i]
+        amid[both] = (low[both] + high[both]) / 2
+        held = [y if model.embedding is None else model.embedding.held(y, each) for each in (u, amid)]
+        return [np.concatenate(pair) for pair in zip(held, (u, amid), strict=True)]
+
+    def _outside(self, x: Float[np.ndarray, " nx"]) -> float:
+        """Return by how many standard deviations x is further from the mean of the model's data than 3; 0 if inside."""
+        center, spread = self.model.center, self.model.spread
+        if center is None or spread is None:
+            return 0.0
+        away = np.abs(x[: len(center)] - center) / np.maximum(spread, 1e-12 * (1 + np.abs(center)))
+        return max(float(away.max()) - _FAR, 0.0)
+
+    def _missed(self, x: Float[np.ndarray, " nx"], row: Float[np.ndarray, " nr"]) -> float:
+        """Return ‖of(x) − r‖²_Q by its size; what a good equilibrium may leave counts as that."""
+        off = self.values(x, np.zeros(self.model.nu))[1] - row
+        return max(float(off @ self._outputs.Q @ off), _MISSED * float(row @ self._outputs.Q @ row))
+
+    def _solved(
+        self,
+        row: Float[np.ndarray, " nr"],
+        e: Float[np.ndarray, " nx"] | None,
+        guesses: Sequence[Float[np.ndarray, " n"]],
+    ) -> Equilibrium | None:
+        """Return the best equilibrium from these guesses, or the first that is good."""
         model, inputs, box = self.model, self._outputs.inputs, self._outputs.outputs
         nx, e = model.nx, np.zeros(model.nx) if e is None else e
         size, limit_size = self.size, self._limit_size
-        guesses = self._guesses(row) if near is None else [np.concatenate([near.x, near.u])]
         unlimited = np.full(len(box.low), np.inf)
         good = _MISSED * float(row @ self._outputs.Q @ row) / self._scale
-        best: Float[np.ndarray, " n"] | None = None
+        best = None
         for limits in (box, Interval(-unlimited, unlimited)):
-            found, least = None, (np.inf, np.inf)
+            found, least = None, np.inf
             for guess in guesses:
                 bounds = {
                     "lbx": np.concatenate([np.full(nx, -np.inf), inputs.low / size[nx:]]),
@@ -300,9 +318,9 @@ class Equilibria:
                 with listening():
                     solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
                     success, f, s = self._solver.stats()["success"], float(solved["f"]), solved["x"].full().ravel()
-                if success and (rank := (max(f, good), self._away(s[:nx] * size[:nx]))) < least:
-                    found, least = s * size, rank
-                if least[0] <= good and model.center is None:
+                if success and f < least:
+                    found, least = s * size, f
+                if least <= good:
                     break
             if found is not None:
                 best = found

@@ -42,6 +42,8 @@ class LearnedMap:
         What makes x of the plant's state and its past; None where x is that state.
     center
         (ny,) mean of the plant's states over the data that the model was fitted to, None where it is not known.
+    spread
+        (ny,) their standard deviation, None where it is not known.
     """
 
     model: ModelOrMap
@@ -56,13 +58,16 @@ class LearnedMap:
     lifting: None = None  # a plan is made of states, and none of them is lifted
     nz: int = field(init=False)  # a plan is made of x
     center: Float[np.ndarray, " ny"] | None = field(init=False)
+    spread: Float[np.ndarray, " ny"] | None = field(init=False)
 
     def __post_init__(self) -> None:
-        model, center = self.model, None
+        model, center, spread = self.model, None, None
         if not isinstance(model, StepMap) and model.scale is not None and model.lifting.constant_index is not None:
             center = model.C @ (model.scale.T @ model.scale[:, model.lifting.constant_index])
+            spread = np.sqrt(np.maximum(np.sum((model.scale @ model.C.T) ** 2, axis=0) - center**2, 0.0))
         object.__setattr__(self, "nz", self.nx)
         object.__setattr__(self, "center", center)
+        object.__setattr__(self, "spread", spread)
 
     def updated(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.
