@@ -225,7 +225,7 @@ def test_what_cannot_be_used_is_named(model, tmp_path: Path):
     with pytest.raises(km.errors.DataError, match="run is a LinearPredictor, expected a Run"):
         km.record(model, tmp_path / "run.rrd")
     with pytest.raises(km.errors.DataError, match=r"K is a Gain; pass its matrix, gain\.K"):
-        km.Feedback(km.dlqr(model.A, model.B, np.eye(model.nz), np.eye(1)), km.Noise(-1, 1))
+        km.Feedback(km.dlqr([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], np.eye(2), np.eye(1)), km.Noise(-1, 1))
     run = replace(loop(PLANT, move), scene=lambda x, u: [km.scene.Line("arm", [(0, 0), (float("nan"), 1)])])
     with pytest.raises(km.errors.DataError, match=r"step 0 draws 'arm' at NaN"):
         km.record(run, tmp_path / "run.rrd")
