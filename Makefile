@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 # One BLAS thread: timings that can be compared, and the same bits on every run.
 PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
-PYTEST := $(PINNED) $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-disable
+# Bytecode is kept: tests start hundreds of processes that import koopmpc.
+PYTEST := $(PINNED) PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-disable
 TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
 
 .PHONY: bench test typed full mutants loops soak speed docs check format clean embedded

@@ -16,6 +16,8 @@ from hypothesis import settings
 import tests.typecheck
 
 MODE = os.environ.get("KOOPMPC_TESTS", "")
+if MODE != "bare":
+    os.environ.setdefault("KOOPMPC_CFLAGS", "-O0")  # the numbers are those of -O3, and compiling takes half the time
 if MODE == "typed":
     tests.typecheck.hook()
 

@@ -125,15 +125,18 @@ def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
 def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
     """Return the machine code of this C, loaded from `cache` or compiled into it; without one nothing is left on disk.
 
+    The flags in the environment variable KOOPMPC_CFLAGS come after our own, and code of other flags is another file.
+
     Raises
     ------
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
+    command = [*command, *_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # code that is loaded outlives its file
             return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
-    key = "\0".join([text, *command, *_FLAGS, platform.machine(), platform.system()])
+    key = "\0".join([text, *command, platform.machine(), platform.system()])
     path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     if path.is_file():
         try:
@@ -174,7 +177,7 @@ def _compile(text: str, command: list[str], path: Path) -> Path:
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         code, library = Path(folder) / "step.c", Path(folder) / "step.so"
         code.write_text(text)
-        subprocess.run([*command, *_FLAGS, "-o", str(library), str(code), "-lm"], check=True, capture_output=True)
+        subprocess.run([*command, "-o", str(library), str(code), "-lm"], check=True, capture_output=True)
         library.replace(path)
     return path
 

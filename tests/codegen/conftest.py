@@ -6,6 +6,12 @@ import koopmpc as km
 DT = 0.05
 
 
+@pytest.fixture(autouse=True)
+def _sizes_are_not_measured(monkeypatch):
+    """Leave out the compiler's run for the README's table of sizes; folders of module fixtures are made before this."""
+    monkeypatch.setattr("koopmpc.codegen.export._measure_objects", lambda *_: None)
+
+
 @pytest.fixture(scope="session")
 def pendulum():
     """The pendulum driven upright: its map, and a model of twelve observables that was fitted in closed loop."""

@@ -201,6 +201,16 @@ def test_the_compiler_may_have_arguments(tmp_path, monkeypatch):
     assert routines.compiler() is None
 
 
+@needs_compiler
+def test_flags_of_the_environment_come_last_and_code_of_other_flags_is_another_file(tmp_path, monkeypatch):
+    command, text = routines.compiler(), "#ifdef __OPTIMIZE__\n#error\n#endif\nint told(void) { return TOLD; }"
+    for told in (3, 4):
+        monkeypatch.setenv("KOOPMPC_CFLAGS", f"-O0 -DTOLD={told}")
+        for cache in (tmp_path, tmp_path, None):
+            assert routines.library(text, command, cache).told() == told
+    assert len(list(tmp_path.glob("*.so"))) == 2
+
+
 def test_without_a_compiler_batches_run_over_columns(monkeypatch):
     monkeypatch.setattr(routines, "compiler", lambda: None)
     plant = km.discretize(CartPole(), 0.02)
