@@ -68,6 +68,7 @@ class Prepared:
         self._designs: list[tuple[Limits, Design]] = []
         self.training_time = 0.0
         self._held: dict[str, Float[np.ndarray, "T nu"]] = {}
+        self._plants: dict[str, StepMap | Plant] = {}  # of the cases that have one of their own
 
     def keep(self, names: Iterable[str]) -> None:
         """Learn what these controllers need, and write it into the folder `kept`, for all workers.
@@ -123,7 +124,11 @@ class Prepared:
     def truth_of(self, case: str) -> StepMap | Plant:
         """Return the plant that is driven in this case, by default the problem's."""
         plant = self.problem.cases[case].plant
-        return self.truth if plant is None else self._driven(plant)
+        if plant is None:
+            return self.truth
+        if case not in self._plants:
+            self._plants[case] = self._driven(plant)
+        return self._plants[case]
 
     def off(self, case: str, wrong: float, start: int) -> StepMap | Plant:
         """Return the plant of a case with each parameter times 1 + e, e uniform in ±`wrong`.
