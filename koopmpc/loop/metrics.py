@@ -228,6 +228,8 @@ def _violation(run: Run) -> tuple[float, float]:
     if run.limits is None:
         return 0.0, 0.0
     nu, cost, (states, rates) = run.U.shape[1], run.cost or Cost(1, 1), _broken(run, run.limits)
+    if not states.any() and not rates.any():
+        return 0.0, 0.0
     tracked = cost.of.bind(run.states)
     size = Sizes.of(tracked, *cost.matrices(tracked.nz, nu), run.limits, run.states, None).rows
     most = states.max(axis=0, initial=0.0)
