@@ -61,6 +61,7 @@ def _every_qp_meets_kkt():
     if MODE == "bare":
         yield
         return
+    import koopmpc.bench.single
     import koopmpc.control.target
     from koopmpc.control import solvers
     from tests.control.kkt import CheckedDAQP, CheckedOSQP
@@ -68,4 +69,5 @@ def _every_qp_meets_kkt():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(solvers.SOLVERS, "osqp", CheckedOSQP)
         patch.setattr(koopmpc.control.target, "DAQP", CheckedDAQP)
+        patch.setattr(koopmpc.bench.single, "_COLD_STEPS", 2)  # a sleep before each of 25 is half of a short run
         yield

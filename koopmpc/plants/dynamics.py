@@ -156,8 +156,10 @@ def output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
     x = ca.SX.sym("x", dynamics.nx)
     value = _expression(dynamics.measure(x), f"{type(dynamics).__name__}.measure", x)
     names: list[str] = []
+    states = [(name, x[j]) for j, name in enumerate(dynamics.states)]
     for i in range(value.size1()):
-        passed = [name for j, name in enumerate(dynamics.states) if ca.is_equal(value[i], x[j])]
+        measured = value[i]
+        passed = [name for name, state in states if ca.is_equal(measured, state)]
         names.append(passed[0] if passed else f"y{i}")
     return ca.Function("h", [x], [value], ["x"], ["y"]), tuple(names)
 

@@ -229,7 +229,7 @@ def test_two_sweeps_at_once_in_one_folder_are_refused(problem, tmp_path):
     assert len(km.sweep([problem], ["lqr"], folder=tmp_path, progress=second)) == 2
 
 
-def test_a_sweep_waits_for_the_worker_of_one_that_was_killed(problem, tmp_path):
+def test_a_sweep_waits_for_the_worker_of_one_that_was_killed(problem, tmp_path, monkeypatch):
     pytest.importorskip("fcntl")
     grid, folder = {**GRID, "starts": 1}, tmp_path / "kept"
     expected = figures(km.sweep([problem], TWO, folder=folder, **grid))
@@ -247,6 +247,7 @@ def test_a_sweep_waits_for_the_worker_of_one_that_was_killed(problem, tmp_path):
                 assert figures(km.sweep([problem], TWO, folder=folder, **grid)) == expected
                 assert worker.poll() == 0
             else:
+                monkeypatch.setattr("koopmpc.bench.store._OUTLIVES", 0.2)
                 with pytest.raises(km.errors.ProblemError, match="another process runs a sweep in"):
                     km.sweep([problem], TWO, folder=folder, **grid)
                 worker.kill()

@@ -47,6 +47,11 @@ def usual():
     return designed(data())
 
 
+@cache
+def of_noisy_data():
+    return designed(noisy(data(), 0.05))
+
+
 def least_cost(x0, steps):
     """The least cost of a whole run of the mass with |u| ≤ 1, by bounded least squares."""
     powers, rows, right = [np.eye(2)], [], []
@@ -128,7 +133,7 @@ def test_a_position_that_nothing_depends_on_may_leave_the_data():
 
 
 def test_noise_in_the_data_is_in_the_runs_too():
-    clean, rough = usual().expected, designed(noisy(data(), 0.05)).expected
+    clean, rough = usual().expected, of_noisy_data().expected
     assert np.median(rough.cost) > np.median(clean.cost)
 
 
@@ -187,8 +192,16 @@ def test_a_moving_state_is_no_equilibrium_to_rest_at():
     ("more", "sentence"),
     [
         ({"starts": [0.0, 3.0]}, r"a start has x1 = 3, outside the data"),
-        ({"reference": np.column_stack([np.zeros(40), np.linspace(0, 3, 40)])}, r"the reference has x1 = 3, outside"),
-        ({"starts": [0.0, -0.6]}, r"a start has x1 = -0\.6, beyond the limit x1 = -0\.5: no input can keep the limit"),
+        pytest.param(
+            {"reference": np.column_stack([np.zeros(40), np.linspace(0, 3, 40)])},
+            r"the reference has x1 = 3, outside",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"starts": [0.0, -0.6]},
+            r"a start has x1 = -0\.6, beyond the limit x1 = -0\.5: no input can keep the limit",
+            marks=pytest.mark.slow,
+        ),
         (
             {"reference": np.column_stack([np.zeros(40), np.linspace(0, 0.6, 40)])},
             r"the reference has x1 = 0\.6, beyond the limit x1 = 0\.5: the loop stays at the limit there; ask for less",
@@ -248,8 +261,7 @@ def test_data_without_inputs_are_refused():
 
 
 def test_limits_are_tightened_by_the_models_errors_unless_told():
-    rough = noisy(data(), 0.05)
-    kept, free = designed(rough), designed(rough, tighten=False)
+    kept, free = of_noisy_data(), designed(noisy(data(), 0.05), tighten=False)
     margin = np.asarray(kept.controller.limits.margin)
     assert margin[0, 1] > 0.03  # smoothing takes the noise out of the data, but not out of what the loop measures
     assert (margin[:, 0] == 0).all()

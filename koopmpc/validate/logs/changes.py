@@ -296,9 +296,16 @@ def _faster(r: int) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray
 
 def _best_offset(log: Log, law: OneStepLaw, pairs: list[Pair], i: int) -> float:
     """Return the offset of state i under which the segments follow the law best."""
+    now, after = (np.concatenate([X[part] for X, _ in pairs]) for part in (slice(-1), slice(1, None)))
+    inputs, ends = np.concatenate([U for _, U in pairs]), np.cumsum([len(U) for _, U in pairs])[:-1]
 
     def total(b: float) -> float:
-        return float(np.median([_moved(i, -b)(law, *pair).mean() for pair in pairs]))
+        X, X_next = now.copy(), after.copy()
+        X[:, i] -= b
+        X_next[:, i] -= b
+        with np.errstate(over="ignore", invalid="ignore"):
+            missed = np.split(X_next - law.step(X, inputs), ends)
+            return float(np.median([law._above(part).mean() for part in missed]))
 
     width = 4.0 * float(log.size[i])
     low, high = -width, width

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -130,9 +130,10 @@ class Log:
         n = Z.shape[1]
         parts = [np.ones((len(Z), 1)), Z]
         if n <= _PAIRED:
-            parts.append(np.stack([Z[:, i] * Z[:, j] for i, j in combinations_with_replacement(range(n), 2)], axis=1))
-            cubes = combinations_with_replacement(range(n), 3) if n <= _CUBED else [(i, i, i) for i in range(n)]
-            parts.append(np.stack([Z[:, i] * Z[:, j] * Z[:, k] for i, j, k in cubes], axis=1))
+            two = _choices(n, 2)
+            three = _choices(n, 3) if n <= _CUBED else np.repeat(_choices(n, 1), 3, axis=0)
+            parts.append(Z[:, two[0]] * Z[:, two[1]])
+            parts.append(Z[:, three[0]] * Z[:, three[1]] * Z[:, three[2]])
         for i in self.angles:
             parts.append(np.stack([np.sin(X[:, i]), np.cos(X[:, i])], axis=1))
             parts.append(Z * np.sin(X[:, [i]]))
@@ -169,6 +170,12 @@ class Log:
         """States that move by more than 0.3 and are not known to be in another unit than rad."""
         free = [i for i, name in enumerate(self.data.states) if "[" not in name or "[rad]" in name]
         return tuple(i for i in free if 0.3 < self.size[i] < 500)
+
+
+@cache
+def _choices(n: int, count: int) -> Int[np.ndarray, "count chosen"]:
+    """Return all ways to choose `count` of n columns, a column of them twice or more too."""
+    return np.array(list(combinations_with_replacement(range(n), count))).T
 
 
 def fitted(P: Float[np.ndarray, "M p"], Y: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
