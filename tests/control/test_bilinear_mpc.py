@@ -4,6 +4,7 @@ import copy
 import pickle
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from tests.tiers import slow
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
 GOOD = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
@@ -50,7 +52,7 @@ LIMITS = [
 ]
 
 
-@pytest.mark.parametrize("nu", [1, 2])
+@pytest.mark.parametrize("nu", [*slow([1]), 2])
 @pytest.mark.parametrize("limits", LIMITS)
 def test_on_a_linear_plant_it_is_koopman_mpc(nu: int, limits: km.Limits) -> None:
     model, cost = linear(nu), km.Cost(Q=[1, 2, 1], R=0.3, Q_N=[[9, 1, 2], [1, 8, 3], [2, 3, 6]])
@@ -118,7 +120,11 @@ def test_machine_code_and_interpreter_agree(monkeypatch: pytest.MonkeyPatch) -> 
         x = pendulum().step_map()(x, a.u)
 
 
-SHARED = km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5, x_min=[-9, -1], x_max=[9, 1]), 10)
+@cache
+def shared() -> km.BilinearMPC:
+    return km.BilinearMPC(pendulum(), CIRCLE, km.Limits(-0.8, 0.5, x_min=[-9, -1], x_max=[9, 1]), 10)
+
+
 measured = st.one_of(st.floats(-20, 20), st.sampled_from([np.nan, np.inf, -np.inf, 1e300, 1e31, 0.0]))
 
 
@@ -126,15 +132,15 @@ measured = st.one_of(st.floats(-20, 20), st.sampled_from([np.nan, np.inf, -np.in
 @given(st.lists(st.tuples(measured, measured), min_size=1, max_size=6), st.booleans())
 def test_whatever_it_measures_its_input_is_inside_the_limits(states: list, fresh: bool) -> None:
     if fresh:
-        SHARED.reset()
+        shared().reset()
     for x in states:
-        move = SHARED(x, [0, 1, 0])
+        move = shared()(x, [0, 1, 0])
         assert (move.u >= -0.8).all()
         assert (move.u <= 0.5).all()
         assert (move.status in GOOD) == (move.fallback is km.control.Fallback.NONE)
         bad = not np.abs(x).max() < 1e30
         assert (move.status is km.Status.BAD_MEASUREMENT) == bad
-        assert (SHARED.plan() is None) == (move.status not in GOOD)
+        assert (shared().plan() is None) == (move.status not in GOOD)
 
 
 def test_hard_limits_that_nothing_meets_are_found() -> None:

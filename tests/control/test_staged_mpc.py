@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -280,19 +281,23 @@ def test_a_step_without_time_says_so_and_the_next_ones_go_on():
     assert ready([0.5, 0.5], [0.0, 0]).status in GOOD
 
 
-SHARED = {
-    "bilinear": km.BilinearMPC(pendulum(), TRACKED, km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3), 10),
-    "nonlinear": km.NonlinearMPC(pendulum().step_map(), TRACKED, km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3), 10),
-}
+@cache
+def shared(kind):
+    model, limits = pendulum(), km.Limits(-0.8, 0.5, du_min=-0.2, du_max=0.3)
+    if kind == "bilinear":
+        return km.BilinearMPC(model, TRACKED, limits, 10)
+    return km.NonlinearMPC(model.step_map(), TRACKED, limits, 10)
+
+
 faulty = st.one_of(st.floats(-4, 4), st.sampled_from([np.nan, np.inf, -np.inf, 1e300, 1e31, 0.0]))
 got = st.one_of(st.none(), st.floats(-3, 3), st.sampled_from([np.nan, np.inf]))
 
 
-@pytest.mark.parametrize("kind", list(SHARED))
+@pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=25, deadline=None)
 @given(steps=st.lists(st.tuples(faulty, faulty, got, st.booleans()), min_size=1, max_size=5))
 def test_inputs_and_rates_are_never_outside_their_limits(kind, steps):
-    mpc = SHARED[kind]
+    mpc = shared(kind)
     mpc.reset()
     last = np.zeros(1)
     for theta, omega, applied, fails in steps:

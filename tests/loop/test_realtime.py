@@ -181,7 +181,7 @@ def test_a_late_step_is_counted_and_its_input_is_applied_late_or_not_at_all(tmp_
             plant,
             dt=dt,
             reference=[0.0],
-            steps=9,
+            steps=7,
             late=policy,
             recorder=recorder,
         )
@@ -193,7 +193,7 @@ def test_a_late_step_is_counted_and_its_input_is_applied_late_or_not_at_all(tmp_
     assert given[at] == (4.0 if policy == "skip" else given[at - 1])
     assert all(given[k] == given[k - 1] for k in skipped)
     assert plant.got == [*(given[k] for k in taken), 0.0]
-    assert paced.steps + paced.skipped == 9
+    assert paced.steps + paced.skipped == 7
     assert paced.late >= 1
     assert paced.held == (paced.late if policy == "hold" else 0)
     assert [k for k in range(run.steps) if run.status[k] is km.Status.TIME_LIMIT] == skipped
