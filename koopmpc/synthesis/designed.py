@@ -242,8 +242,8 @@ def _worst(values: Float[np.ndarray, " runs"]) -> str:
 def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
     """Return the place of the simplest row within 0.5 % of the best, among those that were judged in all conditions.
 
-    A linear model is simpler than a bilinear one; of the same kind a row without weights is simpler, then the one with
-    fewer delays, then the one with fewer observables.
+    A row without weights is simpler, then the one with the smaller model: a bilinear one counts twice its observables.
+    Of one model the row with an estimator is taken, for it forgives what surrogates and models have learned alike.
     """
     places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
     if not places:
@@ -253,7 +253,7 @@ def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
 
     def simple(i: int) -> tuple[object, ...]:
         one = rows[i].recipe
-        return one.candidate.bilinear, one.weighted, one.candidate.delays, one.candidate.lifting.nz, rows[i].score, i
+        return one.weighted, one.candidate.size, one.candidate.delays, one.estimator is None, rows[i].score, i
 
     return min(near, key=simple)
 

@@ -12,6 +12,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import koopmpc as km
+from koopmpc.synthesis.candidates import Candidate, Recipe
 from koopmpc.synthesis.designed import place_of
 from koopmpc.synthesis.judging import LOST, Outcome, ratios, scores
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
@@ -116,6 +117,25 @@ def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
         assert (each[lost] == LOST).all()
         rows = [replace(usual().best, score=float(score), off=True) for score in scores(each)]
         assert place_of(rows) != lost
+
+
+def test_of_equal_rows_the_smallest_model_is_taken_and_of_one_model_the_controller_with_an_estimator():
+    best = usual().best
+    data = km.Episodes([km.Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], 0.1)
+    liftings = [km.State() + km.Constant() + km.Monomials(degree) for degree in (4, 3)]
+    models = [Candidate(f"{i}", each, bilinear=i > 0).bind(data.states, data.inputs) for i, each in enumerate(liftings)]
+    assert models[0].lifting.nz < 2 * models[1].lifting.nz
+    recipes = [Recipe(models[1], 1e-6), *(Recipe(models[0], 1e-6, one) for one in (None, km.LiftedDisturbance()))]
+
+    def chosen(*scores):
+        rows = [
+            replace(best, recipe=recipe, score=score, off=True) for recipe, score in zip(recipes, scores, strict=True)
+        ]
+        return place_of(rows)
+
+    assert chosen(1.0, 1.001, 1.004) == 2
+    assert chosen(1.0, 1.001, 1.006) == 1  # the estimator costs more than half a percent
+    assert chosen(1.0, 1.006, 1.006) == 0
 
 
 def test_violations_count_beyond_half_a_percent_and_beyond_what_nobody_avoids():
