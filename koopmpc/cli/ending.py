@@ -34,13 +34,17 @@ class Ending:
     def __enter__(self) -> None:
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in _SIGNALS:
-            signal.signal(number, self._interrupt)
-        ends, begins = socket.socketpair()
-        begins.setblocking(False)
-        signal.set_wakeup_fd(begins.fileno(), warn_on_full_buffer=False)
-        self._begins = begins  # kept open
-        threading.Thread(target=self._watch, args=(ends,), name="koopmpc-ending", daemon=True).start()
+        try:
+            for number in _SIGNALS:
+                signal.signal(number, self._interrupt)
+            ends, begins = socket.socketpair()
+            begins.setblocking(False)
+            signal.set_wakeup_fd(begins.fileno(), warn_on_full_buffer=False)
+            self._begins = begins  # kept open
+            threading.Thread(target=self._watch, args=(ends,), name="koopmpc-ending", daemon=True).start()
+        except KeyboardInterrupt as error:  # Python leaves no block that was not entered
+            self.__exit__(type(error), error, None)
+            raise
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

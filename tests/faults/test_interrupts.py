@@ -285,6 +285,18 @@ def test_a_command_ends_at_once_with_one_line_and_whole_files(
     assert interrupted > 0
 
 
+def test_an_interrupt_while_the_program_begins_to_listen_ends_it_with_one_line() -> None:
+    code = """
+import os, signal, threading
+from koopmpc.cli.ending import ENDING
+threading.Thread.start = lambda _: os.kill(os.getpid(), signal.SIGINT)
+with ENDING:
+    print("entered")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted; nothing was written\n")
+
+
 def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
     assert kept(None) == "nothing was written"
     folder = tmp_path / "logs"
