@@ -186,7 +186,8 @@ def test_a_pickle_goes_on_with_the_targets_that_it_knew(swung):
     assert other([0.4, 0.0], [0.2, 0.0]).status is km.Status.UNCONSTRAINED
 
 
-@pytest.mark.parametrize("precision", [pytest.param("double", marks=pytest.mark.slow), "float"])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["double", "float"])
 def test_the_folder_builds_without_a_warning_and_runs_clean(swung, tmp_path, precision):
     plant, model = swung
     limits = km.Limits(**BOX, du_max=3.0, x_max=[2.0, 1.5])
