@@ -7,7 +7,6 @@ import pytest
 
 import koopmpc as km
 
-
 FAST, SLOW = "pendulum", pytest.param("cart_pole", marks=pytest.mark.slow)
 NAMES = ["lqr", "koopman-mpc", "offset-free", "nonlinear-mpc"]
 
