@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
+from time import monotonic, sleep
 from typing import Any, cast
 
 from koopmpc import checks
@@ -288,9 +289,15 @@ def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
 
 
 def _exit_code(processes: list[Any]) -> int:
-    """Return how these processes ended: negative where a signal ended one, its number."""
+    """Return how these processes ended: negative where a signal ended one, its number.
+
+    The executor's own thread waits for them too: where it was told first, their exit codes come a moment later.
+    """
+    deadline = monotonic() + _GRACE
     for process in processes:
         process.join(_GRACE)
+        while process.exitcode is None and monotonic() < deadline:
+            sleep(0.001)
     return min((process.exitcode or 0 for process in processes), default=0)
 
 

@@ -1,5 +1,6 @@
 """Tasks come back in order wherever they are done, a lost worker costs nothing, and errors name their task."""
 
+import os
 import subprocess
 import sys
 import time
@@ -191,6 +192,19 @@ def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
 
 def test_a_worker_that_is_killed_while_it_starts_is_not_blamed_on_the_script() -> None:
     with pytest.raises(km.KoopmpcError, match=r"was killed while it started \(signal 9\); run with fewer workers"):
+        list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
+
+
+def test_its_signal_is_found_also_where_the_executor_was_told_of_its_end_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited = os.waitpid
+
+    def slowly(pid: int, options: int) -> tuple[int, int]:
+        ended = waited(pid, options)
+        time.sleep(0.05)  # between the end of a process and the note of its exit code
+        return ended
+
+    monkeypatch.setattr(os, "waitpid", slowly)
+    with pytest.raises(km.KoopmpcError, match=r"killed while it started \(signal 9\)"):
         list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
 
 
