@@ -3,7 +3,7 @@
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -33,6 +33,29 @@ CASES = {
 def test_no_solver_prints(solver, capfd):
     mpc = km.NonlinearMPC(step_map(A, B), *CASES["inputs"], 5, solver=solver)
     assert np.isfinite(mpc([0.5, 0.0], [0.0, 0.0]).u).all()
+    assert capfd.readouterr() == ("", "")
+
+
+@dataclass(frozen=True)
+class Outflow(km.Dynamics):
+    """A tank whose level is not a number below its outlet, 0.2 m above the bottom."""
+
+    states = ("level [m]",)
+    inputs = ("inflow [m/s]",)
+
+    def rhs(self, x, u):
+        return u - ca.sqrt(x - 0.2)
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop", "sqpmethod", None])
+def test_a_step_where_the_model_is_not_a_number_says_so_by_its_status_alone(solver, capfd):
+    plant = km.discretize(Outflow(), dt=0.1)
+    asked = plant, km.Cost(Q=[1.0], R=0.1), km.Limits(u_min=0, u_max=2), 5
+    mpc = km.BilinearMPC(*asked) if solver is None else km.NonlinearMPC(*asked, solver=solver)
+    assert mpc([1.0], [1.0]).status.name in ("OPTIMAL", "UNCONSTRAINED")
+    move = mpc([0.1], [1.0])
+    assert move.status is km.Status.FAILED
+    assert 0 <= move.u[0] <= 2
     assert capfd.readouterr() == ("", "")
 
 

@@ -24,7 +24,14 @@ from koopmpc.plants.routines import Buffered
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
 RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too
 CLOSE = 1e-2  # the same where the next control step goes on: the error left is of the square of this share
-_QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "error_on_fail": False}
+_QUIET = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "error_on_fail": False,
+    "show_eval_warnings": False,
+    "calc_lam_p": False,
+}
 _NEWTON = 20  # Gauss–Newton steps, at most
 _AT = 1e-6  # share of a limit's size and value within which ipopt ends at a limit that is active
 _BESIDE = 0.3  # share of a reference row within which the next one is sought from its equilibrium

@@ -46,7 +46,8 @@ class NonlinearMPC(StagedMPC):
         N steps of the model's dt.
     solver
         "ipopt"; "fatrop", an interior point method that uses the stages; "sqpmethod", sequential quadratic programs
-        solved by qrqp.
+        solved by qrqp. Where a model is no number everywhere, take ipopt: a step of fatrop that begins there is
+        FAILED, and one that comes there on its way does not end.
     starts
         Solve the first step, and one after a failure, from this many guesses, rest at x_0 and random inputs, and
         keep the best: several where this controller is the oracle, so that a local optimum is not the reference.

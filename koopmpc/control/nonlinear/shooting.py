@@ -32,6 +32,8 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
     },
 }
+# A step that failed says so by its status; nobody asks how the cost depends on the parameters.
+_QUIET = {"show_eval_warnings": False, "calc_lam_p": False}
 _STATUS = {
     "Solve_Succeeded": Status.OPTIMAL,
     "Solved_To_Acceptable_Level": Status.OPTIMAL,
@@ -159,7 +161,9 @@ class Shooting:
         parameters = ca.veccat(x0, r, u_r, e, M, L, m)
         nlp = {"x": ca.vec(W), "p": parameters, "f": f / p.scale, "g": ca.vertcat(*g)}
         given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
+        self._start_is_number: ca.Function | None = None
         if solver == "fatrop":
+            self._start_is_number = _is_number(nlp)
             given |= {
                 "N": N,
                 "nx": [0] + [nx] * N,
@@ -168,7 +172,7 @@ class Shooting:
             }
         try:
             with listening():
-                self._solver = ca.nlpsol("shooting", solver, nlp, {**OPTIONS[solver], **given, **settings})
+                self._solver = ca.nlpsol("shooting", solver, nlp, {**_QUIET, **OPTIONS[solver], **given, **settings})
         except (RuntimeError, NotImplementedError, TypeError) as error:
             reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
             raise DataError(
@@ -198,6 +202,9 @@ class Shooting:
             self._bounds[end][:nu] = value / self._sizes[:nu]
         p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
+        if self._start_is_number is not None and not float(self._start_is_number(start.v, np.concatenate(p))):
+            U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
+            return NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)
         with listening():
             found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
             stats = self._solver.stats()
@@ -211,6 +218,16 @@ class Shooting:
         return NLPSolution(
             U, X, slacks, self._scale * float(found["f"]), status, int(stats.get("iter_count", 0)), after
         )
+
+
+def _is_number(nlp: Mapping[str, ca.MX]) -> ca.Function:
+    """Return (variables, parameters) → whether cost, constraints and their slope along (1, …, 1) are finite there.
+
+    fatrop does not end where they are not: it factors a matrix of NaN again and again.
+    """
+    v, values = nlp["x"], ca.vertcat(nlp["f"], nlp["g"])
+    size = ca.sumsqr(values) + ca.sumsqr(ca.jtimes(values, v, ca.MX.ones(v.numel())))
+    return ca.Function("is_number", [v, nlp["p"]], [size < ca.inf])
 
 
 def _weighted(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:
