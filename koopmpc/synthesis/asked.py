@@ -18,7 +18,8 @@ from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
 RUN = 3  # horizons that a run lasts
-STARTS = 4  # episodes whose first states are the default starts
+STARTS = 12  # episodes whose first states are the default starts: one for each condition of a design
+_FEW = 4  # of them are enough, inside the limits and near the others
 ROOM = 0.5  # share of the data's range by which a run may leave the data
 FAR = 1.0  # widths of the others' box by which an episode leaves it that is left out
 MOST = 0.9  # share of the episodes that this box holds
@@ -293,18 +294,18 @@ def _aims(asked: Asked, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
 
 
 def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
-    """Return the first states of episodes, those inside the limits alone where there are as many as starts."""
+    """Return the first states of episodes, those inside the limits alone where there are four or more."""
     points = np.unique(np.array([episode.X[0] for episode in data]), axis=0)
     low, high = limits.states(data.nx)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
-    return inside if len(inside) >= STARTS else points
+    return inside if len(inside) >= _FEW else points
 
 
 def _spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx"]:
     """Return a few of the points: of the half nearest to their median, far from each other."""
     size = np.ptp(points, axis=0)
     Z = (points - np.median(points, axis=0)) / np.where(size > 0, size, 1.0)
-    central = np.argsort((Z**2).sum(axis=1), kind="stable")[: max(-(-len(Z) // 2), min(STARTS, len(Z)))]
+    central = np.argsort((Z**2).sum(axis=1), kind="stable")[: max(-(-len(Z) // 2), min(_FEW, len(Z)))]
     picked = [int(central[-1])]
     while len(picked) < min(STARTS, len(central)):
         apart = np.min([((Z[central] - Z[i]) ** 2).sum(axis=1) for i in picked], axis=0)

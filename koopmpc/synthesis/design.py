@@ -74,9 +74,10 @@ def design(
     4. The best go on with every estimator and end of the horizon, one with weights around what its loops visit, and are
        also judged on surrogates whose inputs act 20 % more and 20 % less: a plant is never quite the one of its logs.
     5. A run's score is its cost × (1 + 10 max(0, violation − 0.5 %)) over the best on the same surrogate and start, at
-       most 20, and 20 where it leaves the data by half of their range. The least geometric mean wins; of all within
-       0.5 % of it the simplest is taken, and fitted to all data. Where it then loses or costs a quarter more on the
-       surrogates than it did when fitted to two folds, the next best is taken, and the notes say so.
+       most 20, and 20 where it leaves the data by half of their range. The least geometric mean wins, in which runs
+       with inputs 20 % off count half; of all within 0.5 % of it the simplest is taken, and fitted to all data. Where
+       it then loses or costs a quarter more on the surrogates than it did when fitted to two folds, the next best is
+       taken, and the notes say so.
 
     The choice depends on the data and `rng` alone, never on time or on the number of workers.
 
@@ -91,7 +92,8 @@ def design(
     reference
         (nr,) of the tracked outputs, or rows (T+1, nr), of which the runs take stretches of three horizons.
     starts
-        (nx,) or (n, nx) states from which runs begin; by default first states of four episodes, inside the limits.
+        (nx,) or (n, nx) states from which runs begin; by default first states of up to twelve episodes, inside the
+        limits.
     angles
         Indices of states whose errors wrap at ±π. They may leave the data; so may angles that made whole turns in the
         data, and positions on which nothing depends.
@@ -374,7 +376,7 @@ def _rounds(
     """
     run, every = partial(judged, test), tuple(range(len(test.conditions)))
     first = pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops"), size=Job.size)
-    score = scores(ratios(first))
+    score = scores(ratios(first), test.weights[list(test.nominal)])
     ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
@@ -391,13 +393,13 @@ def _rounds(
     jobs = _jobs(second, screened, first, every)
     outcomes = pool.map(run, jobs, _stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
-        tried_ones = scores(ratios(outcomes[: len(estimators)]))
+        tried_ones = scores(ratios(outcomes[: len(estimators)]), test.weights)
         best = estimators[int(np.argmin(tried_ones))]
         third.append(replace(bilinear[0], estimator=best, weighted=True))
         third += [replace(one, estimator=best) for one in bilinear[1:]]
     jobs = _jobs(third, screened, first, every)
     outcomes += pool.map(run, jobs, _stage(progress, "closed loops of the last"), size=Job.size)
-    return _leaderboard((screened, first), ([*second, *third], outcomes))
+    return _leaderboard(test, (screened, first), ([*second, *third], outcomes))
 
 
 def _stage(progress: StageProgress | None, name: str) -> Progress | None:
@@ -417,13 +419,14 @@ def _jobs(
     return jobs
 
 
-def _leaderboard(screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
+def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
     """Return the rows and the outcome of each: the last round before the others, and the best first in each."""
     both: list[tuple[DesignRow, Outcome]] = []
-    for off, (recipes, outcomes) in ((True, last), (False, screened)):
+    nominal = test.weights[list(test.nominal)]
+    for off, (recipes, outcomes), weights in ((True, last, test.weights), (False, screened, nominal)):
         part: list[tuple[DesignRow, Outcome]] = []
         each = ratios(outcomes)
-        for recipe, outcome, ratio, score in zip(recipes, outcomes, each, scores(each), strict=True):
+        for recipe, outcome, ratio, score in zip(recipes, outcomes, each, scores(each, weights), strict=True):
             known = outcome.violation[np.isfinite(outcome.violation)]
             row = DesignRow(
                 recipe=recipe,

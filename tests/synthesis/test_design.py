@@ -115,7 +115,10 @@ def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
         ]
         each = ratios(outcomes)
         assert (each[lost] == LOST).all()
-        rows = [replace(usual().best, score=float(score), off=True) for score in scores(each)]
+        rows = [
+            replace(usual().best, score=float(score), off=True)
+            for score in scores(each, np.array([1.0] * 6 + [0.5] * 6))
+        ]
         assert place_of(rows) != lost
 
 
@@ -134,8 +137,20 @@ def test_of_equal_rows_the_smallest_model_is_taken_and_of_one_model_the_controll
         return place_of(rows)
 
     assert chosen(1.0, 1.001, 1.004) == 2
-    assert chosen(1.0, 1.001, 1.006) == 1  # the estimator costs more than half a percent
+    assert chosen(1.0, 1.001, 1.02) == 2
+    assert chosen(1.0, 1.001, 1.022) == 1  # the estimator costs more than two percent
     assert chosen(1.0, 1.006, 1.006) == 0
+
+
+def test_a_run_with_inputs_off_counts_half():
+    one, two = scores(np.array([[1.0, 4.0], [4.0, 1.0]]), np.array([1.0, 0.5]))
+    np.testing.assert_allclose([one, two], [4 ** (1 / 3), 4 ** (2 / 3)])
+
+
+def test_by_default_each_loop_of_a_design_has_a_start_of_its_own():
+    of_many, of_few = designed(data(count=24)).expected.starts, usual().expected.starts
+    assert len(np.unique(of_many, axis=0)) == len(of_many) == 6
+    assert len(np.unique(of_few, axis=0)) == 4  # the half of eight episodes that begin inside the limits
 
 
 def test_violations_count_beyond_half_a_percent_and_beyond_what_nobody_avoids():
