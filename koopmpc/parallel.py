@@ -171,8 +171,13 @@ class _Pool:
             A worker has died; the pool is of no use any more.
         """
         sent = _pickled(job.task, str(job))
-        with _one_thread(), _undisturbed():  # `submit` starts the processes
-            return self._executor.submit(_work, sent, self._number, self._code)
+        try:
+            with _one_thread(), _undisturbed():  # `submit` starts the processes
+                return self._executor.submit(_work, sent, self._number, self._code)
+        except OSError as error:  # another worker died meanwhile, and the executor has closed what this one inherits
+            if self._executor._broken:
+                raise BrokenProcessPool("a worker died while another one was started") from error
+            raise
 
     def close(self) -> None:
         """End the processes, those that work too; Python 3.14 calls this `kill_workers`."""

@@ -5,8 +5,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from textwrap import dedent
+from typing import Any, cast
 
 import pytest
 
@@ -204,6 +206,21 @@ def test_its_signal_is_found_also_where_the_executor_was_told_of_its_end_first(m
         return ended
 
     monkeypatch.setattr(os, "waitpid", slowly)
+    with pytest.raises(km.KoopmpcError, match=r"killed while it started \(signal 9\)"):
+        list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
+
+
+def test_a_worker_that_dies_while_another_one_is_started_is_found_as_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = ProcessPoolExecutor._spawn_process  # pyright: ignore[reportAttributeAccessIssue]
+
+    def late(executor: ProcessPoolExecutor) -> None:
+        held, deadline = cast("Any", executor), time.monotonic() + 10
+        while held._processes and not held._broken and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(0.2)  # until its thread has closed the queue
+        started(executor)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_spawn_process", late)
     with pytest.raises(km.KoopmpcError, match=r"killed while it started \(signal 9\)"):
         list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
 
