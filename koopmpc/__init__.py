@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.control.cost import Cost as Cost
     from koopmpc.control.limits import Limits as Limits
     from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
-    from koopmpc.control.linear.linear_mpc import LinearMPC as LinearMPC
+    from koopmpc.control.linear.koopman_mpc import LinearMPC as LinearMPC
     from koopmpc.control.lqr import LQR as LQR
     from koopmpc.control.lqr import dlqr as dlqr
     from koopmpc.control.lqr import lqr as lqr
@@ -115,7 +115,7 @@ else:
         },
         core=(
             "bench.library",
-            "control.linear.linear_mpc",
+            "control.linear.koopman_mpc",
             "control.lqr",
             "control.nonlinear.bilinear_mpc",
             "control.nonlinear.nonlinear_mpc",

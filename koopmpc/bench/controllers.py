@@ -19,8 +19,7 @@ from koopmpc.checks import nearest
 from koopmpc.control.adaptive import Adaptive
 from koopmpc.control.cost import state_tracking
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.control.linear.linear_mpc import LinearMPC
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC, LinearMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Controller

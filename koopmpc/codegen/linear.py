@@ -163,7 +163,7 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
 
 def daqp_defaults() -> dict[str, Any]:
     """Return the settings that DAQP has here where none are given."""
-    from koopmpc.control.solvers.qp import QP
+    from koopmpc.control.solvers.base import QP
 
     one = np.ones(1)
     return dict(DAQP(QP(np.eye(1), 0 * one, np.eye(1), -one, one))._model.settings)

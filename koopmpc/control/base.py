@@ -1,10 +1,12 @@
-"""MPCBase: what predictive controllers share: where a plan starts, move blocks, deadlines, what a failed step does."""
+"""MPCBase: what predictive controllers share: where a plan starts, blocks, deadlines, a failed step, being saved."""
 
 import copy
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,15 +14,49 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
-from koopmpc.control.cost import Tracking
-from koopmpc.control.limits import admitted
+from koopmpc.control.cost import Cost, Tracking
+from koopmpc.control.limits import Limits, admitted
 from koopmpc.control.monitor import Monitor, Watch
 from koopmpc.control.move import Fallback, Move, Status, Token
-from koopmpc.control.saved import Savable
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Viewing
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.base import save_value
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.values import Value, Viewing
+
+Kind = Literal["KoopmanMPC", "BilinearMPC", "NonlinearMPC"]
+
+
+@dataclass(frozen=True, eq=False)
+class SavedController(Value):
+    """The data that a controller is made of. A loaded controller begins as after `reset`.
+
+    Attributes
+    ----------
+    name
+        The class of the controller.
+    model
+        The predictor of the controller.
+    cost, limits, horizon, estimator, latency, moves, time_limit
+        Arguments of the controller; `moves` are the lengths of the blocks of held inputs.
+    options
+        The arguments that only this class has.
+    monitor
+        The monitor, where it has one.
+    """
+
+    name: Kind
+    model: LinearPredictor | BilinearPredictor
+    cost: Cost
+    limits: Limits
+    horizon: int
+    estimator: Value | None
+    latency: int
+    moves: tuple[int, ...]
+    time_limit: float | None
+    options: Mapping[str, Any]
+    monitor: Monitor | None = None
 
 
 class InitialCondition(Viewing):
@@ -184,7 +220,7 @@ def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
     return (1,) * (M - 1) + (N - M + 1,)
 
 
-class MPCBase(Savable):
+class MPCBase:
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
     A subclass calls `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step returns the
@@ -287,6 +323,51 @@ class MPCBase(Savable):
         self._initial.reset(x0, self._given)
         if self._watch is not None:
             self._watch.reset()
+
+    def as_data(self) -> SavedController:
+        """Return what the controller was made of.
+
+        Raises
+        ------
+        DataError
+            Its model is a StepMap, whose equations are code, or its estimator is no class of koopmpc.
+        """
+        kind, model, options = self._made_of()
+        if isinstance(model, StepMap):
+            raise DataError("the controller's model is a StepMap, which is code and cannot be saved; fit a predictor")
+        if not isinstance(self._estimator, Value | None):
+            raise DataError(
+                f"a {type(self._estimator).__name__} is no estimator of koopmpc and cannot be saved as data"
+            )
+        return SavedController(
+            kind,
+            model,
+            self.cost,
+            self.limits,
+            sum(self._blocks),
+            self._estimator,
+            self._latency,
+            self._blocks,
+            self._time_limit,
+            options,
+            None if self._watch is None else self._watch.monitor,
+        )
+
+    def _made_of(self) -> tuple[Kind, LinearPredictor | BilinearPredictor | StepMap, dict[str, Any]]:
+        """Return the class, the model, and the arguments that only this class has."""
+        raise NotImplementedError
+
+    def save(self, path: str | Path) -> None:
+        """Write the controller as data (.npz: arrays and one JSON text); `km.load_controller` reads it.
+
+        Raises
+        ------
+        DataError
+            A part of it is code: a StepMap, or a user's own estimator.
+        LogError
+            The path cannot be written.
+        """
+        save_value(self.as_data(), path)
 
     def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
         """Keep a good plan (by reference, for speed): its first entries are the moves."""

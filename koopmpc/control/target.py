@@ -11,9 +11,8 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking, Sizes
 from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QPSolver
+from koopmpc.control.solvers.base import QP, QPSolver
 from koopmpc.control.solvers.daqp import DAQP
-from koopmpc.control.solvers.qp import QP
 from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria

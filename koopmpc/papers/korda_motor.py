@@ -9,8 +9,7 @@ from jaxtyping import Float
 from koopmpc.bench.library import load_problem
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.control.linear.linear_mpc import LinearMPC
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC, LinearMPC
 from koopmpc.control.move import Status
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes

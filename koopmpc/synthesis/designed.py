@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import RenderableType
 
+from koopmpc.control.base import SavedController
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
-from koopmpc.control.saved import SavedController
 from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.asked import Asked

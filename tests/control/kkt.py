@@ -5,9 +5,9 @@ from typing import ClassVar
 import numpy as np
 
 import koopmpc as km
+from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.osqp import DEFAULTS, OSQP
-from koopmpc.control.solvers.qp import QP
 
 
 class CheckedOSQP(OSQP):

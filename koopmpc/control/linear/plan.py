@@ -11,7 +11,7 @@ from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.horizon import Condensed, Coordinates, Horizon, condense, horizon_of, stages
 from koopmpc.control.limits import Interval, Softness, ahead
 from koopmpc.control.riccati import recursion
-from koopmpc.control.solvers.qp import StepQP
+from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
+from koopmpc.control.base import Kind
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.monitor import Monitor
@@ -17,7 +18,6 @@ from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
-from koopmpc.control.saved import Kind
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import heard

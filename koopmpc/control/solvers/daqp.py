@@ -23,8 +23,7 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QPSolver
-from koopmpc.control.solvers.qp import INFINITY, QP, QPSolution
+from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.

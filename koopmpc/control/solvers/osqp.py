@@ -21,8 +21,7 @@ from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QPSolver
-from koopmpc.control.solvers.qp import QP, QPSolution
+from koopmpc.control.solvers.base import QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
 
 _MASK = getattr(signal, "pthread_sigmask", None)  # Windows has none

@@ -3,9 +3,9 @@
 import numpy as np
 
 from koopmpc.control.solvers import SOLVERS as SOLVERS
+from koopmpc.control.solvers.base import QP as QP
 from koopmpc.control.solvers.base import QPSolver as QPSolver
 from koopmpc.control.solvers.osqp import DEFAULTS as DEFAULTS
-from koopmpc.control.solvers.qp import QP as QP
 
 KINDS = ("box", "hard", "soft", "exact", "dense", "degenerate", "singular", "scaled", "infeasible")
 FEASIBLE = tuple(kind for kind in KINDS if kind != "infeasible")

@@ -6,8 +6,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.limits import Softness
+from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
-from koopmpc.control.solvers.qp import QP
 from tests.bare import shown
 from tests.control.solvers.random_qps import exactness, random_qp
 
@@ -177,7 +177,7 @@ def test_settings_that_daqp_would_swallow():
         box(time_limit=np.nan)
     (line,) = shown(
         """
-from koopmpc.control.solvers.qp import QP
+from koopmpc.control.solvers.base import QP
 from koopmpc.control.limits import Softness
 from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
 one = np.ones(1)

@@ -4,8 +4,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.osqp import OSQP
-from koopmpc.control.solvers.qp import QP
 from tests.bare import shown
 from tests.control.kkt import meets_kkt
 
@@ -89,7 +89,7 @@ def test_a_qp_that_does_not_fit_is_refused():
     lines = shown(
         """
 from koopmpc.control.solvers.osqp import OSQP
-from koopmpc.control.solvers.qp import QP
+from koopmpc.control.solvers.base import QP
 eye, one = np.eye(2), np.ones(2)
 show(lambda: OSQP(QP(eye, one[:1], eye, -one, one)))
 show(lambda: OSQP(QP(np.eye(3), one, eye, -one, one)))

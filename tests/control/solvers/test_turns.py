@@ -5,8 +5,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.limits import Interval, Softness
-from koopmpc.control.solvers.base import Choice, StepSolver
-from koopmpc.control.solvers.qp import QPSolution, StepQP
+from koopmpc.control.solvers.base import Choice, QPSolution, StepQP, StepSolver
 
 OPTIMAL, FAILED, MOST = km.Status.OPTIMAL, km.Status.FAILED, km.Status.MAX_ITERATIONS
 INFEASIBLE = km.Status.INFEASIBLE
