@@ -15,7 +15,7 @@ from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.eigenfunction import Eigenfunction
+from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.plants.routines import Buffered
 
 _FLAT = 1e-24  # b R⁻¹ bᵀ below which no input moves φ

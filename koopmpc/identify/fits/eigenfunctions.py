@@ -13,7 +13,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.fits.null_space import EigenfunctionRows, weights
 from koopmpc.lifting.base import Lifting, lifting_of
-from koopmpc.lifting.eigenfunction import Eigenfunction
+from koopmpc.lifting.composed import Eigenfunction
 
 
 def eigenfunctions(

@@ -10,7 +10,7 @@ from jaxtyping import Float, Inexact, Int
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.eigenfunction import Eigenfunction, jacobians
+from koopmpc.lifting.composed import Eigenfunction, jacobians
 
 _FLAT = 1e-9  # share of the largest gradient, or of its terms, below which a combination of observables is constant
 _EXACT = 1e-6  # relative residual below which no observable more is taken
