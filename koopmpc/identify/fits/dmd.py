@@ -11,9 +11,8 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.edmd import Method, fit
+from koopmpc.identify.fits.edmd import Method, Rank, fit
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.rank import Rank
 from koopmpc.identify.regression import Regression, linear_predictor
 from koopmpc.identify.solve import RegressionRows
 from koopmpc.lifting.state import State
