@@ -1,4 +1,4 @@
-"""OnlineEDMD: recursive EDMD that learns while the plant runs."""
+"""OnlineEDMD: recursive EDMD that learns while the plant runs, and which rows it does not learn from."""
 
 from collections.abc import Sequence
 
@@ -18,6 +18,7 @@ from koopmpc.lifting.base import Lifting, buffered, lifting_of
 from koopmpc.predict.predictors import LinearPredictor
 
 _BLOCK = 32  # rows that the factor takes in at once
+# The gate of outliers:
 BEYOND, LEAST, MEMORY = 30.0, 0.01, 0.01  # of a spread; of a column's size; share that a new row has in both
 FEW = 20  # innovations, or rows, that say nothing of their spread yet
 FAR = 1000.0  # of a column's size: what no signal reaches, where there is no forecast to compare it with

@@ -11,8 +11,8 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.constrained.constrained import linear
-from koopmpc.identify.constrained.prior import Entries
+from koopmpc.identify.fits.constrained import linear
+from koopmpc.identify.fits.prior import Entries
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, doubts, norms, onto, solve
