@@ -78,15 +78,15 @@ class LinearPredictor(Predictor):
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
     ) -> None:
-        bound, nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
+        _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
         modes = exact_modes
         if modes is not None:
-            if not isinstance(bound, Projected) or modes.shape != bound.basis.shape:
+            if not isinstance(self.lifting, Projected) or modes.shape != self.lifting.basis.shape:
                 raise ShapeError(
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
             modes = np.array(modes, dtype=np.complex128, order="C")
-        drift = np.zeros((nz, 0)) if E is None else checks.array(E, "E", (nz, None))
+        drift = np.zeros((self.nz, 0)) if E is None else checks.array(E, "E", (self.nz, None))
         nw = drift.shape[1]
         names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
         if len(names) != nw:
@@ -197,8 +197,8 @@ class BilinearPredictor(Predictor):
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
     ) -> None:
-        nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)[1]
-        freeze(self, N=checks.array(N, "N", (len(inputs), nz, nz)))
+        _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
+        freeze(self, N=checks.array(N, "N", (len(inputs), self.nz, self.nz)))
 
     def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
@@ -250,11 +250,11 @@ def _store(
     report: FitReport | None,
     embedding: Delay | None,
     scale: ArrayLike | None,
-) -> tuple[Lifting, int]:
-    """Check the fields that all predictors share and store them; return the bound lifting and nz."""
+) -> None:
+    """Check the fields that all predictors share and store them."""
     states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
     embedded = None if embedding is None else embedding.bind(states, inputs)
-    bound = lifting_of(lifting).bind(tuple(states) if embedded is None else embedded.names)
+    bound = lifting_of(lifting).bind(states if embedded is None else embedded.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)
     transition = checks.array(A, "A")
     largest = float(np.abs(transition).max(initial=0.0))
@@ -265,20 +265,22 @@ def _store(
             f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
             "pass the lifting used in the fit"
         )
-    fields = {
-        "A": transition,
-        "B": checks.array(B, "B", (nz, nu)),
-        "C": checks.array(C, "C", (nx, nz)),
-        "lifting": bound,
-        "dt": checks.positive(dt, "dt", "s"),
-        "states": tuple(states),
-        "inputs": tuple(inputs),
-        "report": report,
-        "embedding": embedded,
-        "scale": None if scale is None else _triangular(scale, nz),
-    }
-    freeze(predictor, **fields, nx=nx, nu=nu, nz=nz)
-    return bound, nz
+    freeze(
+        predictor,
+        A=transition,
+        B=checks.array(B, "B", (nz, nu)),
+        C=checks.array(C, "C", (nx, nz)),
+        lifting=bound,
+        dt=checks.positive(dt, "dt", "s"),
+        states=states,
+        inputs=inputs,
+        report=report,
+        embedding=embedded,
+        scale=None if scale is None else _triangular(scale, nz),
+        nx=nx,
+        nu=nu,
+        nz=nz,
+    )
 
 
 def _triangular(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:

@@ -226,13 +226,23 @@ class EigenfunctionRows:
 
     def parts(self, value: complex) -> tuple[Inexact[np.ndarray, "n nz"], Inexact[np.ndarray, "n nb"]]:
         """Return M_c and M_β with φ̇ − λφ − βu = M_c c + M_β β on the data; real for a real λ."""
-        nz, nu, R = self.lifting.nz, self.nu, self.R
-        later, now, rest = R[:, :nz], R[:, nz : 2 * nz], R[:, 2 * nz :]
-        mu = value if value.imag else value.real
+        later, mu = self.R[:, : self.lifting.nz], value if value.imag else value.real
         if self.by == "derivatives":
-            return later - mu * now, -rest
-        before, after = weights(mu, self.dt)
-        return (later - np.exp(mu * self.dt) * now) / self.dt, -before * rest[:, : nu * nz] - after * rest[:, nu * nz :]
+            return later - mu * self._now, -self._effect(mu)
+        return (later - np.exp(mu * self.dt) * self._now) / self.dt, -self._effect(mu)
+
+    @property
+    def _now(self) -> Float[np.ndarray, "n nz"]:
+        """The columns of R that hold ψ(x)."""
+        return self.R[:, self.lifting.nz : 2 * self.lifting.nz]
+
+    def _effect(self, value: complex) -> Inexact[np.ndarray, "n nb"]:
+        """Return βu, a column for each coefficient of β; over a step its mean, weighted as λ asks for."""
+        driven, half = self.R[:, 2 * self.lifting.nz :], self.nu * self.lifting.nz
+        if self.by == "derivatives":
+            return driven
+        before, after = weights(value, self.dt)
+        return before * driven[:, :half] + after * driven[:, half:]
 
     def implicit(self, value: complex, count: int) -> list[Eigenpair]:
         """Return the sparsest vectors of the null space for λ: residuals near the smallest one, or near rounding."""
@@ -242,7 +252,7 @@ class EigenfunctionRows:
         size: Float[np.ndarray, " nz"] = np.linalg.norm(self.G, axis=0)
         if value:  # a Constant counts by its value, for x − 3 may be an eigenfunction where x is none
             null = null[:, [not self._vanishes(c) for c in null.T]]
-            size = np.where(size > 0, size, np.linalg.norm(self.R[:, len(size) : 2 * len(size)], axis=0))
+            size = np.where(size > 0, size, np.linalg.norm(self._now, axis=0))
         return [(value, xi) for xi in _sparsest(null * size[:, None], size[:, None])]
 
     def explicit(self, count: int) -> list[Eigenpair]:
@@ -253,7 +263,7 @@ class EigenfunctionRows:
         size = np.where(size > 0, size, 1.0)
         K = np.linalg.lstsq(P / size, self.R[:, :nz], rcond=1e-12)[0] / size[:, None]
         values, vectors = np.linalg.eig(K[:nz])
-        sizes = np.vstack([self.G, self.R[:, nz : 2 * nz]])
+        sizes = np.vstack([self.G, self._now])
         pairs: list[tuple[float, Eigenpair]] = []
         for j, mu in enumerate(values):
             xi: Inexact[np.ndarray, " nz"] = vectors[:, j]
@@ -272,8 +282,7 @@ class EigenfunctionRows:
 
     def _vanishes(self, c: Inexact[np.ndarray, " nz"]) -> bool:
         """Return whether φ is zero on all data, as H − H₀ is on one trajectory: any λ fits it."""
-        now = self.R[:, self.lifting.nz : 2 * self.lifting.nz] @ c
-        return bool(np.linalg.norm(now) <= _ZERO * np.linalg.norm(self.G @ c))
+        return bool(np.linalg.norm(self._now @ c) <= _ZERO * np.linalg.norm(self.G @ c))
 
     def sparse(
         self, value: complex, xi: Inexact[np.ndarray, " nz"], growth: float, *, free: bool
@@ -282,8 +291,7 @@ class EigenfunctionRows:
 
         None where λ is not 0 and φ vanishes on all data.
         """
-        now = self.R[:, self.lifting.nz : 2 * self.lifting.nz]
-        weight = np.abs(xi) * np.hypot(np.linalg.norm(self.G, axis=0), np.linalg.norm(now, axis=0))
+        weight = np.abs(xi) * np.hypot(np.linalg.norm(self.G, axis=0), np.linalg.norm(self._now, axis=0))
         order = np.argsort(-weight, kind="stable")
         order = order[weight[order] > 0]
         xi = xi / np.linalg.norm(self.G @ xi)
@@ -303,26 +311,19 @@ class EigenfunctionRows:
         largest = float(size.max())
         last = int(np.flatnonzero(size > (1 - 1e-6) * largest)[-1])
         factor = abs(solved.c[last]) / solved.c[last] / largest
-        c, beta = solved.c * factor, beta * factor
-        whole = [c.real] if not rate.imag else [c.real, c.imag]
-        drive = [beta.real] if not rate.imag else [beta.real, beta.imag]
-        rates = (rate.real,) if not rate.imag else (rate.real, rate.imag)
-        return Eigenfunction(self.lifting, np.array(whole), rates, np.array(drive), residual=residual / self.speed)
+        p = 2 if rate.imag else 1  # a real φ has no imaginary part
+        c, drive = (np.array([each.real, each.imag])[:p] for each in (solved.c * factor, beta * factor))
+        return Eigenfunction(self.lifting, c, (rate.real, rate.imag)[:p], drive, residual=residual / self.speed)
 
     def _refined(
         self, value: complex, support: Int[np.ndarray, " s"], xi: Inexact[np.ndarray, " nz"], allowed: float, free: bool
     ) -> tuple[complex, _Solved]:
         """Return λ, where it is free the one that fits best, and the nearest to ξ of all c with an allowed residual."""
         solved = self._nearest(value, support, xi, allowed)
-        nz, nu = self.lifting.nz, self.nu
         for _ in range(5 if free else 0):
-            now, later = self.R[:, nz : 2 * nz] @ solved.c, self.R[:, :nz] @ solved.c
-            push, beta = self.R[:, 2 * nz :], solved.beta.ravel()
-            if self.by == "steps":
-                before, after = weights(value, self.dt)
-                later = later - self.dt * (before * push[:, : nu * nz] + after * push[:, nu * nz :]) @ beta
-            else:
-                later = later - push @ beta
+            pushed = self.dt * self._effect(value) if self.by == "steps" else self._effect(value)
+            now, later = self._now @ solved.c, self.R[:, : self.lifting.nz] @ solved.c
+            later = later - pushed @ solved.beta.ravel()
             mu = complex(np.vdot(now, later) / max(float(np.vdot(now, now).real), 1e-300))
             if self.by == "steps" and not abs(mu) > 0:
                 break

@@ -119,7 +119,8 @@ class Moments(Value):
         n, scale = len(regressors), self.samples / self.weight
         one = self._constant(regressors)
         if self.route == "qr":
-            R = _triangle(np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])])
+            some = np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])]
+            R = np.asarray(np.linalg.qr(some, mode="r"), dtype=np.float64)
             return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples, one)
         G = scale * self.sums
         size = np.sqrt(G.diagonal()[regressors])
@@ -166,10 +167,6 @@ class Moments(Value):
 
     def _gram(self) -> Float[np.ndarray, "nd nd"]:
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
-
-
-def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
-    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
 
 
 class BothSides(NamedTuple):

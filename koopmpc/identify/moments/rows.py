@@ -147,10 +147,10 @@ def lifted_chunks(
         last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
         first = np.concatenate([[0], last[:-1] + 1])
         P = space[: int(last[-1]) + 1]
-        lifting.lift_into(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
+        lifting.lift_into(joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
         if nu:
             U = P[:, nz : nz + nu]
-            given = _joined([of[i].U[start:end] for i, start, end in chunk])
+            given = joined([of[i].U[start:end] for i, start, end in chunk])
             U[:] = np.insert(given, last - np.arange(len(last)), 0.0, axis=0)
             for i, start in enumerate(range(nz + nu, n, max(len(products), 1))):
                 np.multiply(U[:, i : i + 1], P[:, products], out=P[:, start : start + len(products)])
@@ -158,7 +158,8 @@ def lifted_chunks(
         yield LiftedChunk(P, first, last, nz, w)
 
 
-def _joined(parts: list[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+def joined(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+    """Return the parts as one array; a single one is not copied."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
