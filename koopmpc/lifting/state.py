@@ -1,4 +1,4 @@
-"""Functions of the state: State (degree 1), Constant (0), Monomials (from 2 on), Expressions, and those of numbers."""
+"""State (degree 1), Constant (degree 0), Monomials (degrees from 2 on), and a user's own: Expressions, or Numeric."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence

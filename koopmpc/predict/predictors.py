@@ -1,4 +1,7 @@
-"""The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z, as fitted here, read, or found by others."""
+"""The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z; x ≈ C z, z₀ = ψ(x₀).
+
+`load_model` reads one from a file, `from_peer` takes one over from another package.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

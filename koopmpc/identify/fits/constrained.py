@@ -166,7 +166,6 @@ def optimum(
         No A and B meet the priors, or the solver gives up.
     """
     cp: Any = import_module("cvxpy")  # without types, and slow to import
-
     n, nz = rows.P.shape[1], len(which)
     size = _ones(norms(rows.P))
     energy = np.sum(rows.T[:, which] ** 2, axis=0) + rows.rest[which]
@@ -216,9 +215,7 @@ def violation(
     if prior.symmetric:
         worst = float(np.abs(A - A.T).max()) / max(float(np.abs(A).max()), 1e-300)
     for each in prior.combinations:
-        value = sum(
-            float(np.sum(w * m)) for w, m in ((each.A, A), (each.B, B)) if w is not None
-        )  # the sum of weighted entries
+        value = sum(float(np.sum(w * m)) for w, m in ((each.A, A), (each.B, B)) if w is not None)
         worst = max(worst, each.low - value, value - each.high)
     if prior.dissipation is not None:
         M = _dissipation(prior.dissipation, A, B, size[:nz], size[nz:], np.block)
@@ -236,8 +233,7 @@ def _coupling(
     constraints: list[Any] = []
     if prior.symmetric:
         W = scale[:nz].T
-        balance = np.sqrt(W / W.T)
-        S = cp.multiply(balance, X[:nz].T)
+        S = cp.multiply(np.sqrt(W / W.T), X[:nz].T)  # A / √(W Wᵀ) entry by entry: symmetric where A is
         constraints.append(cp.upper_tri(S) == cp.upper_tri(S.T))
     for each in prior.combinations:
         constraints += _limits(cp, each, A, B)

@@ -103,8 +103,8 @@ class OnlineEDMD:
         self._n, width = nz + nf, nf + 2 * self._full.nz
         self._memory: Forgetting | Window
         if window is None:
-            self._memory = Forgetting(width, self._n, factor, float(keep))
             self._forgetting = width, self._n, factor, float(keep)
+            self._memory = Forgetting(*self._forgetting)
         elif factor < 1:
             raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
         else:

@@ -185,7 +185,6 @@ def lyapunov_fit(
     Trans. Automat. Contr. 48, 2003.
     """
     cp: Any = import_module("cvxpy")  # without types, and slow to import
-
     n = len(A0)
     values, vectors = np.linalg.eigh(G)
     root = np.sqrt(np.maximum(values, 1e-8 * values[-1]))
