@@ -22,7 +22,7 @@ from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.eigenfunction import Eigenfunction
+from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.plants.routines import Buffered
 from koopmpc.predict.predictors import LinearPredictor
 

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.identify.constrained.constrained import constrained_edmd as constrained_edmd
-    from koopmpc.identify.constrained.prior import Combination as Combination
-    from koopmpc.identify.constrained.prior import Dissipation as Dissipation
-    from koopmpc.identify.constrained.prior import Prior as Prior
-    from koopmpc.identify.constrained.stable import stable_edmd as stable_edmd
+    from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
     from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
     from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd
     from koopmpc.identify.fits.kic import InputPredictor as InputPredictor
     from koopmpc.identify.fits.kic import kic as kic
+    from koopmpc.identify.fits.prior import Combination as Combination
+    from koopmpc.identify.fits.prior import Dissipation as Dissipation
+    from koopmpc.identify.fits.prior import Prior as Prior
     from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
+    from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,4 +1,4 @@
-"""Least squares min ‖T − P K‖ on a few rows that stand for all snapshots."""
+"""Least squares min ‖T − P K‖ on a few rows that stand for all snapshots, and the ridge that data ask for."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,6 @@ from scipy.linalg import qr, solve_triangular
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.identify.ridge import cross_validated
 
 Ridge = float | Literal["gcv"]
 
@@ -20,6 +19,11 @@ _CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix sh
 _ILL_CONDITIONED = 1e10
 _LIGHT = 1e-3  # factor of the norm of columns on which a ridge counts a millionth
 _NAMED = 3  # dependent columns that a message names
+_ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
+_NOTHING = 1e-14  # share of the smallest σ² below which a ridge changes nothing
+_LARGEST = 1e3  # share of σ₁² above which a ridge leaves next to nothing of K
+_POINTS = 300  # points of the first grid, about ten a decade
+_ZOOMS = 5  # refinements of the grid, each ten times finer than the one before
 
 
 def ridge_of(given: object) -> Ridge:
@@ -170,6 +174,62 @@ class _Factors:
         rows = self._rows
         outside = np.sum((rows.T - self._U @ self._shares) ** 2, axis=0) + rows.rest
         return cross_validated(self._s, self._shares, outside, rows.samples - free, self._cut)
+
+
+def cross_validated(
+    s: Float[np.ndarray, " k"],
+    shares: Float[np.ndarray, "k nt"],
+    outside: Float[np.ndarray, " nt"],
+    samples: int,
+    cut: float,
+) -> float:
+    """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
+
+    Each target counts relative to its own size, so that λ does not depend on units. Where P fits all targets to
+    rounding, there is no noise, and λ is 0. The errors are those of one step; `select` chooses a ridge by errors over a
+    horizon, on held-out folds.
+
+    Parameters
+    ----------
+    s
+        Singular values of P on unit-norm columns.
+    shares
+        Uᵀ T.
+    outside
+        Energy of each target that P cannot reach.
+    samples
+        The number M of snapshot pairs.
+    cut
+        Singular values below cut · σ₁ are rounding.
+
+    References
+    ----------
+    Golub, Heath & Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",
+    Technometrics 21, 1979.
+    """
+    live = s > cut * s.max(initial=0.0)
+    energy = np.sum(shares**2, axis=0) + outside
+    lost = outside + np.sum(shares[~live] ** 2, axis=0)
+    exact = samples > live.sum() and not (lost > _ROUNDING * energy).any()
+    if exact or not live.any():
+        return 0.0
+    size = np.where(energy > 0, energy, 1.0)
+    power = np.sum(shares**2 / size, axis=1)
+    rest = float(np.sum(outside / size))
+    squares = s**2
+
+    def score(ridge: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        left = ridge[:, None] / (squares + ridge[:, None])  # I − H along each singular direction
+        free = samples - len(s) + np.sum(left, axis=1)
+        return samples * (left**2 @ power + rest) / free**2
+
+    smallest = float(s[live].min())  # a ridge far below its square changes nothing
+    low, high, points = np.log(_NOTHING * smallest**2), np.log(_LARGEST * float(s[0]) ** 2), _POINTS
+    for _ in range(_ZOOMS):
+        grid = np.linspace(low, high, points)
+        best = int(np.argmin(score(np.exp(grid))))
+        low, high, points = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, points - 1)]), 21
+    return float(np.exp(0.5 * (low + high)))
 
 
 def about_means(

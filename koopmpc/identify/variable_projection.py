@@ -123,12 +123,11 @@ def _inside(lifting: Lifting) -> Iterator[tuple[str, Lifting | tuple[Lifting, ..
 def _tunable(lifting: Lifting) -> Iterator[_Field]:
     """Yield the tunable fields of the lifting, then those of the liftings in it."""
     values = {name: np.asarray(getattr(lifting, name), dtype=float) for name in lifting.tunable}
-    positive: list[Any] = [values[name] for name, kind in lifting.tunable.items() if kind == "positive"]
-    widths = [float(np.exp(np.mean(np.log(np.asarray(value, dtype=float))))) for value in positive]
-    for name, kind in lifting.tunable.items():
-        value: Any = values[name]
-        spread = float(np.std(value - np.mean(value, axis=0))) if np.ndim(value) else 0.0
-        yield _Field(value, widths[0] if widths else spread or 1.0, kind == "positive")
+    positive = [name for name, kind in lifting.tunable.items() if kind == "positive"]
+    widths = [float(np.exp(np.mean(np.log(values[name])))) for name in positive]
+    for name, value in values.items():
+        spread = float(np.std(value - np.mean(value, axis=0))) if value.ndim else 0.0
+        yield _Field(value, widths[0] if widths else spread or 1.0, name in positive)
     for _, inner in _inside(lifting):
         for part in inner if isinstance(inner, tuple) else (inner,):
             yield from _tunable(part)

@@ -5,7 +5,6 @@ A new family is added here.
 """
 
 from koopmpc.lifting import composed as composed
-from koopmpc.lifting import eigenfunction as eigenfunction
 from koopmpc.lifting import fourier as fourier
 from koopmpc.lifting import radial as radial
 from koopmpc.lifting import state as state

@@ -138,10 +138,8 @@ class Lifting(Value, ABC):
 
         other = lifting_of(other)
         parts = [part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))]
-        bound = self._common(other)
-        if bound is None:
-            return Sum(tuple(parts))
-        return Sum(tuple(parts)).bind(bound)
+        total, bound = Sum(tuple(parts)), self._common(other)
+        return total if bound is None else total.bind(bound)
 
     def __mul__(self, other: "Lifting") -> "Lifting":
         """Return all products of this lifting's observables with the other's."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 from zlib import crc32
 
 import casadi as ca
@@ -76,7 +76,6 @@ class Fourier(Lifting):
 
 
 _SEEDS = 2**32
-_UNDRAWN = "RandomFourier has drawn nothing yet; call .bind(states) or pass it to edmd"
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -165,9 +164,8 @@ class RandomFourier(Lifting):
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return √(2/count) cos(ωⱼ·x + bⱼ) for each j."""
-        if self.frequencies is None or self.phases is None:
-            raise DataError(_UNDRAWN)
-        return self._amplitude * ca.cos(ca.SX(self.frequencies) @ x + ca.SX(self.phases))
+        frequencies, phases = self._drawn
+        return self._amplitude * ca.cos(ca.SX(frequencies) @ x + ca.SX(phases))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         frequencies, phases = self._drawn
@@ -188,7 +186,8 @@ class RandomFourier(Lifting):
         return float(np.sqrt(2.0 / self.count))
 
     @property
-    def _drawn(self) -> tuple[Float[np.ndarray, "count nx"], Float[np.ndarray, " count"]]:
+    def _drawn(self) -> tuple[Any, Any]:
+        """The frequencies (count, nx) and phases (count,): numbers, or symbols while they are tuned."""
         if self.frequencies is None or self.phases is None:
-            raise DataError(_UNDRAWN)
+            raise DataError("RandomFourier has drawn nothing yet; call .bind(states) or pass it to edmd")
         return self.frequencies, self.phases

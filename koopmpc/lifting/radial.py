@@ -25,16 +25,14 @@ def checked_centers(centers: ArrayLike) -> Float[np.ndarray, "nc nx"]:
     return rows
 
 
-def center_names(
-    family: str, centers: Float[np.ndarray, "nc nx"], states: tuple[str, ...], suffix: str = ""
-) -> tuple[str, ...]:
-    """Return ``"family(0.5, -1)"`` for each centre: one name is one function, to the last digit."""
+def written(centers: Float[np.ndarray, "nc nx"], states: tuple[str, ...]) -> list[str]:
+    """Return each centre as ``"0.5, -1"``, to the last digit, so that one name is one function."""
     if centers.shape[1] != len(states):
         raise ShapeError(
             f"centers has {centers.shape[1]} columns and there are {len(states)} states "
             f"({', '.join(states)}); pass a centre as one row of {len(states)} numbers"
         )
-    return tuple(f"{family}({', '.join(map(_number, row.tolist()))}{suffix})" for row in centers)
+    return [", ".join(repr(value).removesuffix(".0") for value in row) for row in centers.tolist()]
 
 
 def squared_distances(
@@ -64,10 +62,6 @@ def symbolic_squared_distances(x: ca.SX, centers: "Float[np.ndarray, 'nc nx'] | 
             total += (x[i] - rows[j, i]) ** 2
         totals.append(total)
     return totals
-
-
-def _number(value: float) -> str:
-    return repr(value).removesuffix(".0")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -106,11 +100,8 @@ class Gaussian(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"gaussian(0.5, -1; 0.3)"``, which hold the centre and the width."""
-        if not isinstance(self.width, np.ndarray):
-            return center_names("gaussian", self.centers, states, f"; {self.width!r}")
-        pairs = zip(self.centers, self.width, strict=True)
-        every = [center_names("gaussian", row[None], states, f"; {float(width)!r}") for row, width in pairs]
-        return tuple(name for names in every for name in names)
+        centers, widths = written(self.centers, states), np.broadcast_to(self.width, len(self.centers)).tolist()
+        return tuple(f"gaussian({c}; {width!r})" for c, width in zip(centers, widths, strict=True))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return exp(−‖x − c‖² / (2 width²)) for each centre."""
@@ -151,7 +142,7 @@ class ThinPlate(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"thinplate(0.5, -1)"``, which hold the centre."""
-        return center_names("thinplate", self.centers, states)
+        return tuple(f"thinplate({c})" for c in written(self.centers, states))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return ½ r² ln r²."""
@@ -186,7 +177,7 @@ class PolynomialKernel(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"polynomial(0.5, -1; 3)"``, which hold the centre and the degree."""
-        return center_names("polynomial", self.centers, states, f"; {self.degree}")
+        return tuple(f"polynomial({c}; {self.degree})" for c in written(self.centers, states))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return (1 + xᵀc)^degree for each centre."""

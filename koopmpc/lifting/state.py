@@ -1,4 +1,4 @@
-"""Formulas of the state: State (degree 1), Constant (degree 0), Monomials (degrees from 2 on), a user's Expressions."""
+"""State (degree 1), Constant (degree 0), Monomials (degrees from 2 on), and a user's own: Expressions, or Numeric."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.checks import HUGE
+from koopmpc.errors import DataError, ObservableError
 from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, Traced, frozen, indices, short
 from koopmpc.plants.graph import Graph
 from koopmpc.values import Value, freeze
@@ -202,3 +203,76 @@ class Expressions(Lifting):
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the expressions of `fn` as a column."""
         return ca.SX(ca.vertcat(*self.fn(x)))
+
+
+RowFunction = Callable[[Float[np.ndarray, "M nx"]], Float[np.ndarray, "M nz"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Numeric(Lifting):
+    """ψ(x) = fn(x), a function of numbers: rows (M, nx) to rows (M, nz).
+
+    `LQR` and `KoopmanMPC` need no more. What linearises the lifting, such as `BilinearMPC` or an equilibrium that is
+    not the origin, and every file needs a formula: write ψ as `Expressions`.
+
+    Parameters
+    ----------
+    fn
+        Takes (M, nx) states and returns (M, nz) observables.
+    labels
+        The name of each observable.
+    """
+
+    fn: RowFunction
+    labels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        freeze(self, labels=tuple(self.labels))
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names given."""
+        return self.labels
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Raise: numbers have no formula."""
+        raise ObservableError(
+            "this lifting is a function of numbers, and a formula is needed here; write it with km.Expressions or the "
+            "families of koopmpc, and pass it as lifting="
+        )
+
+    def measured(self) -> ca.Function:
+        """Return ψ of one measured state, as a CasADi function that calls Python."""
+        return _Called(self)
+
+    def as_saved(self) -> Value:
+        """Refuse: a file holds no function."""
+        raise DataError("the lifting is a Python function, which no file holds; write it with km.Expressions")
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        found = np.asarray(self.fn(np.ascontiguousarray(x.T)), dtype=np.float64)
+        if found.shape != Z.shape:
+            raise DataError(f"the lifting returns shape {found.shape} for {Z.shape[0]} states, expected {Z.shape}")
+        Z[:] = found
+
+
+class _Called(ca.Callback):
+    """ψ of one state, NaN where the state is NaN or beyond 1e30."""
+
+    def __init__(self, lifting: Numeric) -> None:
+        super().__init__()
+        self._lifting, self._nx, self._nz = lifting, len(lifting.bound_states), lifting.nz
+        self.construct("psi", {})
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return that of a column of states."""
+        return ca.Sparsity.dense(self._nx, 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Return that of a column of observables."""
+        return ca.Sparsity.dense(self._nz, 1)
+
+    def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
+        """Return [ψ(x)]."""
+        x = np.array(arg[0]).reshape(1, self._nx)
+        z = self._lifting(x)[0] if np.abs(x).sum() < HUGE else np.full(self._nz, np.nan)
+        return [ca.DM(z)]

@@ -29,7 +29,7 @@ from koopmpc.errors import unwarned
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.eigenfunctions import eigenfunctions
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.eigenfunction import Eigenfunction
+from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.lifting.state import Constant, Expressions, Monomials, State
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.plants import closed_loop, trajectories

@@ -1,10 +1,14 @@
-"""The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z; x ≈ C z, z₀ = ψ(x₀)."""
+"""The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z; x ≈ C z, z₀ = ψ(x₀).
+
+`load_model` reads one from a file, `from_peer` takes one over from another package.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,11 +22,12 @@ from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.lifting.composed import Projected
-from koopmpc.lifting.state import Constant, State
+from koopmpc.lifting.state import Constant, Numeric, State
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.values import freeze
 
+_PROBES = 7  # states at which liftings of two packages are compared
 _LARGEST = 1e300  # entry of A: sums of as many as it has are finite
 
 
@@ -76,15 +81,15 @@ class LinearPredictor(Predictor):
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
     ) -> None:
-        bound, nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
+        _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
         modes = exact_modes
         if modes is not None:
-            if not isinstance(bound, Projected) or modes.shape != bound.basis.shape:
+            if not isinstance(self.lifting, Projected) or modes.shape != self.lifting.basis.shape:
                 raise ShapeError(
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
             modes = np.array(modes, dtype=np.complex128, order="C")
-        drift = np.zeros((nz, 0)) if E is None else checks.array(E, "E", (nz, None))
+        drift = np.zeros((self.nz, 0)) if E is None else checks.array(E, "E", (self.nz, None))
         nw = drift.shape[1]
         names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
         if len(names) != nw:
@@ -195,8 +200,8 @@ class BilinearPredictor(Predictor):
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
     ) -> None:
-        nz = _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)[1]
-        freeze(self, N=checks.array(N, "N", (len(inputs), nz, nz)))
+        _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
+        freeze(self, N=checks.array(N, "N", (len(inputs), self.nz, self.nz)))
 
     def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
@@ -248,11 +253,11 @@ def _store(
     report: FitReport | None,
     embedding: Delay | None,
     scale: ArrayLike | None,
-) -> tuple[Lifting, int]:
-    """Check the fields that all predictors share and store them; return the bound lifting and nz."""
+) -> None:
+    """Check the fields that all predictors share and store them."""
     states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
     embedded = None if embedding is None else embedding.bind(states, inputs)
-    bound = lifting_of(lifting).bind(tuple(states) if embedded is None else embedded.names)
+    bound = lifting_of(lifting).bind(states if embedded is None else embedded.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)
     transition = checks.array(A, "A")
     largest = float(np.abs(transition).max(initial=0.0))
@@ -263,20 +268,22 @@ def _store(
             f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
             "pass the lifting used in the fit"
         )
-    fields = {
-        "A": transition,
-        "B": checks.array(B, "B", (nz, nu)),
-        "C": checks.array(C, "C", (nx, nz)),
-        "lifting": bound,
-        "dt": checks.positive(dt, "dt", "s"),
-        "states": tuple(states),
-        "inputs": tuple(inputs),
-        "report": report,
-        "embedding": embedded,
-        "scale": None if scale is None else _triangular(scale, nz),
-    }
-    freeze(predictor, **fields, nx=nx, nu=nu, nz=nz)
-    return bound, nz
+    freeze(
+        predictor,
+        A=transition,
+        B=checks.array(B, "B", (nz, nu)),
+        C=checks.array(C, "C", (nx, nz)),
+        lifting=bound,
+        dt=checks.positive(dt, "dt", "s"),
+        states=states,
+        inputs=inputs,
+        report=report,
+        embedding=embedded,
+        scale=None if scale is None else _triangular(scale, nz),
+        nx=nx,
+        nu=nu,
+        nz=nz,
+    )
 
 
 def _triangular(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
@@ -300,3 +307,103 @@ def _re_lifted(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | n
     moved = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)
     F = ca.Function("F", [x, u], [ca.densify(moved)], ["x", "u"], ["x_next"], {"cse": True})
     return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs)
+
+
+def from_peer(
+    fitted: Any,
+    *,
+    dt: float,
+    states: Sequence[str] | None = None,
+    inputs: Sequence[str] | None = None,
+    lifting: Lifting | None = None,
+) -> LinearPredictor:
+    """Return a model of PyDMD (DMD and its kin, DMDc) or a KoopmanPipeline of pykoop as a LinearPredictor.
+
+    A model that was found by hand needs no help: ``km.LinearPredictor(A, B, C, lifting, dt, states, inputs)``.
+
+    Parameters
+    ----------
+    fitted
+        The fitted object. Of PyDMD A = Φ Λ Φ⁺ and B are taken, on the state; of pykoop A and B of its regressor, on
+        its lifting.
+    dt
+        Sample time [s], of which these packages know nothing.
+    states, inputs
+        Names with units; by default ``x0, x1, …`` and ``u0, u1, …``.
+    lifting
+        The same lifting in the families of koopmpc, where a formula is needed or the model is to be saved. It is
+        compared with the package's own at a few states.
+
+    Raises
+    ------
+    DataError
+        It is of no known package or not fitted; it has delays, or lifts its inputs; its lifting does not hold the
+        states; `lifting` is another function.
+    """
+    if hasattr(fitted, "regressor_") and hasattr(fitted, "lift_state"):
+        return _of_pykoop(fitted, dt, states, inputs, lifting)
+    if hasattr(fitted, "eigs") and hasattr(fitted, "modes"):
+        return _of_pydmd(fitted, dt, states, inputs)
+    raise DataError(
+        f"a {type(fitted).__name__} is no fitted DMD of PyDMD nor a fitted KoopmanPipeline of pykoop; with its "
+        "matrices km.LinearPredictor(A, B, C, lifting, dt, states, inputs) is the model"
+    )
+
+
+def _of_pydmd(fitted: Any, dt: float, states: Sequence[str] | None, inputs: Sequence[str] | None) -> LinearPredictor:
+    """Return x⁺ = Φ Λ Φ⁺ x + B u."""
+    try:
+        modes, eigenvalues = np.asarray(fitted.modes), np.asarray(fitted.eigs)
+    except (ValueError, AttributeError) as error:
+        raise DataError(f"the {type(fitted).__name__} is not fitted; call its fit first") from error
+    A = (modes * eigenvalues) @ np.linalg.pinv(modes)
+    nx = len(A)
+    if np.abs(A.imag).max() > 1e-9 * np.abs(A).max():
+        raise DataError("its operator Φ Λ Φ⁺ is not real; fit it to real snapshots")
+    known = getattr(fitted, "B", None)
+    B = np.zeros((nx, 0)) if known is None else np.asarray(known, dtype=np.float64)
+    return LinearPredictor(A.real, B, np.eye(nx), State(), dt, _names(states, "x", nx), _names(inputs, "u", B.shape[1]))
+
+
+def _of_pykoop(
+    fitted: Any, dt: float, states: Sequence[str] | None, inputs: Sequence[str] | None, lifting: Lifting | None
+) -> LinearPredictor:
+    """Return z⁺ = A z + B u of the regressor, z = ψ(x) of the pipeline's lifting functions."""
+    nx, nu, nz = fitted.n_states_in_, fitted.n_inputs_in_, fitted.n_states_out_
+    if fitted.min_samples_ > 1:
+        raise DataError(
+            "the pipeline has delays; fit km.edmd(data, lifting, embedding=km.Delay(…)), which has them too"
+        )
+    if fitted.n_inputs_out_ != nu:
+        raise DataError(
+            f"the pipeline makes {fitted.n_inputs_out_} inputs of {nu}: it lifts them. Lift the states alone, in a "
+            "pykoop.SplitPipeline with lifting_functions_input=None"
+        )
+    matrix = np.asarray(fitted.regressor_.coef_, dtype=np.float64).T
+    named = _names(states, "x", nx)
+
+    def lift(X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M nz"]:
+        return np.asarray(fitted.lift_state(X, episode_feature=False), dtype=np.float64)
+
+    probes = np.random.default_rng(0).uniform(-1.0, 1.0, (_PROBES, nx))
+    Z = lift(probes)
+    C = np.zeros((nx, nz))
+    for i, column in enumerate(probes.T):
+        equal = np.flatnonzero(np.abs(Z - column[:, None]).max(axis=0) < 1e-9)
+        if not len(equal):
+            raise DataError(f"the pipeline's lifting does not hold {named[i]}; keep the states among its observables")
+        C[i, equal[0]] = 1.0
+    if lifting is None:
+        lifting = Numeric(lift, tuple(f"z{j}" for j in range(nz)))
+    else:
+        own = lifting.bind(named)(probes)
+        if own.shape != Z.shape or not np.allclose(own, Z, rtol=1e-9, atol=1e-9):
+            raise DataError(
+                "lifting has other observables than the pipeline, or another order: "
+                f"{', '.join(lifting.bind(named).names)}"
+            )
+    return LinearPredictor(matrix[:, :nz], matrix[:, nz:], C, lifting, dt, named, _names(inputs, "u", nu))
+
+
+def _names(given: Sequence[str] | None, letter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{letter}{i}" for i in range(count)) if given is None else tuple(given)

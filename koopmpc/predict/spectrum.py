@@ -121,9 +121,7 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
             gap = phi[1:] - phi[:-1] * predictor.eigenvalues - episode.U[first : first + _ROWS] @ forced.T
             error += np.sum(np.abs(gap) ** 2, axis=0)
             size += np.sum(np.abs(phi[:-1]) ** 2, axis=0)
-    if (size == 0).any():
-        raise DataError(f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it")
-    return np.sqrt(error / size)
+    return _relative(error, size)
 
 
 def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes | Source) -> None:
@@ -190,6 +188,11 @@ def evolution_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
             promised = predictor.eigenvalues ** np.arange(len(phi))[:, None] * phi[0]
             error += np.sum(np.abs(phi - promised) ** 2, axis=0)
         size += np.sum(np.abs(phi) ** 2, axis=0)
+    return _relative(error, size)
+
+
+def _relative(error: Float[np.ndarray, " nz"], size: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " nz"]:
+    """Return the root of the error as a share of the size, both sums of squares for each eigenfunction."""
     if (size == 0).any():
         raise DataError(f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it")
     return np.sqrt(error / size)

@@ -1,6 +1,6 @@
 """One candidate, cross-validated: fitted without each fold and rolled out over it, for every ridge at once.
 
-This is how `select` chooses a ridge; the ``ridge="gcv"`` of a single fit is in identify/ridge.py.
+This is how `select` chooses a ridge; the ``ridge="gcv"`` of a single fit is in identify/solve.py.
 """
 
 from collections.abc import Sequence

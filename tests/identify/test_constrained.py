@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.constrained.convex import violation
-from koopmpc.identify.constrained.prior import entries_of
+from koopmpc.identify.fits.constrained import violation
+from koopmpc.identify.fits.prior import entries_of
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 from tests.roundtrip import returned
 

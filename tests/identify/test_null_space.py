@@ -6,8 +6,8 @@ from scipy.integrate import quad
 from scipy.linalg import eigh
 
 import koopmpc as km
-from koopmpc.identify.fits import null_space
-from koopmpc.identify.fits.null_space import EigenfunctionRows, _sparsest, _turned, weights
+from koopmpc.identify.fits import eigenfunctions as null_space
+from koopmpc.identify.fits.eigenfunctions import EigenfunctionRows, _sparsest, _turned, weights
 
 DT = 0.1
 LIBRARY = km.State() + km.Monomials(2)

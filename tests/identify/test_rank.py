@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.rank import kept, known_factor, leading, lost, optimal_factor
+from koopmpc.identify.fits.edmd import kept, known_factor, leading, lost, optimal_factor
 from koopmpc.identify.solve import RegressionRows
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs, random_episodes

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 import koopmpc as km
-from koopmpc.identify.ridge import cross_validated
+from koopmpc.identify.solve import cross_validated
 from tests.bare import shown
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from koopmpc.identify.moments.moments import absorb, empty
-from koopmpc.identify.moments.sliding import Forgetting, Gate, Rival, Window
+from koopmpc.identify.fits.online import Gate, Rival
+from koopmpc.identify.moments.rows import Forgetting, Window, absorb, empty
 
 K = np.array([[1.0, 2.0], [-0.5, 0.3]])  # t = Kᵀ r, of two regressors
 

@@ -8,8 +8,17 @@ from hypothesis import strategies as st
 from scipy.optimize import approx_fprime
 
 import koopmpc as km
-from koopmpc.identify.constrained.convex import lyapunov_fit
-from koopmpc.identify.constrained.stable import Misfit, _ball, _Descent, _metric, clipped, inside, nearest, radius_of
+from koopmpc.identify.fits.stable import (
+    Misfit,
+    _ball,
+    _Descent,
+    _metric,
+    clipped,
+    inside,
+    lyapunov_fit,
+    nearest,
+    radius_of,
+)
 from tests.identify.plants import brute_force, random_episodes
 
 

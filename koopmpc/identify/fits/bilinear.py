@@ -11,9 +11,9 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ObservableError
+from koopmpc.identify.fits.edmd import Rank, leading, lost
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.regression import FitResult, fit_report, regression_of, scale_factor
 from koopmpc.identify.solve import RegressionRows, Ridge, about_means, doubts, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting

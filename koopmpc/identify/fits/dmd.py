@@ -1,6 +1,5 @@
 """Dynamic mode decomposition on the states themselves, without and with inputs."""
 
-from collections.abc import Sequence
 from typing import Unpack
 
 import numpy as np
@@ -11,9 +10,9 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.edmd import Method, fit
+from koopmpc.identify.fits.edmd import Method, Rank, fit
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.rank import Rank
+from koopmpc.identify.moments.rows import joined
 from koopmpc.identify.regression import Regression, linear_predictor
 from koopmpc.identify.solve import RegressionRows
 from koopmpc.lifting.state import State
@@ -135,8 +134,8 @@ def _regression(
     episodes = source.episodes if isinstance(source, Held) and options.get("weights") is None else ()
     pairs = sum(len(e) for e in episodes)
     if 0 < pairs <= 2 * nx + nu:  # few snapshots have no more rows than their moments would
-        X, X_next = _stacked([e.X[:-1] for e in episodes]), _stacked([e.X[1:] for e in episodes])
-        P = np.hstack([X, _stacked([e.U for e in episodes])]) if nu else X
+        X, X_next = joined([e.X[:-1] for e in episodes]), joined([e.X[1:] for e in episodes])
+        P = np.hstack([X, joined([e.U for e in episodes])]) if nu else X
         rows = RegressionRows(P, X_next, np.zeros(nx), pairs)
     else:
         total = second_moments(source, lifting, route="qr", **options)
@@ -156,8 +155,3 @@ def _regression(
         B=B,
         scaled=False,
     )
-
-
-def _stacked(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
-    """Return the parts as one array; a single one is not copied."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -1,7 +1,7 @@
-"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x), by least squares or by fits for noisy states."""
+"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x), or on few directions of it, for noisy states too."""
 
 from dataclasses import replace
-from typing import Literal, Unpack
+from typing import Literal, Unpack, cast
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -13,18 +13,20 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.rank import Rank, leading, lost
 from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
-from koopmpc.identify.solve import RegressionRows, Ridge, Solution, doubts, orthonormal, ridge_of, rule, solve
+from koopmpc.identify.solve import RegressionRows, Ridge, Solution, cutoff, doubts, orthonormal, ridge_of, rule, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import LinearPredictor
 
 Method = Literal["ls", "tls", "fb"]
+Rank = int | float | Literal["hard-threshold"] | None
 Towards = Literal["zero", "affine"]
 _DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is taken
 _REAL = 1e-6  # share of the size of A below which an imaginary part is rounding
+_NODES = 200  # nodes of the quadrature of the Marchenko–Pastur law, which is smooth in the angle
+_HALVINGS = 60
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
@@ -132,6 +134,106 @@ def _reduced(
         ridge=solution.ridge,
         modes=forward @ eigen(A)[1],
     )
+
+
+def leading(rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]) -> tuple[Float[np.ndarray, "nz r"], str]:
+    """Return U_r, the leading left singular vectors of the snapshots ψ(x), columns unscaled, and the rule in words.
+
+    Parameters
+    ----------
+    rows
+        P begins with ψ(x).
+    nz
+        Number of observables.
+    rank
+        A whole number; the least number of directions that hold this share of Σσ², between 0 and 1; or
+        "hard-threshold", all σ above ω(β) times their median.
+    sentences
+        The list that gets a sentence where the snapshots have a lower rank than asked for; the lower one is then taken.
+    """
+    Z = rows.P[:, :nz]
+    if len(Z) < nz:  # LAPACK is faster on the tall side
+        U, s, _ = np.linalg.svd(Z.T, full_matrices=False)
+    else:
+        _, s, Vt = np.linalg.svd(Z, full_matrices=False)
+        U = Vt.T
+    held = int(np.sum(s > cutoff(rows) * s[0]))
+    r, words = kept(rank, s, rows.samples, nz)
+    if held < r:
+        sentences.append(
+            f"rank-deficient: rank {r} was asked for, the snapshots have rank {held}, which is taken; "
+            f"pass rank={held}, or collect richer data"
+        )
+    r = max(min(held, r), 1)
+    return np.ascontiguousarray(U[:, :r]), f"truncated SVD of unscaled columns at rank {r}{words}"
+
+
+def kept(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple[int, str]:
+    """Return the number of singular values of (samples, nz) snapshots that a rank keeps, and the rule in words."""
+    if isinstance(rank, str):
+        if rank != "hard-threshold":
+            raise DataError(f'rank is {rank!r}; pass a whole number, a share of energy in (0, 1), or "hard-threshold"')
+        short, long = sorted((samples, nz))
+        every = np.zeros(short)
+        every[: len(s)] = s[:short]
+        threshold = optimal_factor(short / long) * float(np.median(every))
+        r = int(np.sum(s > threshold))
+        if r == 0:
+            raise DataError(
+                f"no singular value of the snapshots is above the hard threshold {threshold:.3g}: they look like "
+                "white noise alone; pass a rank, or collect richer data"
+            )
+        return r, f", the singular values above the hard threshold {threshold:.3g}"
+    if isinstance(rank, float | np.floating):
+        share = float(rank)
+        if not 0 < share < 1:
+            raise DataError(f"rank is {share:g}; pass a whole number, or a share of energy between 0 and 1")
+        energy = np.cumsum(s**2)
+        return int(np.sum(energy < share * energy[-1])) + 1, f", which holds {share:g} of the energy"
+    whole = checks.count(cast(int, rank), "rank")
+    if whole > nz:
+        raise DataError(f"rank is {whole}, but the lifting has {nz} observables; pass {nz} or less")
+    return whole, ""
+
+
+def lost(
+    Z: Float[np.ndarray, "m nz"], basis: Float[np.ndarray, "nz r"], C: Float[np.ndarray, "nx nz"] | None, samples: int
+) -> Float[np.ndarray, " nx"]:
+    """Return the root-mean-square of C (I − U_r U_rᵀ) ψ(x), the part of each state that the truncation loses."""
+    gap = (Z @ basis) @ basis.T
+    np.subtract(Z, gap, out=gap)
+    gap = gap if C is None else gap @ C.T
+    return np.sqrt(np.einsum("ij,ij->j", gap, gap) / samples)
+
+
+def known_factor(beta: float) -> float:
+    """Return λ(β), the optimal threshold in units of √(long side) · σ for noise of known σ; λ(1) = 4/√3."""
+    return float(np.sqrt(2 * (beta + 1) + 8 * beta / (beta + 1 + np.sqrt(beta**2 + 14 * beta + 1))))
+
+
+def optimal_factor(beta: float) -> float:
+    """Return ω(β) = λ(β) / √μ(β), the optimal threshold in units of the median singular value, 0 < β ≤ 1.
+
+    μ(β) is the median of the Marchenko–Pastur law. With t = 1 + β + 2√β cos φ its density is
+    2 sin²φ / (π t) on 0 ≤ φ ≤ π.
+
+    References
+    ----------
+    Gavish & Donoho, "The optimal hard threshold for singular values is 4/√3", IEEE Trans. Inf. Theory 60, 2014.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+
+    def above(phi: float) -> float:  # the share of the law's mass with t above t(φ)
+        angles = 0.5 * phi * (nodes + 1)
+        t = 1 + beta + 2 * np.sqrt(beta) * np.cos(angles)
+        return float(0.5 * phi * weights @ (2 * np.sin(angles) ** 2 / (np.pi * t)))
+
+    low, high = 0.0, np.pi
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if above(middle) < 0.5 else (low, middle)
+    median = 1 + beta + 2 * np.sqrt(beta) * np.cos(low)
+    return float(known_factor(beta) / np.sqrt(median))
 
 
 def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:

@@ -11,8 +11,8 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
-from koopmpc.identify.constrained.constrained import linear
-from koopmpc.identify.constrained.prior import Entries
+from koopmpc.identify.fits.constrained import linear
+from koopmpc.identify.fits.prior import Entries
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import growth, linear_predictor, read, unreduced
 from koopmpc.identify.solve import RegressionRows, doubts, norms, onto, solve
@@ -170,8 +170,7 @@ def sparse_edmd(
         growth(RegressionRows(rows.P, few.T, few.rest, rows.samples), whole, plain),
     ]
     assert regression.C is not None, "an extended regression has its C"
-    place = {name: i for i, name in enumerate(picked.names)}
-    where = np.array([place[state] for state in regression.states])
+    where = np.array([picked.names.index(state) for state in regression.states])
     part = replace(regression, rows=few, lifting=picked, C=regression.C[:, stay], x_next=where)
     rule = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
     return linear_predictor(part, unreduced(part, K, rule=rule, doubts=sentences, changes=changes))

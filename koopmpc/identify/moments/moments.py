@@ -1,4 +1,4 @@
-"""Second moments of the rows [ψ(x) u u⊗ψ(x) ψ(x⁺)], all that the regressions need, and what sums them up."""
+"""Second moments of the rows [ψ(x) u u⊗ψ(x) ψ(x⁺)], all that the regressions need."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -7,113 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg.lapack import dtpqrt
 
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError, FitWarning
-from koopmpc.identify.moments.rows import LiftedChunk, RowColumns, row_columns
+from koopmpc.identify.moments.rows import RowColumns, absorb, row_columns
 from koopmpc.identify.solve import RegressionRows, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Value
-
-_PANEL = 4, 16  # columns that dtpqrt eliminates at once: the fastest for few rows and for many
-_MANY = 256
-
-Triangle = Float[np.ndarray, "nd nd"]
-Table = Float[np.ndarray, "m nd"]
-
-
-def absorb(R: Triangle, rows: Table) -> None:
-    """Turn R into the triangular factor of [R; rows], in place; R is in Fortran's order."""
-    if len(rows):
-        panel = min(_PANEL[len(rows) >= _MANY], len(R))
-        info = dtpqrt(0, panel, R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
-        assert info == 0, f"dtpqrt refused argument {-info}"
-
-
-def empty(nd: int) -> Triangle:
-    """Return the factor of no rows."""
-    return np.zeros((nd, nd), order="F")
-
-
-class Gram:
-    """Sums of products over chunks, each state multiplied once.
-
-    Inside a piece of consecutive states Σ ψ⁺ψ⁺ᵀ is Σ ψψᵀ but for the first and the last state. So the rows between
-    are multiplied once, and what the ends have of their own is added; nothing is subtracted, so no digits are lost.
-
-    Parameters
-    ----------
-    n
-        Columns of p = [ψ(x) u u⊗ψ(x)].
-    nz
-        Columns of ψ.
-    """
-
-    def __init__(self, n: int, nz: int) -> None:
-        self._n = n
-        self._now, self._cross, self._next = np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nz, nz))
-        self._both, self._beside = np.empty((n, n)), np.empty((n, nz))
-
-    def add(self, chunk: LiftedChunk) -> None:
-        """Add Σ w dᵀd of one chunk; its rows are used up."""
-        if chunk.weights is not None:
-            self._add_weighted(chunk.pairs())
-            return
-        P, first, last, nz, _ = chunk
-        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs that hold the first or the last state of a piece
-        now, after = P[at_ends], P[at_ends + 1, :nz]
-        starts, stops = P[first], P[last, :nz]
-        P[first] = P[last] = 0.0
-        np.matmul(P.T, P, out=self._both)
-        np.matmul(P[:-1].T, P[1:, :nz], out=self._beside)
-        self._now += self._both
-        self._now += starts.T @ starts
-        self._next += self._both[:nz, :nz]
-        self._next += stops.T @ stops
-        self._cross += self._beside
-        self._cross += now.T @ after
-
-    def _add_weighted(self, D: Float[np.ndarray, "M nd"]) -> None:
-        n, products = self._n, D.T @ D
-        self._now += products[:n, :n]
-        self._cross += products[:n, n:]
-        self._next += products[n:, n:]
-
-    @property
-    def size(self) -> Float[np.ndarray, " nd"]:
-        """A number for each column that is finite only if the column is: Σ w d²."""
-        return np.concatenate([self._now.diagonal(), self._next.diagonal()])
-
-    @property
-    def sums(self) -> Float[np.ndarray, "nd nd"]:
-        """Σ dᵀd."""
-        return np.block([[self._now, self._cross], [self._cross.T, self._next]])
-
-
-class Factor:
-    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd: twice the digits of the sums.
-
-    Parameters
-    ----------
-    n, nz
-        As for `Gram`.
-    """
-
-    def __init__(self, n: int, nz: int) -> None:
-        self._R = empty(n + nz)
-        self.size = np.zeros(n + nz)
-
-    def add(self, chunk: LiftedChunk) -> None:
-        """Take in the rows of one chunk."""
-        D = chunk.pairs()
-        self.size = np.abs(D).max(axis=0)
-        absorb(self._R, D)
-
-    @property
-    def sums(self) -> Float[np.ndarray, "nd nd"]:
-        """R."""
-        return np.ascontiguousarray(self._R)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +119,8 @@ class Moments(Value):
         n, scale = len(regressors), self.samples / self.weight
         one = self._constant(regressors)
         if self.route == "qr":
-            R = _triangle(np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])])
+            some = np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])]
+            R = np.asarray(np.linalg.qr(some, mode="r"), dtype=np.float64)
             return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples, one)
         G = scale * self.sums
         size = np.sqrt(G.diagonal()[regressors])
@@ -266,10 +167,6 @@ class Moments(Value):
 
     def _gram(self) -> Float[np.ndarray, "nd nd"]:
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
-
-
-def _triangle(columns: Float[np.ndarray, "nd n"]) -> Float[np.ndarray, "k n"]:
-    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
 
 
 class BothSides(NamedTuple):

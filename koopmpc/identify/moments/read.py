@@ -15,8 +15,8 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Held, Part, Source, source_of
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.moments.moments import Factor, Gram, Moments
-from koopmpc.identify.moments.rows import ROWS, chunks, lifted_chunks, row_columns
+from koopmpc.identify.moments.moments import Moments
+from koopmpc.identify.moments.rows import ROWS, Factor, Gram, chunks, lifted_chunks, row_columns
 from koopmpc.lifting.base import Lifting, lifting_of
 from koopmpc.parallel import Progress, map_tasks
 from koopmpc.values import Arrays, from_data, to_data

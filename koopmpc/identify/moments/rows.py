@@ -1,17 +1,24 @@
-"""Rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]: their columns, and the chunks of fixed size in which states are lifted."""
+"""Rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]: their columns, the chunks in which states are lifted, and what sums them up."""
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg.lapack import dtpqrt
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import CONSTANT, Lifting
 from koopmpc.lifting.state import State
 
 ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
+_PANEL = 4, 16  # columns that dtpqrt eliminates at once: the fastest for few rows and for many
+_MANY = 256
+
+Triangle = Float[np.ndarray, "nd nd"]
+Table = Float[np.ndarray, "m nd"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +147,10 @@ def lifted_chunks(
         last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
         first = np.concatenate([[0], last[:-1] + 1])
         P = space[: int(last[-1]) + 1]
-        lifting.lift_into(_joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
+        lifting.lift_into(joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
         if nu:
             U = P[:, nz : nz + nu]
-            given = _joined([of[i].U[start:end] for i, start, end in chunk])
+            given = joined([of[i].U[start:end] for i, start, end in chunk])
             U[:] = np.insert(given, last - np.arange(len(last)), 0.0, axis=0)
             for i, start in enumerate(range(nz + nu, n, max(len(products), 1))):
                 np.multiply(U[:, i : i + 1], P[:, products], out=P[:, start : start + len(products)])
@@ -151,7 +158,8 @@ def lifted_chunks(
         yield LiftedChunk(P, first, last, nz, w)
 
 
-def _joined(parts: list[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+def joined(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+    """Return the parts as one array; a single one is not copied."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
@@ -160,3 +168,214 @@ def _without(P: Float[np.ndarray, "m n"], rows: Int[np.ndarray, " k"]) -> Float[
     if len(rows) > 1:
         return np.delete(P, rows, axis=0)
     return P[1:] if rows[0] == 0 else P[:-1]
+
+
+def absorb(R: Triangle, rows: Table) -> None:
+    """Turn R into the triangular factor of [R; rows], in place; R is in Fortran's order."""
+    if len(rows):
+        panel = min(_PANEL[len(rows) >= _MANY], len(R))
+        info = dtpqrt(0, panel, R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
+        assert info == 0, f"dtpqrt refused argument {-info}"
+
+
+def empty(nd: int) -> Triangle:
+    """Return the factor of no rows."""
+    return np.zeros((nd, nd), order="F")
+
+
+class Gram:
+    """Sums of products over chunks, each state multiplied once.
+
+    Inside a piece of consecutive states Σ ψ⁺ψ⁺ᵀ is Σ ψψᵀ but for the first and the last state. So the rows between
+    are multiplied once, and what the ends have of their own is added; nothing is subtracted, so no digits are lost.
+
+    Parameters
+    ----------
+    n
+        Columns of p = [ψ(x) u u⊗ψ(x)].
+    nz
+        Columns of ψ.
+    """
+
+    def __init__(self, n: int, nz: int) -> None:
+        self._n = n
+        self._now, self._cross, self._next = np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nz, nz))
+        self._both, self._beside = np.empty((n, n)), np.empty((n, nz))
+
+    def add(self, chunk: LiftedChunk) -> None:
+        """Add Σ w dᵀd of one chunk; its rows are used up."""
+        if chunk.weights is not None:
+            self._add_weighted(chunk.pairs())
+            return
+        P, first, last, nz, _ = chunk
+        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs that hold the first or the last state of a piece
+        now, after = P[at_ends], P[at_ends + 1, :nz]
+        starts, stops = P[first], P[last, :nz]
+        P[first] = P[last] = 0.0
+        np.matmul(P.T, P, out=self._both)
+        np.matmul(P[:-1].T, P[1:, :nz], out=self._beside)
+        self._now += self._both
+        self._now += starts.T @ starts
+        self._next += self._both[:nz, :nz]
+        self._next += stops.T @ stops
+        self._cross += self._beside
+        self._cross += now.T @ after
+
+    def _add_weighted(self, D: Float[np.ndarray, "M nd"]) -> None:
+        n, products = self._n, D.T @ D
+        self._now += products[:n, :n]
+        self._cross += products[:n, n:]
+        self._next += products[n:, n:]
+
+    @property
+    def size(self) -> Float[np.ndarray, " nd"]:
+        """A number for each column that is finite only if the column is: Σ w d²."""
+        return np.concatenate([self._now.diagonal(), self._next.diagonal()])
+
+    @property
+    def sums(self) -> Float[np.ndarray, "nd nd"]:
+        """Σ dᵀd."""
+        return np.block([[self._now, self._cross], [self._cross.T, self._next]])
+
+
+class Factor:
+    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd: twice the digits of the sums.
+
+    Parameters
+    ----------
+    n, nz
+        As for `Gram`.
+    """
+
+    def __init__(self, n: int, nz: int) -> None:
+        self._R = empty(n + nz)
+        self.size = np.zeros(n + nz)
+
+    def add(self, chunk: LiftedChunk) -> None:
+        """Take in the rows of one chunk."""
+        D = chunk.pairs()
+        self.size = np.abs(D).max(axis=0)
+        absorb(self._R, D)
+
+    @property
+    def sums(self) -> Float[np.ndarray, "nd nd"]:
+        """R."""
+        return np.ascontiguousarray(self._R)
+
+
+class Forgetting:
+    """The factor of all rows, each weighted by forgetting^age.
+
+    A row of R is one equation r·k = t of the triangular system R K = T. Forgetting multiplies it by √λ. A direction
+    about which new rows say nothing would fade away, until noise alone decided it (wind-up). So an equation whose
+    information r_jj² falls below `keep` times its maximum so far is forgotten no further: it is scaled back to that
+    floor, left side and right side together, which leaves K as it is.
+
+    Parameters
+    ----------
+    nd, n
+        Columns of a row, and how many of them are regressors.
+    forgetting
+        λ in (0, 1].
+    keep
+        The floor, as a share of information.
+    """
+
+    def __init__(self, nd: int, n: int, forgetting: float, keep: float) -> None:
+        self._R, self._n = empty(nd), n
+        self._forgetting, self._keep = forgetting, keep
+        self._most = np.zeros(n)
+        self._weight = 0.0
+
+    def push(self, rows: Table) -> None:
+        """Take in rows, the newest last."""
+        R, self._weight = self._joined(self._R, rows)
+        if self._forgetting < 1.0:
+            held = np.abs(R.diagonal()[: self._n])
+            np.maximum(self._most, held, out=self._most)
+            floor = np.sqrt(self._keep) * self._most
+            low = np.flatnonzero((held < floor) & (held > 0))
+            R[low] *= (floor[low] / held[low])[:, None]
+
+    @property
+    def R(self) -> Triangle:
+        """The factor of the rows that were pushed; it changes with the next ones."""
+        return self._R
+
+    def factor(self, pending: Table) -> tuple[Triangle, float]:
+        """Return R and the sum of weights of all rows, with those that wait."""
+        return self._joined(self._R.copy(order="F"), pending)
+
+    def _joined(self, R: Triangle, rows: Table) -> tuple[Triangle, float]:
+        if self._forgetting == 1.0:
+            absorb(R, rows)
+            return R, self._weight + len(rows)
+        R *= self._forgetting ** (0.5 * len(rows))
+        weights = self._forgetting ** np.arange(len(rows) - 1.0, -1.0, -1.0)
+        absorb(R, rows * np.sqrt(weights)[:, None])
+        return R, self._weight * self._forgetting ** len(rows) + float(weights.sum())
+
+
+class Window:
+    """The factor of the last `length` rows, kept like a queue made of two stacks: nothing is ever subtracted.
+
+    New blocks are absorbed at the back. For each old block the front holds one factor, that of the block and of all
+    later ones of the front, so that the oldest block leaves when its factor is dropped. When the front is used up, the
+    back becomes the front. Each row is absorbed twice, errors do not add up over time, and about 2 · length rows are
+    held in memory. Turning the back into the front takes one step that costs as much as `length` updates.
+
+    Parameters
+    ----------
+    nd
+        Columns of a row.
+    length
+        Rows in the window.
+    block
+        Rows that come at once.
+    """
+
+    def __init__(self, nd: int, length: int, block: int) -> None:
+        self._nd, self._length, self._block = nd, length, block
+        self._front: deque[tuple[Triangle, Table]] = deque()
+        self._back: list[Table] = []
+        self._R = empty(nd)
+
+    def push(self, rows: Table) -> None:
+        """Take in a block of rows, the newest last."""
+        absorb(self._R, rows)
+        self._back.append(rows.copy())
+        self._drop(0)
+
+    def factor(self, pending: Table) -> tuple[Triangle, float]:
+        """Return R and the number of rows in the window, the last of them those that wait."""
+        pending = pending[-self._length :]
+        old = self._drop(len(pending))
+        if old:
+            self._turn()
+        R = self._R.copy(order="F")
+        if old:
+            absorb(R, self._front[0][1][old:])
+        if len(self._front) > bool(old):
+            absorb(R, self._front[bool(old)][0])
+        absorb(R, pending)
+        return R, float(self._held - old + len(pending))
+
+    @property
+    def _held(self) -> int:
+        return (len(self._front) + len(self._back)) * self._block
+
+    def _drop(self, waiting: int) -> int:
+        """Let blocks go that lie before the window; return how many rows of the oldest one do."""
+        while self._held + waiting - self._length >= self._block:
+            self._turn()
+            self._front.popleft()
+        return max(self._held + waiting - self._length, 0)
+
+    def _turn(self) -> None:
+        """Make the back the front where that is empty."""
+        if not self._front:
+            R = empty(self._nd)
+            for rows in reversed(self._back):
+                absorb(R, rows)
+                self._front.appendleft((R.copy(order="F"), rows))
+            self._back, self._R = [], empty(self._nd)

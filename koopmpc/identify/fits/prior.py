@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,6 +12,8 @@ from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import short
 from koopmpc.values import Value, freeze
+
+Given = TypeVar("Given", bound="np.ndarray | None")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -232,25 +235,18 @@ def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) 
             f"bounds {low[i, j]:g} … {high[i, j]:g}; drop one of them"
         )
     for combination in prior.combinations:
-        for weights, shape, what in (
-            (combination.A, (nz, nz), "Combination.A"),
-            (combination.B, (nz, nu), "Combination.B"),
-        ):
-            if weights is not None:
-                _sized(weights, shape, what)
+        _sized(combination.A, (nz, nz), "Combination.A")
+        _sized(combination.B, (nz, nu), "Combination.B")
     if prior.dissipation is not None:
         _sized(prior.dissipation.P, (nz, nz), "Dissipation.P")
-        for matrix, shape, what in (
-            (prior.dissipation.C, (nu, nz), "Dissipation.C"),
-            (prior.dissipation.D, (nu, nu), "Dissipation.D"),
-        ):
-            if matrix is not None:
-                _sized(matrix, shape, what)
+        _sized(prior.dissipation.C, (nu, nz), "Dissipation.C")
+        _sized(prior.dissipation.D, (nu, nu), "Dissipation.D")
     return Entries(known, low, high)
 
 
-def _sized(value: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
-    if value.shape != shape:
+def _sized(value: Given, shape: tuple[int, ...], name: str) -> Given:
+    """Return the array, or None where the prior does not give it; raise where it has another shape."""
+    if value is not None and value.shape != shape:
         raise ShapeError(f"{name} has shape {value.shape}, expected {shape}: observables by observables or inputs")
     return value
 

@@ -1,7 +1,9 @@
 """EDMD whose A has no eigenvalue outside a circle about zero."""
 
+import warnings
 from dataclasses import dataclass, replace
-from typing import Unpack
+from importlib import import_module
+from typing import Any, Unpack
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +13,6 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.constrained.convex import lyapunov_fit
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import Regression, growth, linear_predictor, read, relative_misfit, unreduced
 from koopmpc.identify.solve import RegressionRows, Ridge, doubts, norms, onto, ridge_of, rule, solve
@@ -19,6 +20,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
 _SMALL = 20  # observables up to which the matrix inequality is solved too
+_LEAST = 1e-3  # least eigenvalue of P in that inequality, as a share of the mean one
 _HELP = 1e-10  # ridge that helps the descent where columns are nearly dependent
 _MUCH = 0.5  # relative misfit from which a stable model describes the data hardly at all
 _ROUNDING = 1e-9  # an eigenvalue this close to the circle is on it
@@ -165,6 +167,42 @@ def _nearest(misfit: Misfit, rho: float) -> Float[np.ndarray, "m m"]:
         start = lyapunov_fit(misfit.A0, misfit.G, rho)
         starts += [] if start is None else [inside(start, rho)]
     return nearest(misfit, rho, starts)
+
+
+def lyapunov_fit(
+    A0: Float[np.ndarray, "n n"], G: Float[np.ndarray, "n n"], radius: float
+) -> Float[np.ndarray, "n n"] | None:
+    """Return A = H Y P⁻¹ H⁻¹, H = G^½, of min ‖H (Y − H⁻¹A₀H P)‖_F with [[ρ² P, Y], [Yᵀ, P]] ⪰ 0, tr P = n.
+
+    The inequality is Y P⁻¹ Yᵀ ⪯ ρ² P: H P H is a Lyapunov matrix of A, so |λ(A)| ≤ ρ. Objective and constraints are
+    convex in (Y, P), so the optimum is global. The squared norm is the misfit tr (A − A₀) G (A − A₀)ᵀ where P = I;
+    elsewhere it weighs the observables' whitened directions by P² instead of I. P ⪰ 10⁻³ I bounds that ratio.
+    Returns None where the solver stops without an answer.
+
+    References
+    ----------
+    Lacy & Bernstein, "Subspace identification with guaranteed stability using constrained optimization", IEEE
+    Trans. Automat. Contr. 48, 2003.
+    """
+    cp: Any = import_module("cvxpy")  # without types, and slow to import
+    n = len(A0)
+    values, vectors = np.linalg.eigh(G)
+    root = np.sqrt(np.maximum(values, 1e-8 * values[-1]))
+    H, inverse = (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
+    Y, P = cp.Variable((n, n)), cp.Variable((n, n), symmetric=True)
+    M = cp.bmat([[radius**2 * P, Y], [Y.T, P]])
+    constraints = [0.5 * (M + M.T) >> 0, P - _LEAST * np.eye(n) >> 0, cp.trace(P) == n]
+    misfit = cp.norm((H / root[-1]) @ (Y - inverse @ A0 @ H @ P), "fro")
+    problem = cp.Problem(cp.Minimize(misfit), constraints)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an inaccurate solution is a start like any other
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except cp.SolverError:
+            return None
+    if Y.value is None or P.value is None:
+        return None
+    return H @ np.linalg.solve(np.asarray(P.value), np.asarray(Y.value).T).T @ inverse
 
 
 def _refitted(
