@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import short
-from koopmpc.validate.identifiability import persistency
 from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, episodes_of_places, listed, runs
+from koopmpc.validate.sufficiency import persistency
 from koopmpc.validate.text import percent
 
 _GRID = 0.95  # share of a sensor's different values that stand on a grid
