@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -85,12 +85,10 @@ def audited(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[st
     report = audit(episodes)
     rest = episodes
     if cut and any(fault.places for fault in report.faults):
-        try:
-            rest = report.without_faults(episodes)
-        except DataError:  # every row is at fault
-            rest = episodes
-        if sum(map(len, rest)) < _LEAST * sum(map(len, episodes)):
-            rest = episodes
+        with suppress(DataError):  # every row is at fault
+            left = report.without_faults(episodes)
+            if sum(map(len, left)) >= _LEAST * sum(map(len, episodes)):
+                rest = left
     notes: list[str] = []
     for fault in report.faults:
         if fault.name in _REPAIRED:

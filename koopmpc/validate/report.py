@@ -314,7 +314,7 @@ def _dictionary(report: TrustReport) -> Iterator[tuple[str, str]]:
     names, errors = report.invariance.names, report.invariance.errors
     bad = np.flatnonzero(errors > _INVARIANT)
     if bad.size:
-        worst = bad[np.argsort(-errors[bad], kind="stable")].tolist()
+        worst: list[int] = bad[np.argsort(-errors[bad], kind="stable")].tolist()
         named = ", ".join(f"{observable(names[i])} {percent(float(errors[i]))}" for i in worst[:_NAMED])
         yield (
             f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "

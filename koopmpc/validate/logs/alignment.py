@@ -7,6 +7,7 @@ raises it, and moving what one sensor knows to another does not.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
@@ -73,8 +74,8 @@ def rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> Row
     states, inputs, moved = np.arange(nx), np.arange(nu), np.zeros(nx + nu, dtype=np.intp)
     for shift in shifts:
         moved[shift.column] += shift.steps
-    parts: list[tuple[np.ndarray, ...]] = []
-    count = 0
+    none = np.zeros((0, nx))
+    parts, count = [(none, np.zeros((0, nu)), none, none)], 0
     for episode in log.data:
         T = len(episode)
         if 2 * margin + 3 > T:
@@ -85,9 +86,6 @@ def rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> Row
         count += len(at)
         if count > _ROWS:
             break
-    if not parts:
-        none = np.zeros((0, nx))
-        return Rows(none, np.zeros((0, nu)), none, none)
     return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -205,20 +203,19 @@ def _by_one_row(log: Log) -> Shift | None:
     them: late or not, its residual is the same. Without the row before, it must follow from the others. Nothing is said
     where the inputs tell nothing: a motion that repeats itself follows from any of its rows.
     """
+    if log.data.nx < 2:
+        return None
     plain = rows(log)
     E = plain.one_row_residuals(log)
     if won(log, fitted(log.regressors(plain.X), (plain.after - plain.X) / log.size), E) < _GAIN:
         return None
     best, most = None, _OWN_ONE_ROW
-    for shift in (
-        Shift(i, n) for i in range(log.data.nx if log.data.nx > 1 else 0) for n in range(1, _ONE_ROW_LATEST + 1)
-    ):
-        other = rows(log, (shift,)).one_row_residuals(log)
-        i = shift.column
+    for i, steps in product(range(log.data.nx), range(1, _ONE_ROW_LATEST + 1)):
+        other = rows(log, (Shift(i, steps),)).one_row_residuals(log)
         pairs = zip(np.array_split(E[:, i], _BLOCKS), np.array_split(other[:, i], _BLOCKS), strict=True)
         gains = [0.5 * float(np.log((np.mean(a**2) + 1e-20) / (np.mean(b**2) + 1e-20))) for a, b in pairs]
         if np.median(gains) > most and min(gains) > _EVEN * np.median(gains):
-            best, most = shift, float(np.median(gains))
+            best, most = Shift(i, steps), float(np.median(gains))
     return best
 
 
@@ -245,28 +242,18 @@ def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Floa
 
 def _said(log: Log, shift: tuple[Shift, ...], alike: list[int]) -> LogFault:
     """Return the fault; the sensors `alike` explain a late input as well, if they are late instead."""
-    nx, steps = log.data.nx, shift[0].steps
+    steps = abs(shift[0].steps)
     names = tuple(log.names[one.column] for one in shift)
     said = " and ".join(short(name) for name in names)
-    count = f"{abs(steps)} step{'s' * (abs(steps) > 1)}"
-    if shift[0].column >= nx:
+    count = f"{steps} step{'s' * (steps > 1)}"
+    past = f"let the model see the past: embedding=km.Delay({steps})"
+    if shift[0].column >= log.data.nx:
         acts = "acts" if len(names) == 1 else "act"
         others = " or ".join(short(log.names[i]) for i in alike)
         instead = f", unless the sensor of {others} is {count} behind" if alike else ""
-        return LogFault(
-            "input delay",
-            f"{said} {acts} {count} late{instead}",
-            f"let the model see the past: embedding=km.Delay({abs(steps)})",
-            names,
-            steps=abs(steps),
-        )
-    return LogFault(
-        "late sensor",
-        f"{said} is {count} behind the other signals",
-        f"move its column by {count}, or let the model see the past: embedding=km.Delay({abs(steps)})",
-        names,
-        steps=abs(steps),
-    )
+        return LogFault("input delay", f"{said} {acts} {count} late{instead}", past, names, steps=steps)
+    behind = f"{said} is {count} behind the other signals"
+    return LogFault("late sensor", behind, f"move its column by {count}, or {past}", names, steps=steps)
 
 
 _QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of an input, at which an actuator may end
@@ -283,7 +270,7 @@ def ending(log: Log) -> Iterator[LogFault]:
     E = plain.residuals(log)
     for j in range(log.data.nu):
         column = plain.U[:, j]
-        ends = [(low, high) for side in ("both", "high", "low") for low, high in _ends(column, side)]
+        ends = list(_ends(column))
         if not ends:
             continue
         scores = [won(log, E, _clipped(plain, j, *pair).residuals(log)) for pair in ends]
@@ -311,9 +298,9 @@ def ending(log: Log) -> Iterator[LogFault]:
         )
 
 
-def _ends(column: Float[np.ndarray, " M"], side: str) -> Iterator[tuple[float, float]]:
-    """Yield low and high ends at quantiles of the input, of one side or both."""
-    for q in _QUANTILES:
+def _ends(column: Float[np.ndarray, " M"]) -> Iterator[tuple[float, float]]:
+    """Yield low and high ends at quantiles of the input, of both sides or one."""
+    for side, q in product(("both", "high", "low"), _QUANTILES):
         low = float(np.quantile(column, q)) if side != "high" else float(column.min())
         high = float(np.quantile(column, 1 - q)) if side != "low" else float(column.max())
         if low < high and (low > column.min() or high < column.max()):
@@ -327,7 +314,7 @@ def _clipped(of: Rows, j: int, low: float, high: float) -> Rows:
 
 
 def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float, float]:
-    """Return the ends that predict best, each by golden section around the quantile that was best."""
+    """Return the ends that predict best, by steps around the quantiles that were best, halved five times."""
     bottom, top = float(of.U[:, j].min()), float(of.U[:, j].max())
     width = 0.1 * (top - bottom)
     for _ in range(6):
@@ -408,13 +395,12 @@ def feedback(log: Log) -> Iterator[LogFault]:
     changed. Two signs tell a feedback u = K x from that: x_k knows more of u_k than of u_{k−1}, although that one has
     acted already, and it tells a part of u_k that earlier inputs do not.
     """
-    U = [e.U for e in log.data if len(e) > 2 * _PAST]
-    X = [e.X for e in log.data if len(e) > 2 * _PAST]
-    if not U or not log.data.nu:
+    long, nu = [e for e in log.data if len(e) > 2 * _PAST], log.data.nu
+    if not long or not nu:
         return
-    now = np.concatenate([u[_PAST + 1 :] for u in U])
-    past = np.concatenate([_past(u, _PAST, len(u), _PAST + 1)[:, u.shape[1] :] for u in U])
-    state = np.concatenate([x[_PAST + 1 : -1] for x in X])
+    now = np.concatenate([e.U[_PAST + 1 :] for e in long])
+    past = np.concatenate([_past(e.U, _PAST, len(e), _PAST + 1)[:, nu:] for e in long])
+    state = np.concatenate([e.X[_PAST + 1 : -1] for e in long])
     if len(now) < max(_ENOUGH, 4 * (past.shape[1] + state.shape[1])):
         return
     V = (now - log.input_center) / log.input_size
@@ -422,7 +408,7 @@ def feedback(log: Log) -> Iterator[LogFault]:
     one, Z = np.ones((len(V), 1)), (state - log.center) / log.size
     left = (fitted(np.hstack([one, own]), V) ** 2).mean(axis=0)
     after = (fitted(np.hstack([one, own, Z]), V) ** 2).mean(axis=0)
-    alone, acted = np.split((fitted(np.hstack([one, Z]), np.hstack([V, own[:, : V.shape[1]]])) ** 2).mean(axis=0), 2)
+    alone, acted = np.split((fitted(np.hstack([one, Z]), np.hstack([V, own[:, :nu]])) ** 2).mean(axis=0), 2)
     around = np.maximum((V**2).mean(axis=0) - V.mean(axis=0) ** 2, 1e-300)
     for j in np.flatnonzero(around > 1e-12):
         told = 1 - after[j] / max(left[j], 1e-300)

@@ -209,10 +209,10 @@ def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
     return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
 
-def listed(places: tuple[Place, ...], most: int = 3) -> str:
-    """Return the first places in words, and how many more there are."""
-    shown = "; ".join(str(place) for place in places[:most])
-    return shown + (f"; and {len(places) - most} more" if len(places) > most else "")
+def listed(places: tuple[Place, ...]) -> str:
+    """Return the first three places in words, and how many more there are."""
+    shown = "; ".join(str(place) for place in places[:3])
+    return shown + (f"; and {len(places) - 3} more" if len(places) > 3 else "")
 
 
 def episodes_of_places(places: tuple[Place, ...]) -> str:

@@ -116,7 +116,8 @@ def coarse(log: Log) -> dict[int, float]:
 def slow(log: Log) -> Iterator[LogFault]:
     """Find sensors that show a new value every second row, or less often."""
     for i in slow_states(log):
-        every = round(1 / max(1 - float(np.mean(log.changes[:, i] == 0)), 1e-3))
+        zero = log.changes[:, i] == 0
+        every = round(1 / max(1 - float(zero.mean()), 1e-3))
         name = short(log.data.states[i])
         yield LogFault(
             "slow sensor",
