@@ -358,17 +358,14 @@ def without_effect(log: Log) -> Iterator[LogFault]:
     near = rows(log, margin=6)
     if not nu or len(near.X) < max(_ENOUGH, 4 * near.regressors(log).shape[1]):
         return
-    V = np.concatenate([_past(e.U, 6, e.U.shape[0] - 6, 6) for e in log.data if len(e) >= 15])[: len(near.X)]
+    V = np.concatenate([_past(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(near.X)]
+    base = [log.regressors(near.X), (near.before - log.center) / log.size]
+    Y = (near.after - near.X) / log.size
     for j in range(nu):
         own = V[:, j::nu] / log.input_size[j]
         if np.ptp(own) == 0:
             continue
-        rest = [i for i in range(nu) if i != j]
-        base = log.regressors(near.X)
-        kept = np.hstack(
-            [base, (near.before - log.center) / log.size, *(V[:, i::nu] / log.input_size[i] for i in rest)]
-        )
-        Y = (near.after - near.X) / log.size
+        kept = np.hstack([*base, *(V[:, i::nu] / log.input_size[i] for i in range(nu) if i != j)])
         E, other = fitted(kept, Y), fitted(np.hstack([kept, own]), Y)
         chance = own.shape[1] * Y.shape[1] / (2 * len(Y))
         gain = information(other, log.fine)[0] - information(E, log.fine)[0]

@@ -200,16 +200,16 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFaul
     """
     if len(times) != len(data):
         raise DataError(f"times are given for {len(times)} episodes, the data have {len(data)}; pass one array each")
-    stamps = [
-        checks.vector(own, f"times of episode {e}", len(episode) + 1)
+    steps = [
+        np.diff(checks.vector(own, f"times of episode {e}", len(episode) + 1))
         for e, (own, episode) in enumerate(zip(times, data, strict=True))
     ]
-    steps = np.concatenate([np.diff(t) for t in stamps])
-    forward = steps[steps > 0]
+    every = np.concatenate(steps)
+    forward = every[every > 0]
     if not len(forward):
         raise DataError("the times never advance; pass the time of each row in seconds")
     dt = float(np.median(forward))
-    resets = _places(stamps, lambda d: d <= 0)
+    resets = _places(steps, lambda d: d <= 0)
     if resets:
         yield LogFault(
             "clock reset",
@@ -217,15 +217,15 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFaul
             "cut the episodes there: load_episodes does where it goes back",
             places=resets,
         )
-    gaps = _places(stamps, lambda d: d > _GAP * dt)
-    other = [e for e, t in enumerate(stamps) if abs(np.median(np.diff(t)) - dt) > _OTHER * dt]
+    gaps = _places(steps, lambda d: d > _GAP * dt)
+    other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > _OTHER * dt]
     if other:
-        shown = ", ".join(f"episode {e} {np.median(np.diff(stamps[e])):.4g} s" for e in other[:3])
+        shown = ", ".join(f"episode {e} {np.median(steps[e]):.4g} s" for e in other[:3])
         yield LogFault(
             "mixed sampling",
             f"{len(other)} of {len(data)} episodes have another step than {dt:.4g} s: {shown}",
             f"bring them to one step: load_episodes(…, resample={dt:.4g})",
-            places=tuple(Place(e, 0, len(stamps[e])) for e in other),
+            places=tuple(Place(e, 0, len(steps[e]) + 1) for e in other),
         )
     gaps = tuple(p for p in gaps if p.episode not in other)
     if gaps:
@@ -235,7 +235,7 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFaul
             "cut the episodes there: load_episodes does",
             places=gaps,
         )
-    usual = [np.diff(t) for e, t in enumerate(stamps) if e not in other]
+    usual = [d for e, d in enumerate(steps) if e not in other]
     usual = np.concatenate(usual) if usual else np.zeros(0)
     usual = usual[(usual > 0) & (usual <= _GAP * dt)]
     uneven = np.abs(usual - dt) > _JITTER * dt
@@ -248,7 +248,5 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFaul
         )
 
 
-def _places(stamps: list[Float[np.ndarray, " T1"]], found: Callable[[np.ndarray], np.ndarray]) -> tuple[Place, ...]:
-    return tuple(
-        Place(e, int(k), int(k) + 2, jump=True) for e, t in enumerate(stamps) for k in np.flatnonzero(found(np.diff(t)))
-    )
+def _places(steps: list[Float[np.ndarray, " T"]], found: Callable[[np.ndarray], np.ndarray]) -> tuple[Place, ...]:
+    return tuple(Place(e, k, k + 2, jump=True) for e, d in enumerate(steps) for k in np.flatnonzero(found(d)).tolist())
