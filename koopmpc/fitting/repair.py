@@ -23,6 +23,7 @@ from koopmpc.validate.logs.audit import audit
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 _OWN = b"# koopmpc.episodes"  # a table that begins so was written by Episodes.save
+_SHORTER = "pass a shorter --horizon, or more data"  # what to do where too few episodes are as long as the horizon
 
 
 def read(
@@ -31,7 +32,7 @@ def read(
     rng: np.random.Generator,
     memory: int,
     told: Mapping[str, Any],
-    short: str = "pass a shorter --horizon, or more data",
+    short: str = _SHORTER,
 ) -> tuple["Divided", list[str]]:
     """Return the data of logs as `divided` makes them, and notes on how they were read.
 
@@ -282,7 +283,7 @@ def divided(
     horizon: int | None,
     rng: np.random.Generator,
     memory: int,
-    short: str = "pass a shorter --horizon, or more data",
+    short: str = _SHORTER,
 ) -> Divided:
     """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
 

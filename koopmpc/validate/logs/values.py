@@ -149,7 +149,7 @@ def stuck(log: Log) -> Iterator[LogFault]:
     places: dict[int, list[Place]] = {}
     at_end: dict[int, list[Place]] = {}
     low, high = log.X.min(axis=0), log.X.max(axis=0)
-    moving = [i for i in range(log.data.nx) if i not in lazy and low[i] < high[i]]
+    moving = [i for i in range(log.data.nx) if i not in lazy and low[i] != high[i]]
     longest = {i: max(_LONG, 6 * _longest_usual(log, i)) if i in rough else _LONG for i in moving}
     for e, episode in enumerate(log.data):
         for i in moving:
