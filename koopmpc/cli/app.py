@@ -94,8 +94,8 @@ def fit(
     ] = False,
 ) -> None:
     """Choose a model for logged data, fit it, and say whether to trust it; with a goal, design a controller."""
-    from koopmpc.fitting.control import design_data, template_of
     from koopmpc.fitting.fit import fit_data
+    from koopmpc.fitting.goal import design_data, template_of
 
     out, err = console(), Console(stderr=True)
     source: Any = data[0] if len(data) == 1 else data

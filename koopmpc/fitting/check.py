@@ -194,10 +194,7 @@ def check_controller(
     for kind in every:
         outcomes: list[_Outcome] = []
         for j in range(runs):
-            one = evidence.surrogates[j % len(evidence.surrogates)]
-            plant = Fenced(one.plant(kind.gain), evidence.low, evidence.high)
-            begin = one.start(asked.first_states[picked[j]])
-            outcomes.append(_driven(evidence, controller, kind, plant, begin, j, times))
+            outcomes.append(_driven(evidence, controller, kind, asked.first_states[picked[j]], j, times))
             done += 1
             if progress is not None:
                 progress(kind.name, done, total)
@@ -250,8 +247,7 @@ def _driven(
     evidence: Evidence,
     controller: AnyMPC,
     kind: RunKind,
-    plant: Fenced,
-    x0: Float[np.ndarray, " n"],
+    first: Float[np.ndarray, " n"],
     seed: int,
     times: list[float],
 ) -> _Outcome:
@@ -262,9 +258,9 @@ def _driven(
         reference = np.repeat(reference[:1], LONGER * judged + 1, axis=0)
     try:
         run = simulate(
-            plant,
+            Fenced(one.plant(kind.gain), evidence.low, evidence.high),
             timed,  # pyright: ignore[reportArgumentType]
-            x0=x0,
+            x0=one.start(first),
             reference=reference,
             steps=len(reference) - 1,
             noise=kind.noise * one.noise,

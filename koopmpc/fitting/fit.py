@@ -1,6 +1,6 @@
 """fit_data: from a file or a folder of logs to a model file, with its report, its pictures and its Rerun log."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.bench.results import RESULTS
 from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError
 from koopmpc.figures.comparisons import error
 from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import rollout
-from koopmpc.fitting.audited import Data, evenly
-from koopmpc.fitting.repair import IN_MEMORY, PAST, Divided, divided, noted, shortened
+from koopmpc.fitting.repair import IN_MEMORY, PAST, Data, Divided, noted, read
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
@@ -33,7 +31,6 @@ from koopmpc.validate.text import labelled, written
 
 Say = Callable[[str], None]
 _ROLLOUTS = 3  # held-out episodes that are drawn
-_OWN = b"# koopmpc.episodes"  # a table that begins so was written by Episodes.save
 LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 
@@ -124,12 +121,8 @@ def fit_data(
     if scheduler is not None:
         address_of(scheduler, workers)
     tell = silent if say is None else say
-    notes: list[str] = []
-    with noted(notes):
-        told = {name: value for name, value in reading.items() if value is not None}
-        reads = partial(divided, horizon=horizon, rng=draw, memory=memory)
-        files, split = evenly(logs_of(data), told, reads, notes)
-    about = understood(split, [*shortened(notes, files.files), *guessed(files.files, told)])
+    split, notes = read(data, horizon, draw, memory, reading)
+    about = understood(split, notes)
     tell(about)
     doubts: list[str] = []
     with noted(doubts):
@@ -242,24 +235,6 @@ def drawn(
         yield f"rollout-{i}", caption, partial(rollout, predictor, episode, horizon, bands)
     caption = "Eigenvalues of A and the unit circle; crosses are spurious on the held-out episodes."
     yield "spectrum", caption, partial(spectrum, predictor, report.residuals)
-
-
-def logs_of(data: Data) -> Data:
-    """Return the .rrd logs of a folder of runs, which also holds their table; anything else is returned as it is."""
-    if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
-        return sorted(Path(data).glob("*.rrd"))
-    return data
-
-
-def guessed(files: Iterable[str | PathLike[str]], told: Mapping[str, Any]) -> list[str]:
-    """Return a sentence where names of columns alone say which are inputs: tables, and nobody told the roles."""
-    tables = [Path(file) for file in files if Path(file).suffix.lower() == ".csv"]
-    if "inputs" in told or not tables:
-        return []
-    with tables[0].open("rb") as stream:
-        if stream.read(len(_OWN)) == _OWN:  # episodes that were saved, with their roles
-            return []
-    return ["which columns are inputs was guessed from their names; --inputs u,v and --states a,b say it"]
 
 
 def understood(split: Divided, notes: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Goal: what a controller shall do, in a file that a person writes for the plant of some logs."""
+"""The goal of a controller: a file that a person writes for the plant of some logs, and the design from both."""
 
 import math
 import tomllib
@@ -16,10 +16,16 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, LogError
+from koopmpc.fitting.fit import Say, silent, understood
+from koopmpc.fitting.repair import IN_MEMORY, Data, noted, read
 from koopmpc.lifting.state import State
+from koopmpc.parallel import StageProgress
+from koopmpc.recording.page import Page
+from koopmpc.synthesis.design import design
+from koopmpc.synthesis.designed import Design
 from koopmpc.synthesis.folds import usual_horizon
-from koopmpc.validate.text import quantity
 
+_SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
 _TOP = {"horizon", "states", "inputs"}
 _STATE = {"reference", "weight", "limits", "angle"}
 _INPUT = {"weight", "limits", "change", "change_weight"}
@@ -44,6 +50,125 @@ class Goal:
     horizon: int
     reference: Float[np.ndarray, "..."]
     angles: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DesignedData:
+    """The design that was made, and the files that were written.
+
+    Attributes
+    ----------
+    design
+        The controller with its evidence.
+    goal
+        The goal that was read.
+    controller, page
+        Paths of the controller file, and of the report in Markdown.
+    usage
+        Lines of Python that load the controller.
+    """
+
+    design: Design
+    goal: Goal
+    controller: Path
+    page: Path
+    usage: str
+
+
+def design_data(
+    data: Data,
+    goal: str | PathLike[str],
+    folder: str | PathLike[str],
+    *,
+    bilinear: bool = True,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    memory: int = IN_MEMORY,
+    say: Say | None = None,
+    progress: StageProgress | None = None,
+    rng: np.random.Generator | int = 0,
+    **reading: Any,
+) -> DesignedData:
+    """Read data and a goal, design a controller, and write controller.npz and controller.md.
+
+    The data are read and repaired as by `fit_data`; the other arguments are the same as there.
+
+    Parameters
+    ----------
+    data, folder
+        As for `fit_data`.
+    goal
+        A file as `template_of` writes it.
+    bilinear, workers, scheduler, memory, say, progress, rng
+        As for `fit_data`.
+    reading
+        Keywords of `load_episodes` for plain tables; without ``inputs`` the inputs of the goal are inputs.
+
+    Raises
+    ------
+    LogError
+        A file cannot be read, or the folder not written.
+    DataError
+        The data are not of one plant, or too few; the goal names what the data do not have.
+    """
+    place, draw = Path(folder), checks.generator(rng)
+    tell = silent if say is None else say
+    pushed = inputs_of(goal)
+    split, notes = read(data, None, draw, memory, reading, _SHORT)
+    missed = tuple(name for name in pushed if name in split.seen.states)
+    if missed and reading.get("inputs") is None:  # the goal knows inputs that no name in the logs shows
+        reading["inputs"] = (*split.seen.inputs, *missed)
+        split, notes = read(data, None, draw, memory, reading, _SHORT)
+    about = understood(split, notes)
+    tell(about)
+    asked = read_goal(goal, split.seen)
+    with noted([]):  # its advice says the same
+        found = design(
+            split.fitted,
+            asked.cost,
+            asked.limits,
+            horizon=asked.horizon,
+            reference=asked.reference,
+            angles=asked.angles,
+            bilinear=bilinear,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+            rng=draw,
+        )
+    tell(str(found))
+    file = place / "controller.npz"
+    found.save(file)
+    usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
+    page = Page(place)
+    page.text("# Controller report", f"Chosen: {found.best.title}.")
+    page.code(usage, "python")
+    if found.advice:
+        page.text("## Advice")
+        page.items(found.advice)
+    page.text("## What to expect")
+    page.code(str(found.expected))
+    page.text("## Choice")
+    page.code(str(found))
+    page.text("## Goal")
+    page.code(Path(goal).read_text(), "toml")
+    page.text("## Data")
+    page.code(about)
+    return DesignedData(found, asked, file, page.write("controller.md"), usage)
+
+
+def template_of(data: Data, *, memory: int = IN_MEMORY, **reading: Any) -> str:
+    """Return the text of a goal file for the plant of some logs, with the ranges found.
+
+    Raises
+    ------
+    DataError
+        No column is an input.
+    """
+    split, notes = read(data, None, checks.generator(0), memory, reading, _SHORT)
+    if not split.seen.nu:
+        raise DataError("\n".join(["the logs have no input, so nothing can be controlled; pass --inputs u,v", *notes]))
+    return goal_template(split.seen.with_episodes([*split.seen, *split.held_out]))
 
 
 def goal_template(data: Episodes) -> str:
@@ -229,9 +354,7 @@ def _pair(section: Mapping[str, Any], where: str) -> tuple[float, float]:
         raise DataError(f"{where}: limits is {value!r}; write [low, high], with -inf or inf where there is none")
     low, high = value
     if low > high:
-        raise DataError(
-            f"{where}: limits {quantity('', f'{low:g} … {high:g}').strip()} cross; write the lower one first"
-        )
+        raise DataError(f"{where}: limits {low:g} … {high:g} cross; write the lower one first")
     return low, high
 
 

@@ -1,21 +1,107 @@
-"""Logs before a fit: useless columns are left out, angles unwrapped, and episodes held out to judge the model."""
+"""Logs before a fit: they are read, audited and repaired, and episodes are held out to judge the model."""
 
 import warnings
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.bench.results import RESULTS
 from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.storage import Files
 from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
-from koopmpc.fitting.audited import audited
 from koopmpc.synthesis.candidates import jumps
 from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
+from koopmpc.validate.logs.audit import audit
+
+Data = str | PathLike[str] | Iterable[str | PathLike[str]]
+_OWN = b"# koopmpc.episodes"  # a table that begins so was written by Episodes.save
+_SHORTER = "pass a shorter --horizon, or more data"  # what to do where too few episodes are as long as the horizon
+
+
+def read(
+    data: Data,
+    horizon: int | None,
+    rng: np.random.Generator,
+    memory: int,
+    told: Mapping[str, Any],
+    short: str = _SHORTER,
+) -> tuple["Divided", list[str]]:
+    """Return the data of logs as `divided` makes them, and notes on how they were read.
+
+    Where their steps are unequal they are interpolated, and a note says so. `told` holds keywords of `load_episodes`,
+    None for those that nobody gave; with ``resample`` among them the steps are left to that.
+    """
+    told = {name: value for name, value in told.items() if value is not None}
+    logs, notes = logs_of(data), list[str]()
+    with noted(notes):
+        try:
+            files = Files(logs, **told)
+            split = divided(files, horizon, rng, memory, short)
+        except UnevenSamplingError as uneven:
+            if "resample" in told:
+                raise
+            notes.append(f"{str(uneven).rpartition('; pass')[0]}; interpolated to {uneven.dt:g} s")
+            files = Files(logs, **told, resample=uneven.dt)
+            split = divided(files, horizon, rng, memory, short)
+    return split, [*shortened(notes, files.files), *guessed(files.files, told)]
+
+
+def logs_of(data: Data) -> Data:
+    """Return the .rrd logs of a folder of runs, which also holds their table; anything else is returned as it is."""
+    if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
+        return sorted(Path(data).glob("*.rrd"))
+    return data
+
+
+def guessed(files: Iterable[str | PathLike[str]], told: Mapping[str, Any]) -> list[str]:
+    """Return a sentence where names of columns alone say which are inputs: tables, and nobody told the roles."""
+    tables = [Path(file) for file in files if Path(file).suffix.lower() == ".csv"]
+    if "inputs" in told or not tables:
+        return []
+    with tables[0].open("rb") as stream:
+        if stream.read(len(_OWN)) == _OWN:  # episodes that were saved, with their roles
+            return []
+    return ["which columns are inputs was guessed from their names; --inputs u,v and --states a,b say it"]
+
+
+_REPAIRED = ("constant input", "repeated column", "wrapped angle")  # `needed` puts these right, and says so
+_LEAST = 0.5  # share of the steps that must be left once rows at fault are left out
+
+
+def audited(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[str, ...], int]:
+    """Return the episodes without the rows at fault, unless that would leave less than half of the steps.
+
+    Beside them stand the faults, with what was done about each, in sentences, and the steps of the past that a model
+    needs for signals that are late. With `cut` False the episodes are only a sample of the data, so that nothing can be
+    left out.
+    """
+    report = audit(episodes)
+    rest = episodes
+    if cut and any(fault.places for fault in report.faults):
+        with suppress(DataError):  # every row is at fault
+            left = report.without_faults(episodes)
+            if sum(map(len, left)) >= _LEAST * sum(map(len, episodes)):
+                rest = left
+    notes: list[str] = []
+    for fault in report.faults:
+        if fault.name in _REPAIRED:
+            continue
+        if fault.places and rest is not episodes:
+            done = "these rows were left out"
+        elif fault.steps:
+            done = f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"
+        else:
+            done = fault.do
+        notes.append(f"{fault.name}: {fault.says}; {done}")
+    return rest, tuple(notes), report.delay
 
 
 @dataclass(frozen=True)
@@ -197,7 +283,7 @@ def divided(
     horizon: int | None,
     rng: np.random.Generator,
     memory: int,
-    short: str = "pass a shorter --horizon, or more data",
+    short: str = _SHORTER,
 ) -> Divided:
     """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
 
@@ -212,13 +298,12 @@ def divided(
     size = sum(file.stat().st_size for file in files.files)
     told = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_bytes(size)}"
     if size <= memory or len(parts) < 2:
-        looked = audited(joined([part.load() for part in parts]))
-        repair = needed(looked.episodes)
-        notes = (*looked.notes, *repair.notes)
-        return _in_memory(repair(looked.episodes), horizon, rng, told, notes, looked.delay, short)
-    looked = audited(sampled(files, _JUDGED)[0], cut=False)
-    repair = needed(looked.episodes)
-    past = max(PAST, looked.delay)
+        episodes, faults, delay = audited(joined([part.load() for part in parts]))
+        repair = needed(episodes)
+        return _in_memory(repair(episodes), horizon, rng, told, (*faults, *repair.notes), delay, short)
+    episodes, faults, delay = audited(sampled(files, _JUDGED)[0], cut=False)
+    repair = needed(episodes)
+    past = max(PAST, delay)
     source = repair.source(files)
     count = max(len(parts) // 10, 1)
     out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
@@ -241,8 +326,8 @@ def divided(
         judged.with_episodes(held_out),
         ahead,
         told,
-        (*looked.notes, *repair.notes, note),
-        looked.delay,
+        (*faults, *repair.notes, note),
+        delay,
     )
 
 

@@ -9,13 +9,8 @@ if TYPE_CHECKING:
     from koopmpc.validate.bands import Forecast as Forecast
     from koopmpc.validate.bands import conformal as conformal
     from koopmpc.validate.bands import forecast as forecast
-    from koopmpc.validate.identifiability import Persistency as Persistency
-    from koopmpc.validate.identifiability import feedback_share as feedback_share
-    from koopmpc.validate.identifiability import persistency as persistency
     from koopmpc.validate.logs.audit import AuditReport as AuditReport
     from koopmpc.validate.logs.audit import audit as audit
-    from koopmpc.validate.regions import Coverage as Coverage
-    from koopmpc.validate.regions import coverage as coverage
     from koopmpc.validate.report import TrustReport as TrustReport
     from koopmpc.validate.report import trust as trust
     from koopmpc.validate.residuals import Invariance as Invariance
@@ -24,5 +19,10 @@ if TYPE_CHECKING:
     from koopmpc.validate.residuals import residual_dmd as residual_dmd
     from koopmpc.validate.scoring import Score as Score
     from koopmpc.validate.scoring import score as score
+    from koopmpc.validate.sufficiency import Coverage as Coverage
+    from koopmpc.validate.sufficiency import Persistency as Persistency
+    from koopmpc.validate.sufficiency import coverage as coverage
+    from koopmpc.validate.sufficiency import feedback_share as feedback_share
+    from koopmpc.validate.sufficiency import persistency as persistency
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,4 +1,4 @@
-"""trust: all checks of a predictor on held-out episodes in one call, and their report."""
+"""trust: all checks of a predictor on held-out episodes in one call, what they say against it, and their report."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,38 +14,144 @@ from koopmpc.errors import DataError
 from koopmpc.lifting.base import short
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.validate.bands import conformal
-from koopmpc.validate.identifiability import explained_inputs, persistency
-from koopmpc.validate.regions import Coverage, coverage
-from koopmpc.validate.residuals import eigen_residuals, moments_of, proximity_of
-from koopmpc.validate.scoring import AnyPredictor, score
+from koopmpc.validate.bands import ConformalBand, Covered, conformal
+from koopmpc.validate.residuals import Invariance, ResidualDMD, eigen_residuals, moments_of, proximity_of
+from koopmpc.validate.scoring import AnyPredictor, Score, score
+from koopmpc.validate.sufficiency import Coverage, Persistency, coverage, explained_inputs, persistency
 from koopmpc.validate.text import labelled, observable, percent, quantity, table, written
-from koopmpc.validate.verdict import CheckResults, Finding, findings
+from koopmpc.values import Value
 
 _ORDER = 20  # persistency of excitation is looked at up to this order
 _REGIONS = 3  # empty regions that are named
+_USABLE = 0.2  # share of a state's range beyond which the band of its errors is of no use
+_SMALL = 0.05  # share up to which it need not beat x̂ = x_k
+_INVARIANT = 0.1  # one-step error of an observable above which the dictionary is not invariant, as a share of its size
+_OVERFIT = 2.0  # ratio of held-out to training error above which a model is overfitted
+_UNSEEN = 0.05  # share of held-out samples in unseen cells that asks for care
+_GROWS = 2.0  # growth of a spurious eigenfunction over the horizon that is worth a word
+_EXPLAINED = 0.9  # share of an input's energy that ψ(x) explains, above which it counts as feedback
+_NAMED = 3  # names that one sentence lists
 
 
 @dataclass(frozen=True, eq=False)
-class TrustReport(CheckResults):
-    """All checks of a predictor on episodes that it was not fitted to; `print` shows them, the verdict first.
+class Finding(Value):
+    """One reason for distrust or care.
 
-    Its attributes are those of `CheckResults`.
+    Attributes
+    ----------
+    grave
+        True where the model cannot be trusted over the whole horizon; False where care is needed.
+    says
+        What is wrong, with the number.
+    do
+        What to do about it.
     """
 
-    @cached_property
-    def findings(self) -> tuple[Finding, ...]:
-        """Findings against the predictor, the gravest first; empty where there are none."""
-        return findings(self)
+    grave: bool
+    says: str
+    do: str
+
+
+@dataclass(frozen=True, eq=False)
+class TrustReport(Value):
+    """All checks of a predictor on episodes that it was not fitted to; `print` shows them, the verdict first.
+
+    Attributes
+    ----------
+    score, holding
+        Errors of the predictor, and those of x̂_{k+h} = x_k, which needs no model.
+    spread
+        (nx,) range of each state in the held-out episodes, in its unit.
+    residuals
+        Residual of each eigenpair on the held-out episodes; for a linear predictor the same as `linearity_error`.
+    invariance
+        Invariance of the dictionary on the held-out episodes.
+    coverage
+        Where the training episodes lie, or the held-out episodes where no training episodes were given.
+    persistency, feedback
+        Excitation of the inputs, and the share of them that ψ(x) explains, on the same episodes as `coverage`; None
+        without inputs.
+    band
+        Conformal band of the held-out episodes.
+    train_score, unseen
+        Errors on the training episodes, and the share of the held-out samples that lie where these never were;
+        None where they were not given.
+    closed_loop, recalibrated
+        How many closed-loop forecasts lay in the band, and the band calibrated on those episodes; None where
+        they were not given.
+    radius
+        Spectral radius of A.
+    dt
+        Sampling time [s].
+    inputs
+        Names of the inputs that `feedback` is about.
+    """
+
+    score: Score
+    holding: Score
+    spread: Float[np.ndarray, " nx"]
+    residuals: ResidualDMD
+    invariance: Invariance
+    coverage: Coverage
+    persistency: Persistency | None
+    feedback: Float[np.ndarray, " nu"] | None
+    band: ConformalBand
+    train_score: Score | None
+    unseen: float | None
+    closed_loop: Covered | None
+    recalibrated: ConformalBand | None
+    radius: float
+    dt: float
+    inputs: tuple[str, ...]
+
+    @property
+    def error(self) -> Float[np.ndarray, "horizon nx"]:
+        """(horizon, nx) the larger edge of the 5 … 95 % band of the errors, as a share of the state's range."""
+        edge = np.maximum(np.abs(self.score.low), np.abs(self.score.high))
+        return np.divide(edge, self.spread, out=np.where(edge > 0, np.inf, 0.0), where=self.spread > 0)
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(nx,) steps ahead to which each state can be trusted: its errors are small, or beat x̂ = x_k and not large."""
+        beaten = self.score.rmse < self.holding.rmse
+        good = (self.error <= _SMALL) | ((self.error <= _USABLE) & beaten)
+        return np.cumprod(good, axis=0).sum(axis=0)
+
+    @property
+    def steps(self) -> int:
+        """The number of steps ahead for which all states can be trusted."""
+        return int(self.usable.min())
 
     @property
     def trusted(self) -> bool:
         """True where the predictor can be trusted over the whole horizon; `findings` may still ask for care."""
         return self.steps == self.score.horizon
 
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings against the predictor, the gravest first; empty where there are none."""
+        care = _spectrum, _dictionary, _fit, _inputs, _band, _closed_loop
+        grave = [Finding(True, says, do) for says, do in _errors(self)]
+        return (*grave, *(Finding(False, says, do) for check in care for says, do in check(self)))
+
     def __str__(self) -> str:
-        """Return the report: verdict, what to do, evidence."""
-        return _layout(self)
+        """Return the verdict, each finding with what to do about it, and the evidence."""
+        return written(
+            _verdict(self),
+            labelled(
+                pair
+                for finding in self.findings
+                for pair in (("✗" if finding.grave else "!", finding.says), ("", f"→ {finding.do}"))
+            ),
+            "",
+            f"Errors x − x̂ of {self.score.starts} forecasts of held-out episodes. Of the 5 % and 95 % quantiles the "
+            "one of larger size is also shown as a share of the range of the state. The last column divides the RMSE "
+            "by that of the guess that nothing changes, x̂ = x_k.",
+            "",
+            _error_table(self),
+            "",
+            labelled(_evidence(self)),
+        )
 
 
 def trust(
@@ -165,24 +271,113 @@ def _unseen(seen: Coverage, episodes: Episodes) -> float:
     return float(sum(missed) / sum(len(episode) for episode in episodes))
 
 
-def _layout(report: TrustReport) -> str:
-    """Return the verdict, each finding with what to do about it, and the evidence."""
-    return written(
-        _verdict(report),
-        labelled(
-            pair
-            for finding in report.findings
-            for pair in (("✗" if finding.grave else "!", finding.says), ("", f"→ {finding.do}"))
-        ),
-        "",
-        f"Errors x − x̂ of {report.score.starts} forecasts of held-out episodes. Of the 5 % and 95 % quantiles the one "
-        "of larger size is also shown as a share of the range of the state. The last column divides the RMSE by that "
-        "of the guess that nothing changes, x̂ = x_k.",
-        "",
-        _errors(report),
-        "",
-        labelled(_evidence(report)),
-    )
+def _errors(report: TrustReport) -> Iterator[tuple[str, str]]:
+    """Yield what is wrong with the errors, and what to do; the same of other evidence in the functions below."""
+    horizon, steps = report.score.horizon, report.steps
+    if steps == horizon:
+        return
+    state = int(np.argmin(report.usable))
+    name, there = report.score.states[state], report.error[:, state]
+    far = f"{percent(there[steps])} of its range at step {steps + 1} and {percent(there[-1])} at step {horizon}"
+    says = f"the errors of {short(name)} reach {far} (5 % and 95 % quantiles)"
+    if there[steps] <= _USABLE:
+        says += ", and the guess that nothing changes is no worse"
+    if report.unseen is not None and report.unseen > _UNSEEN:
+        do = "collect data where the model will be used"
+    elif _overfit(report):
+        do = "collect more data, take fewer observables or a larger ridge"
+    else:
+        do = "take richer observables or bilinear_edmd, and compare their scores over this horizon"
+    yield says, do + (f"; a horizon of {steps} steps is within reach" if steps else "")
+
+
+def _spectrum(report: TrustReport) -> Iterator[tuple[str, str]]:
+    of = report.residuals
+    bad = of.spurious
+    if not bad.any():
+        return
+    with np.errstate(over="ignore"):
+        growth = np.abs(of.eigenvalues) ** report.score.horizon
+    growing = bad & (growth > _GROWS)
+    worst = int(np.argmax(np.where(growing, growth, 0.0) if growing.any() else of.residuals))
+    told = f"λ = {_complex(complex(of.eigenvalues[worst]))} (residual {percent(float(of.residuals[worst]))})"
+    says = f"{int(bad.sum())} of {len(bad)} eigenpairs are spurious (residual above {percent(of.tolerance)} a step)"
+    if growing.any():
+        n = int(growing.sum())
+        says += f", and {n} of them grow{'s' * (n == 1)}: {told} grows {growth[worst]:.2g}-fold over the horizon"
+        yield says, "drop observables, raise the ridge, or truncate the rank"
+    else:
+        yield f"{says}; the worst is {told}", "read no modes or frequencies from these; predictions may still be good"
+
+
+def _dictionary(report: TrustReport) -> Iterator[tuple[str, str]]:
+    names, errors = report.invariance.names, report.invariance.errors
+    bad = np.flatnonzero(errors > _INVARIANT)
+    if bad.size:
+        worst: list[int] = bad[np.argsort(-errors[bad], kind="stable")].tolist()
+        named = ", ".join(f"{observable(names[i])} {percent(float(errors[i]))}" for i in worst[:_NAMED])
+        yield (
+            f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "
+            f"more than {percent(_INVARIANT)} of its size ({named}{', …' if bad.size > _NAMED else ''})",
+            "for a longer horizon add what their next values depend on; compare scores before dropping one",
+        )
+
+
+def _fit(report: TrustReport) -> Iterator[tuple[str, str]]:
+    if report.train_score is not None and _overfit(report):
+        ratio = report.score.total / max(report.train_score.total, np.finfo(float).tiny)
+        says = f"errors on held-out episodes are {ratio:.3g} times those on the training episodes"
+        yield says, "collect more data, take fewer observables or a larger ridge"
+    if report.unseen is not None and report.unseen > _UNSEEN:
+        said = "; ".join(str(region) for region in report.coverage.empty[:_NAMED])
+        says = f"{percent(report.unseen)} of the held-out samples lie where the training data never were"
+        yield says + (f": {said}" if said else ""), "collect data there, or keep the controller away from there"
+
+
+def _inputs(report: TrustReport) -> Iterator[tuple[str, str]]:
+    if report.persistency is not None and report.persistency.order < min(2, report.persistency.asked):
+        says = f"the inputs are exciting to order {report.persistency.order} only, so B cannot be identified"
+        yield says, "excite every input, with noise or PRBS"
+    if report.feedback is not None:
+        bad = np.flatnonzero(report.feedback > _EXPLAINED).tolist()
+        names = ", ".join(f"{percent(report.feedback[i])} of {short(report.inputs[i])}" for i in bad[:_NAMED])
+        if bad:
+            yield (
+                f"feedback: the observables explain most of the inputs ({names}), so A and B are hard to separate",
+                "add noise to the inputs",
+            )
+
+
+def _band(report: TrustReport) -> Iterator[tuple[str, str]]:
+    band = report.band
+    if np.isfinite(band.quantile):
+        return
+    if band.episodes >= band.needed:
+        yield "forecasts leave the finite numbers", "look at the spectrum of A"
+    else:
+        there = f"there are {band.episodes} calibration episodes, at least {band.needed} are needed"
+        yield f"there is no band at {percent(band.level)}: {there}", "hold out more episodes, or ask for a lower level"
+
+
+def _closed_loop(report: TrustReport) -> Iterator[tuple[str, str]]:
+    loop, band = report.closed_loop, report.band
+    if loop is None:
+        return
+    chance = 2 * np.sqrt(band.level * (1 - band.level) * (1 / band.episodes + 1 / loop.episodes))
+    if loop.share < band.level - chance:
+        yield (
+            f"in closed loop {percent(loop.share)} of the forecasts stay in the {percent(band.level)} band",
+            "use the band that is recalibrated on closed-loop episodes, or fit with closed-loop data",
+        )
+
+
+def _overfit(report: TrustReport) -> bool:
+    train = report.train_score
+    return train is not None and report.score.total > max(_OVERFIT * train.total, 1e-6)
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.3g}" if abs(value.imag) < 1e-12 else f"{value.real:.3g} ± {abs(value.imag):.3g}i"
 
 
 def _verdict(report: TrustReport) -> str:
@@ -195,7 +390,7 @@ def _verdict(report: TrustReport) -> str:
     return f"TRUST{care} over {horizon} steps ({horizon * dt:.3g} s)"
 
 
-def _errors(report: TrustReport) -> Table:
+def _error_table(report: TrustReport) -> Table:
     """Return the errors of each state at a few horizons."""
     of = report.score
     ahead = sorted({1, max(of.horizon // 4, 1), max(of.horizon // 2, 1), of.horizon})

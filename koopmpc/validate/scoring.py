@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -180,14 +179,7 @@ def forecast_errors(
 
 
 _Slice = tuple[Episode, Int[np.ndarray, "_"]]  # an episode and the starts in it
-
-
-class _Block(NamedTuple):
-    """States, inputs on the same rows (0 on the last of a slice), and the rows of the starts."""
-
-    X: Float[np.ndarray, "m nx"]
-    V: Float[np.ndarray, "m nv"]
-    rows: Int[np.ndarray, " n"]
+_Block = tuple[Float[np.ndarray, "m nx"], Float[np.ndarray, "m nv"], Int[np.ndarray, " n"]]
 
 
 def _blocks(episodes: Episodes, starts: Sequence[Int[np.ndarray, "_"]], horizon: int, nw: int) -> Iterator[_Block]:
@@ -208,6 +200,7 @@ def _blocks(episodes: Episodes, starts: Sequence[Int[np.ndarray, "_"]], horizon:
 
 
 def _joined(slices: list[_Slice], horizon: int, nw: int) -> _Block:
+    """Return states, inputs on the same rows (0 on the last of a slice), and the rows of the starts."""
     X: list[np.ndarray] = []
     V: list[np.ndarray] = []
     rows: list[np.ndarray] = []
@@ -219,4 +212,4 @@ def _joined(slices: list[_Slice], horizon: int, nw: int) -> _Block:
         V.append(np.zeros((1, V[-1].shape[1])))
         rows.append(part - first + offset)
         offset += last + 1 - first
-    return _Block(np.concatenate(X), np.concatenate(V), np.concatenate(rows))
+    return np.concatenate(X), np.concatenate(V), np.concatenate(rows)

@@ -14,8 +14,8 @@ import koopmpc as km
 import koopmpc.fitting.fit
 from koopmpc.bench.results import RESULTS
 from koopmpc.cli.app import app
-from koopmpc.fitting.fit import fit_data, guessed
-from koopmpc.fitting.repair import divided, needed, shortened
+from koopmpc.fitting.fit import fit_data
+from koopmpc.fitting.repair import divided, guessed, needed, shortened
 from tests.bench.tiny import write
 
 

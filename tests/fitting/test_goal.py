@@ -10,8 +10,7 @@ import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.control.base import MPCBase
 from koopmpc.fitting.check import RunKind, check_controller
-from koopmpc.fitting.control import design_data
-from koopmpc.fitting.goal import goal_template, read_goal
+from koopmpc.fitting.goal import design_data, goal_template, read_goal
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
 NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)

@@ -1,21 +1,23 @@
-"""Faults between signals: one is late, an actuator ends before its input does, rows are missing.
+"""Faults between signals: one is late, has no effect or follows from others, or an actuator ends before its input.
 
 Each hypothesis undoes its fault in the log, and predicts the next row from the present one. It is judged by the
 information on all states together, −½ log det of the residuals in nats a sample: a signal that is put where it belongs
 raises it, and moving what one sensor knows to another does not.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, fitted, information, listed
+from koopmpc.validate.logs.log import Log, LogFault, fitted, information
+from koopmpc.validate.text import percent
 
 _LATEST = 8  # steps by which a signal is looked for
-_ENOUGH = 200  # rows without which no lag is looked for
+_ENOUGH = 200  # rows without which no lag and no effect is looked for
 _ROWS = 5_000  # rows that are looked at
 _GAIN = 0.02  # nats a sample that a hypothesis must win
 _SURE = 30.0  # nats in all
@@ -68,33 +70,22 @@ class Rows:
 
 def rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> Rows:
     """Return the rows of all episodes `margin` away from both ends, every signal moved by its shifts."""
-    nx = log.data.nx
-    parts: list[tuple[np.ndarray, ...]] = []
-    count = 0
+    nx, nu = log.data.nx, log.data.nu
+    states, inputs, moved = np.arange(nx), np.arange(nu), np.zeros(nx + nu, dtype=np.intp)
+    for shift in shifts:
+        moved[shift.column] += shift.steps
+    none = np.zeros((0, nx))
+    parts, count = [(none, np.zeros((0, nu)), none, none)], 0
     for episode in log.data:
         T = len(episode)
         if 2 * margin + 3 > T:
             continue
-        k = np.arange(margin + 1, T - margin)
-        moved = np.zeros(nx + log.data.nu, dtype=np.intp)
-        for shift in shifts:
-            moved[shift.column] += shift.steps
-
-        def states(at: np.ndarray, X: np.ndarray = episode.X, moved: np.ndarray = moved) -> np.ndarray:
-            return np.stack([X[at + moved[i], i] for i in range(nx)], axis=1)
-
-        U = (
-            np.stack([episode.U[k + moved[nx + j], j] for j in range(log.data.nu)], axis=1)
-            if log.data.nu
-            else episode.U[k]
-        )
-        parts.append((states(k), U, states(k - 1), states(k + 1)))
-        count += len(k)
+        at = np.arange(margin + 1, T - margin)[:, None] + moved
+        X, U = np.hsplit(at, [nx])
+        parts.append((episode.X[X, states], episode.U[U, inputs], episode.X[X - 1, states], episode.X[X + 1, states]))
+        count += len(at)
         if count > _ROWS:
             break
-    if not parts:
-        none = np.zeros((0, nx))
-        return Rows(none, np.zeros((0, log.data.nu)), none, none)
     return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -144,7 +135,7 @@ def _surest(
         return None
     errors = {shift: rows(log, (*found, *shift)).residuals(log) for shift in _shifts(log, found)}
     scores = {shift: _score(log, shift[0], E, other) for shift, other in errors.items()}
-    best = max(scores, key=_weighed(scores, nx))
+    best = max(scores, key=lambda shift: scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0))
     rivals = {shift: score for shift, score in scores.items() if shift[0].column != best[0].column}
     if best[0].column >= nx and not _alone(log, found, best, errors[best]):
         sensors = {shift: score for shift, score in scores.items() if shift[0].column < nx}
@@ -156,15 +147,11 @@ def _surest(
         rival = max(rivals.values(), default=0.0), max((won(log, E, errors[shift]) for shift in rivals), default=0.0)
         sure = _behind(log, best[0], E, errors[best], *rival)
     else:
-        beside = [scores[near] for step in (-1, 1) if (near := _further(best, step)) in scores]
+        near = [tuple(Shift(one.column, one.steps + step) for one in best) for step in (-1, 1)]
+        beside = [scores[shift] for shift in near if shift in scores]
         sure = better(log, E, errors[best]) and max(beside, default=0.0) < _PEAK * scores[best]
     alike = {shift[0].column for shift, score in rivals.items() if score > _CLEAR * scores[best]}
     return (best, errors[best], sorted(i for i in alike if i < nx)) if sure else None
-
-
-def _further(shift: tuple[Shift, ...], steps: int) -> tuple[Shift, ...]:
-    """Return the shift with its signals moved this many steps more."""
-    return tuple(Shift(one.column, one.steps + steps) for one in shift)
 
 
 def _score(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
@@ -181,15 +168,6 @@ def _own(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"], other: Float[np.n
     """Return by how much `other` predicts the shifted state better than `E`, in nats a sample."""
     of, floor = slice(shift.column, shift.column + 1), log.fine[shift.column : shift.column + 1]
     return float((information(other[:, of], floor) - information(E[:, of], floor)).min())
-
-
-def _weighed(scores: dict[tuple[Shift, ...], float], nx: int) -> Callable[[tuple[Shift, ...]], float]:
-    """Return the weight of a shift: its gain, raised for an input, because inputs are late more often than sensors."""
-
-    def weighed(shift: tuple[Shift, ...]) -> float:
-        return scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0)
-
-    return weighed
 
 
 def _behind(
@@ -225,20 +203,19 @@ def _by_one_row(log: Log) -> Shift | None:
     them: late or not, its residual is the same. Without the row before, it must follow from the others. Nothing is said
     where the inputs tell nothing: a motion that repeats itself follows from any of its rows.
     """
+    if log.data.nx < 2:
+        return None
     plain = rows(log)
     E = plain.one_row_residuals(log)
     if won(log, fitted(log.regressors(plain.X), (plain.after - plain.X) / log.size), E) < _GAIN:
         return None
     best, most = None, _OWN_ONE_ROW
-    for shift in (
-        Shift(i, n) for i in range(log.data.nx if log.data.nx > 1 else 0) for n in range(1, _ONE_ROW_LATEST + 1)
-    ):
-        other = rows(log, (shift,)).one_row_residuals(log)
-        i = shift.column
+    for i, steps in product(range(log.data.nx), range(1, _ONE_ROW_LATEST + 1)):
+        other = rows(log, (Shift(i, steps),)).one_row_residuals(log)
         pairs = zip(np.array_split(E[:, i], _BLOCKS), np.array_split(other[:, i], _BLOCKS), strict=True)
         gains = [0.5 * float(np.log((np.mean(a**2) + 1e-20) / (np.mean(b**2) + 1e-20))) for a, b in pairs]
         if np.median(gains) > most and min(gains) > _EVEN * np.median(gains):
-            best, most = shift, float(np.median(gains))
+            best, most = Shift(i, steps), float(np.median(gains))
     return best
 
 
@@ -258,9 +235,6 @@ def _shifts(log: Log, found: tuple[Shift, ...]) -> Iterator[tuple[Shift, ...]]:
 
 def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]) -> bool:
     """Return True where the input of the present row adds next to nothing to the late one."""
-    nx = log.data.nx
-    if shift[0].column < nx:
-        return True
     now, moved = rows(log, found), rows(log, (*found, *shift))
     both = moved.residuals(log, log.scaled(now.X, now.U)[1])
     return won(log, E, both) < 0.1 * won(log, now.residuals(log), both)
@@ -268,28 +242,18 @@ def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Floa
 
 def _said(log: Log, shift: tuple[Shift, ...], alike: list[int]) -> LogFault:
     """Return the fault; the sensors `alike` explain a late input as well, if they are late instead."""
-    nx, steps = log.data.nx, shift[0].steps
+    steps = abs(shift[0].steps)
     names = tuple(log.names[one.column] for one in shift)
     said = " and ".join(short(name) for name in names)
-    count = f"{abs(steps)} step{'s' * (abs(steps) > 1)}"
-    if shift[0].column >= nx:
+    count = f"{steps} step{'s' * (steps > 1)}"
+    past = f"let the model see the past: embedding=km.Delay({steps})"
+    if shift[0].column >= log.data.nx:
         acts = "acts" if len(names) == 1 else "act"
         others = " or ".join(short(log.names[i]) for i in alike)
         instead = f", unless the sensor of {others} is {count} behind" if alike else ""
-        return LogFault(
-            "input delay",
-            f"{said} {acts} {count} late{instead}",
-            f"let the model see the past: embedding=km.Delay({abs(steps)})",
-            names,
-            steps=abs(steps),
-        )
-    return LogFault(
-        "late sensor",
-        f"{said} is {count} behind the other signals",
-        f"move its column by {count}, or let the model see the past: embedding=km.Delay({abs(steps)})",
-        names,
-        steps=abs(steps),
-    )
+        return LogFault("input delay", f"{said} {acts} {count} late{instead}", past, names, steps=steps)
+    behind = f"{said} is {count} behind the other signals"
+    return LogFault("late sensor", behind, f"move its column by {count}, or {past}", names, steps=steps)
 
 
 _QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of an input, at which an actuator may end
@@ -306,7 +270,7 @@ def ending(log: Log) -> Iterator[LogFault]:
     E = plain.residuals(log)
     for j in range(log.data.nu):
         column = plain.U[:, j]
-        ends = [(low, high) for side in ("both", "high", "low") for low, high in _ends(column, side)]
+        ends = list(_ends(column))
         if not ends:
             continue
         scores = [won(log, E, _clipped(plain, j, *pair).residuals(log)) for pair in ends]
@@ -334,9 +298,9 @@ def ending(log: Log) -> Iterator[LogFault]:
         )
 
 
-def _ends(column: Float[np.ndarray, " M"], side: str) -> Iterator[tuple[float, float]]:
-    """Yield low and high ends at quantiles of the input, of one side or both."""
-    for q in _QUANTILES:
+def _ends(column: Float[np.ndarray, " M"]) -> Iterator[tuple[float, float]]:
+    """Yield low and high ends at quantiles of the input, of both sides or one."""
+    for side, q in product(("both", "high", "low"), _QUANTILES):
         low = float(np.quantile(column, q)) if side != "high" else float(column.min())
         high = float(np.quantile(column, 1 - q)) if side != "low" else float(column.max())
         if low < high and (low > column.min() or high < column.max()):
@@ -350,7 +314,7 @@ def _clipped(of: Rows, j: int, low: float, high: float) -> Rows:
 
 
 def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float, float]:
-    """Return the ends that predict best, each by golden section around the quantile that was best."""
+    """Return the ends that predict best, by steps around the quantiles that were best, halved five times."""
     bottom, top = float(of.U[:, j].min()), float(of.U[:, j].max())
     width = 0.1 * (top - bottom)
     for _ in range(6):
@@ -366,34 +330,93 @@ def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float
     return low, high
 
 
-_JUMP = 1.5  # times the largest usual change from row to row
-_OFF = 10.0  # times the largest usual residual
+_PAST = 10  # inputs of the past that may tell the next one
+_EXPLAINED = 0.8  # share of an input that the state of the same row explains: feedback
+_NEWS = 0.02  # share of what is new in an input that this state must explain then
+_FREE = 1e-4  # share of an input that its own past must leave open
 
 
-def jumps(log: Log) -> Iterator[LogFault]:
-    """Find places where the states jump, for rows are missing or an episode holds two runs."""
-    E = np.concatenate(log.residuals)
-    changes = np.concatenate([np.diff(e.X, axis=0) for e in log.data])
-    usual = np.maximum(np.quantile(np.abs(E), 0.97, axis=0), 1e-9)
-    widest = np.quantile(np.abs(changes), 0.99, axis=0)
-    places: list[Place] = []
-    for e, episode in enumerate(log.data):
-        d = np.diff(episode.X, axis=0)
-        off = np.where(log.leverage[e] < ALONE, (np.abs(log.residuals[e]) / usual).max(axis=1), 0.0)
-        wide = (np.abs(d) > _JUMP * widest) & (widest > 0)
-        for k in 1 + np.flatnonzero(((off > _OFF) & wide.any(axis=1))[1:]):
-            if not (np.abs(log.residuals[e][k]) * log.size > 0.5 * np.abs(d[k]))[wide[k]].any():
-                continue
-            i = int(np.argmax(np.abs(d[k]) / np.where(widest > 0, widest, np.inf)))
-            back = k + 1 < len(d) and d[k + 1, i] * d[k, i] < 0 and abs(d[k + 1, i]) > 0.5 * abs(d[k, i])
-            since = d[k - 1, i] * d[k, i] < 0 and abs(d[k - 1, i]) > 0.5 * abs(d[k, i])
-            alone = (k + 1 >= len(d) or off[k + 1] < 0.5 * off[k]) and off[k - 1] < 0.5 * off[k]
-            if not back and not since and alone and log.leverage[e][k - 1] < ALONE:
-                places.append(Place(e, int(k), int(k) + 2, jump=True))
-    if places and len(places) < 0.02 * log.steps:
-        yield LogFault(
-            "jump",
-            f"the states go on from elsewhere {len(places)} times: {listed(tuple(places))}",
-            "rows are missing there, or a new run begins: cut the episode in two",
-            places=tuple(places),
-        )
+def together(log: Log) -> Iterator[LogFault]:
+    """Find inputs of which one follows from the others."""
+    U = log.U
+    moving = [j for j in range(log.data.nu) if np.ptp(U[:, j]) > 0]
+    V = (U[:, moving] - U[:, moving].mean(axis=0)) / np.maximum(U[:, moving].std(axis=0), 1e-300)
+    for n, j in enumerate(moving):
+        if n and float((fitted(V[:, :n], V[:, [n]]) ** 2).mean()) < 1e-4:
+            others = ", ".join(short(log.data.inputs[i]) for i in moving[:n])
+            yield LogFault(
+                "inputs together",
+                f"{short(log.data.inputs[j])} follows from {others}: their effects cannot be told apart",
+                "excite each input by its own noise",
+                (log.data.inputs[j],),
+            )
+
+
+def without_effect(log: Log) -> Iterator[LogFault]:
+    """Find inputs that move and change no state within a few steps."""
+    nu = log.data.nu
+    near = rows(log, margin=6)
+    if not nu or len(near.X) < max(_ENOUGH, 4 * near.regressors(log).shape[1]):
+        return
+    V = np.concatenate([_past(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(near.X)]
+    base = [log.regressors(near.X), (near.before - log.center) / log.size]
+    Y = (near.after - near.X) / log.size
+    for j in range(nu):
+        own = V[:, j::nu] / log.input_size[j]
+        if np.ptp(own) == 0:
+            continue
+        kept = np.hstack([*base, *(V[:, i::nu] / log.input_size[i] for i in range(nu) if i != j)])
+        E, other = fitted(kept, Y), fitted(np.hstack([kept, own]), Y)
+        chance = own.shape[1] * Y.shape[1] / (2 * len(Y))
+        gain = information(other, log.fine)[0] - information(E, log.fine)[0]
+        if gain < 4 * chance + 2e-4 and not better(log, E, other, 1e-3):
+            name = short(log.data.inputs[j])
+            yield LogFault(
+                "input without effect",
+                f"{name} moves, and no state follows within 6 steps",
+                f"check that {name} was applied and is in the right column; excite it more strongly; else leave it out",
+                (log.data.inputs[j],),
+            )
+
+
+def _past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
+    """Return rows [u_k, u_{k−1}, …, u_{k−count+1}] for k = first + 1 … last − 1."""
+    k = np.arange(first + 1, last)
+    return np.hstack([U[k - lag] for lag in range(count)])
+
+
+def feedback(log: Log) -> Iterator[LogFault]:
+    """Find inputs u_k that follow from the state x_k of the same row.
+
+    An input that was chosen freely may be told by the state as well, where the plant is much faster than the input is
+    changed. Two signs tell a feedback u = K x from that: x_k knows more of u_k than of u_{k−1}, although that one has
+    acted already, and it tells a part of u_k that earlier inputs do not.
+    """
+    long, nu = [e for e in log.data if len(e) > 2 * _PAST], log.data.nu
+    if not long or not nu:
+        return
+    now = np.concatenate([e.U[_PAST + 1 :] for e in long])
+    past = np.concatenate([_past(e.U, _PAST, len(e), _PAST + 1)[:, nu:] for e in long])
+    state = np.concatenate([e.X[_PAST + 1 : -1] for e in long])
+    if len(now) < max(_ENOUGH, 4 * (past.shape[1] + state.shape[1])):
+        return
+    V = (now - log.input_center) / log.input_size
+    own = (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
+    one, Z = np.ones((len(V), 1)), (state - log.center) / log.size
+    left = (fitted(np.hstack([one, own]), V) ** 2).mean(axis=0)
+    after = (fitted(np.hstack([one, own, Z]), V) ** 2).mean(axis=0)
+    alone, acted = np.split((fitted(np.hstack([one, Z]), np.hstack([V, own[:, :nu]])) ** 2).mean(axis=0), 2)
+    around = np.maximum((V**2).mean(axis=0) - V.mean(axis=0) ** 2, 1e-300)
+    for j in np.flatnonzero(around > 1e-12):
+        told = 1 - after[j] / max(left[j], 1e-300)
+        exact = alone[j] < 1e-8 * around[j]
+        known = alone[j] < (1 - _EXPLAINED) * around[j] and alone[j] < acted[j]
+        if exact or (known and told > _NEWS and left[j] > _FREE * around[j]):
+            name = short(log.data.inputs[j])
+            yield LogFault(
+                "feedback",
+                f"the states tell {percent(1 - alone[j] / around[j])} of {name}: it was a feedback, so that A and B "
+                "cannot be told apart",
+                f"add noise to {name} while logging: km.Feedback(K, km.Noise(…))",
+                (log.data.inputs[j],),
+            )

@@ -4,45 +4,32 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
-from koopmpc.validate.logs.alignment import ending, jumps, late
+from koopmpc.validate.logs import values
+from koopmpc.validate.logs.alignment import ending, feedback, late, together, without_effect
 from koopmpc.validate.logs.changes import midway
-from koopmpc.validate.logs.clocks import clock_faults
-from koopmpc.validate.logs.inputs import constant, excitation, feedback, together, without_effect
-from koopmpc.validate.logs.log import Log, LogFault, Place, runs
-from koopmpc.validate.logs.values import (
-    coarse,
-    held,
-    outliers,
-    quantised,
-    repeated_columns,
-    repeated_episodes,
-    saturated,
-    slow,
-    slow_states,
-    stuck,
-    turns,
-    wrapped,
-)
-from koopmpc.validate.text import labelled, written
+from koopmpc.validate.logs.log import Log, LogFault, Place, listed, runs
+from koopmpc.validate.text import labelled, percent, written
 from koopmpc.values import Value
 
 Check = Callable[[Log], Iterator[LogFault]]
 _VALUES: tuple[Check, ...] = (
-    repeated_columns,
-    repeated_episodes,
-    quantised,
-    slow,
-    wrapped,
-    stuck,
-    saturated,
-    held,
-    outliers,
+    values.repeated_columns,
+    values.repeated_episodes,
+    values.quantised,
+    values.slow,
+    values.wrapped,
+    values.stuck,
+    values.saturated,
+    values.held,
+    values.outliers,
 )
-_INPUTS: tuple[Check, ...] = (constant, together, excitation, feedback)
+_INPUTS: tuple[Check, ...] = (values.constant, together, values.excitation, feedback)
 _MOST = 200_000  # steps that are looked at
 
 
@@ -124,15 +111,15 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
     for check in (*_VALUES, *(_INPUTS if data.nu else ())):
         faults += check(log)
     kinds = {fault.name for fault in faults}
-    whole = Remainder.of(_unwrapped(data, turns(log)))
+    whole = Remainder.of(_unwrapped(data, values.turns(log)))
     rest = whole.without([p for fault in faults for p in fault.places])
-    for check in (without_effect, midway, jumps):
+    for check in (without_effect, midway, values.jumps):
         if rest is None or (check is without_effect and kinds & {"feedback", "inputs together"}):
             continue
         found = [rest.original(fault) for fault in check(Log(rest.data))]
         faults += found
         rest = whole.without([p for fault in faults for p in fault.places]) if found else rest
-    rough = bool(coarse(log) or slow_states(log))
+    rough = bool(values.coarse(log) or values.slow_states(log))
     if rest is not None and not rough and "inputs together" not in kinds:
         lags = list(late(Log(rest.data)))
         faults += lags or list(ending(Log(rest.data)))
@@ -184,23 +171,82 @@ class Remainder:
                     joined[place.first] = False
                 else:
                     good[place.first : place.last] = False
-            for a, b in _pieces(good, joined):
-                pieces.append(Episode(X=episode.X[a:b], U=episode.U[a : b - 1], W=episode.W[a : b - 1]))
-                origins.append(Place(e, a, b))
+            for a, b in runs(good[:-1] & good[1:] & joined):
+                pieces.append(Episode(X=episode.X[a : b + 1], U=episode.U[a:b], W=episode.W[a:b]))
+                origins.append(Place(e, a, b + 1))
         return Remainder(self.data.with_episodes(pieces), tuple(origins)) if pieces else None
 
     def original(self, fault: LogFault) -> LogFault:
         """Return the fault with its places in the original data."""
-        moved = [
-            Place(self.origins[p.episode].episode, p.first + first, p.last + first, p.jump)
-            for p in fault.places
-            for first in (self.origins[p.episode].first,)
-        ]
+        moved: list[Place] = []
+        for place in fault.places:
+            piece = self.origins[place.episode]
+            moved.append(Place(piece.episode, place.first + piece.first, place.last + piece.first, place.jump))
         return replace(fault, places=tuple(moved))
 
 
-def _pieces(good: np.ndarray, joined: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Yield [first, last) of the stretches of good rows that are joined, of two rows or more."""
-    linked = good[:-1] & good[1:] & joined
-    for a, b in runs(linked):
-        yield int(a), int(b) + 1
+_JITTER = 0.02  # share of dt by which a step may differ, as in load_episodes
+_GAP = 1.5  # a step longer than 1.5 dt is a gap
+_OTHER = 0.1  # share of dt by which the median step of an episode must differ to be another rate
+
+
+def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFault]:
+    """Find the faults that the time stamps of the rows show.
+
+    Raises
+    ------
+    DataError
+        There are not as many time stamps as rows.
+    """
+    if len(times) != len(data):
+        raise DataError(f"times are given for {len(times)} episodes, the data have {len(data)}; pass one array each")
+    steps = [
+        np.diff(checks.vector(own, f"times of episode {e}", len(episode) + 1))
+        for e, (own, episode) in enumerate(zip(times, data, strict=True))
+    ]
+    every = np.concatenate(steps)
+    forward = every[every > 0]
+    if not len(forward):
+        raise DataError("the times never advance; pass the time of each row in seconds")
+    dt = float(np.median(forward))
+    resets = _places(steps, lambda d: d <= 0)
+    if resets:
+        yield LogFault(
+            "clock reset",
+            f"the clock goes back or stands still {len(resets)} times: {listed(resets)}",
+            "cut the episodes there: load_episodes does where it goes back",
+            places=resets,
+        )
+    gaps = _places(steps, lambda d: d > _GAP * dt)
+    other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > _OTHER * dt]
+    if other:
+        shown = ", ".join(f"episode {e} {np.median(steps[e]):.4g} s" for e in other[:3])
+        yield LogFault(
+            "mixed sampling",
+            f"{len(other)} of {len(data)} episodes have another step than {dt:.4g} s: {shown}",
+            f"bring them to one step: load_episodes(…, resample={dt:.4g})",
+            places=tuple(Place(e, 0, len(steps[e]) + 1) for e in other),
+        )
+    gaps = tuple(p for p in gaps if p.episode not in other)
+    if gaps:
+        yield LogFault(
+            "jump",
+            f"rows are missing {len(gaps)} times, by the clock: {listed(gaps)}",
+            "cut the episodes there: load_episodes does",
+            places=gaps,
+        )
+    usual = [d for e, d in enumerate(steps) if e not in other]
+    usual = np.concatenate(usual) if usual else np.zeros(0)
+    usual = usual[(usual > 0) & (usual <= _GAP * dt)]
+    uneven = np.abs(usual - dt) > _JITTER * dt
+    if uneven.any():
+        yield LogFault(
+            "jitter",
+            f"{percent(float(uneven.mean()))} of the steps differ from {dt:.4g} s by more than 2 %, from "
+            f"{usual.min():.4g} to {usual.max():.4g} s",
+            f"interpolate to equal steps: load_episodes(…, resample={dt:.4g})",
+        )
+
+
+def _places(steps: list[Float[np.ndarray, " T"]], found: Callable[[np.ndarray], np.ndarray]) -> tuple[Place, ...]:
+    return tuple(Place(e, k, k + 2, jump=True) for e, d in enumerate(steps) for k in np.flatnonzero(found(d)).tolist())

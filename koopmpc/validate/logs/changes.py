@@ -11,6 +11,7 @@ Rousseeuw & Van Driessen, "Computing LTS regression for large data sets", Data M
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -63,9 +64,10 @@ class OneStepLaw:
     def errors(self, X: Float[np.ndarray, "T1 nx"], U: Float[np.ndarray, "T nu"]) -> Float[np.ndarray, " nx"]:
         """Return log of the root-mean-square error of each state, in nats above that of the consensus."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return self._above(X[1:] - self.step(X[:-1], U))
+            return self.above(X[1:] - self.step(X[:-1], U))
 
-    def _above(self, E: Float[np.ndarray, "T nx"]) -> Float[np.ndarray, " nx"]:
+    def above(self, E: Float[np.ndarray, "T nx"]) -> Float[np.ndarray, " nx"]:
+        """Return the same of these residuals of the next rows."""
         E = np.nan_to_num(E / self.log.size, nan=1e6, posinf=1e6, neginf=-1e6)
         return 0.5 * np.log((E**2).mean(axis=0) + _FLOOR**2) - self.level
 
@@ -185,113 +187,88 @@ def _consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, set[
 
 def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change]:
     data = log.data
+    flipped = "has the other sign"
     for i, name in enumerate(data.states):
-        yield Change("sensor sign", (name,), f"{short(name)} has the other sign", _scaled_state(i, -1.0), chosen=False)
+        yield Change("sensor sign", (name,), f"{short(name)} {flipped}", partial(_scaled_state, i, -1.0), chosen=False)
     for j, name in enumerate(data.inputs):
-        yield Change("input sign", (name,), f"{short(name)} has the other sign", _scaled_input(j, -1.0), chosen=False)
+        yield Change("input sign", (name,), f"{short(name)} {flipped}", partial(_scaled_input, j, -1.0), chosen=False)
     if data.nu > 1:
-        yield Change(
-            "input sign", data.inputs, "every input has the other sign", _scaled_input(slice(None), -1.0), chosen=False
-        )
-    for i, j in combinations(range(data.nx), 2):
-        names = data.states[i], data.states[j]
-        yield Change(
-            "swapped sensors",
-            names,
-            f"{short(names[0])} and {short(names[1])} are swapped",
-            _swapped(i, j, True),
-            chosen=False,
-        )
-    for i, j in combinations(range(data.nu), 2):
-        names = data.inputs[i], data.inputs[j]
-        yield Change(
-            "swapped inputs",
-            names,
-            f"{short(names[0])} and {short(names[1])} are swapped",
-            _swapped(i, j, False),
-            chosen=False,
-        )
+        undone = partial(_scaled_input, slice(None), -1.0)
+        yield Change("input sign", data.inputs, f"every input {flipped}", undone, chosen=False)
+    for kind, names, swapped in (
+        ("swapped sensors", data.states, _swapped_states),
+        ("swapped inputs", data.inputs, _swapped_inputs),
+    ):
+        for i, j in combinations(range(len(names)), 2):
+            says = f"{short(names[i])} and {short(names[j])} are swapped"
+            yield Change(kind, (names[i], names[j]), says, partial(swapped, i, j), chosen=False)
     for said, factor in _FACTORS.items():
         for up, text in ((factor, f"{said} times as large"), (1 / factor, f"{said} times as small")):
             for i, name in enumerate(data.states):
                 charged = max(float(np.log(up)), 0.0)
-                yield Change("unit change", (name,), f"{short(name)} is {text}", _scaled_state(i, 1 / up), charged)
+                yield Change(
+                    "unit change", (name,), f"{short(name)} is {text}", partial(_scaled_state, i, 1 / up), charged
+                )
             for j, name in enumerate(data.inputs):
-                yield Change("unit change", (name,), f"{short(name)} is {text}", _scaled_input(j, 1 / up))
+                yield Change("unit change", (name,), f"{short(name)} is {text}", partial(_scaled_input, j, 1 / up))
     for i, name in enumerate(data.states):
         b = _best_offset(log, law, pairs[:_TRIED], i)
         turns = round(b / (2 * np.pi))
         if i in log.angles and abs(b - 2 * np.pi * turns) < (_TURN if turns else _NOTHING):
             continue
-        yield Change("offset change", (name,), f"{short(name)} is {b:+.3g} off", _moved(i, -b))
+        yield Change("offset change", (name,), f"{short(name)} is {b:+.3g} off", partial(_moved, i, -b))
     for r in (2, 3, 4):  # in r steps a push has moved a speed r times as far, and a position r² times
-        yield Change(
-            "mixed sampling",
-            (),
-            f"rows are {r} times as far apart ({r * data.dt:.3g} s)",
-            _slower(r),
-            2 * float(np.log(r)),
-        )
-        yield Change("mixed sampling", (), f"rows are {r} times as close ({data.dt / r:.3g} s)", _faster(r))
+        apart, close = f"as far apart ({r * data.dt:.3g} s)", f"as close ({data.dt / r:.3g} s)"
+        charged = 2 * float(np.log(r))
+        yield Change("mixed sampling", (), f"rows are {r} times {apart}", partial(_slower, r), charged)
+        yield Change("mixed sampling", (), f"rows are {r} times {close}", partial(_faster, r))
 
 
-def _scaled_state(i: int, factor: float) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-        X = X.copy()
-        X[:, i] *= factor
-        found = law.errors(X, U)
-        found[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is scaled down has small errors in any case
-        return found
-
-    return errors
+def _scaled_state(i: int, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    X = X.copy()
+    X[:, i] *= factor
+    found = law.errors(X, U)
+    found[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is scaled down has small errors in any case
+    return found
 
 
-def _scaled_input(j: int | slice, factor: float) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-        U = U.copy()
-        U[:, j] *= factor
-        return law.errors(X, U)
-
-    return errors
+def _scaled_input(j: int | slice, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    U = U.copy()
+    U[:, j] *= factor
+    return law.errors(X, U)
 
 
-def _swapped(i: int, j: int, states: bool) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-        changed = (X if states else U).copy()
-        changed[:, [i, j]] = changed[:, [j, i]]
-        return law.errors(changed, U) if states else law.errors(X, changed)
-
-    return errors
+def _swapped_states(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    X = X.copy()
+    X[:, [i, j]] = X[:, [j, i]]
+    return law.errors(X, U)
 
 
-def _moved(i: int, by: float) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-        X = X.copy()
-        X[:, i] += by
-        return law.errors(X, U)
-
-    return errors
+def _swapped_inputs(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    U = U.copy()
+    U[:, [i, j]] = U[:, [j, i]]
+    return law.errors(X, U)
 
 
-def _slower(r: int) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-        with np.errstate(over="ignore", invalid="ignore"):
-            ahead = X[:-1]
-            for _ in range(r):
-                ahead = law.step(ahead, U)
-            return law._above(X[1:] - ahead)
-
-    return errors
+def _moved(i: int, by: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    X = X.copy()
+    X[:, i] += by
+    return law.errors(X, U)
 
 
-def _faster(r: int) -> Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]:
-    def errors(law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
-        T = len(U) - r + 1
-        mean = np.mean([U[s : s + T] for s in range(r)], axis=0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return law._above(X[r:] - law.step(X[:T], mean))
+def _slower(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):
+        ahead = X[:-1]
+        for _ in range(r):
+            ahead = law.step(ahead, U)
+        return law.above(X[1:] - ahead)
 
-    return errors
+
+def _faster(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+    T = len(U) - r + 1
+    mean = np.mean([U[s : s + T] for s in range(r)], axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return law.above(X[r:] - law.step(X[:T], mean))
 
 
 def _best_offset(log: Log, law: OneStepLaw, pairs: list[Pair], i: int) -> float:
@@ -305,7 +282,7 @@ def _best_offset(log: Log, law: OneStepLaw, pairs: list[Pair], i: int) -> float:
         X_next[:, i] -= b
         with np.errstate(over="ignore", invalid="ignore"):
             missed = np.split(X_next - law.step(X, inputs), ends)
-            return float(np.median([law._above(part).mean() for part in missed]))
+            return float(np.median([law.above(part).mean() for part in missed]))
 
     width = 4.0 * float(log.size[i])
     low, high = -width, width

@@ -1,6 +1,5 @@
 """Logs as the audit reads them: columns side by side, faults with their places, and one-step regressions."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import combinations_with_replacement
@@ -78,6 +77,16 @@ class Log:
         return np.concatenate([e.X for e in self.data])
 
     @cached_property
+    def U(self) -> Float[np.ndarray, "M nu"]:
+        """All inputs, one episode below the other."""
+        return np.concatenate([e.U for e in self.data])
+
+    @cached_property
+    def changes(self) -> Float[np.ndarray, "M nx"]:
+        """Change of each state from row to row, one episode below the other."""
+        return np.concatenate([np.diff(e.X, axis=0) for e in self.data])
+
+    @cached_property
     def center(self) -> Float[np.ndarray, " nx"]:
         """Median of each state, or its mean."""
         return np.median(self.X, axis=0)
@@ -93,32 +102,23 @@ class Log:
     @cached_property
     def input_center(self) -> Float[np.ndarray, " nu"]:
         """Middle of the range of each input."""
-        U = np.concatenate([e.U for e in self.data])
-        return (U.min(axis=0) + U.max(axis=0)) / 2
+        return (self.U.min(axis=0) + self.U.max(axis=0)) / 2
 
     @cached_property
     def input_size(self) -> Float[np.ndarray, " nu"]:
         """Half the range of each input; 1 where it does not move."""
-        U = np.concatenate([e.U for e in self.data])
-        half = np.subtract(U.max(axis=0), U.min(axis=0), dtype=np.float64) / 2
+        half = np.subtract(self.U.max(axis=0), self.U.min(axis=0), dtype=np.float64) / 2
         return np.where(half > 0, half, 1.0)
 
     @cached_property
     def fine(self) -> Float[np.ndarray, " nx"]:
         """2 % of the root mean square change of each state from row to row, in its size."""
-        changes = np.concatenate([np.diff(e.X, axis=0) for e in self.data]) / self.size
-        return np.maximum(_FINE * np.sqrt((changes**2).mean(axis=0)), _SMALLEST)
+        return np.maximum(_FINE * np.sqrt(((self.changes / self.size) ** 2).mean(axis=0)), _SMALLEST)
 
     @cached_property
     def steps(self) -> int:
         """Number of steps of all episodes."""
         return sum(len(e) for e in self.data)
-
-    def columns(self) -> Iterator[tuple[int, int, Float[np.ndarray, " T"]]]:
-        """Yield the index of each episode and state, and the state's values."""
-        for e, episode in enumerate(self.data):
-            for i in range(self.data.nx):
-                yield e, i, episode.X[:, i]
 
     def scaled(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> tuple[np.ndarray, np.ndarray]:
         """Return states and inputs around 0 with sizes around 1."""
@@ -144,7 +144,7 @@ class Log:
     def residuals(self) -> tuple[Float[np.ndarray, "T nx"], ...]:
         """One-step residuals of each episode in sizes of the states, of a fit without the worst 3 % of the rows."""
         P = np.concatenate([self.stacked(e.X[:-1], e.U) for e in self.data])
-        Y = np.concatenate([np.diff(e.X, axis=0) for e in self.data]) / self.size
+        Y = self.changes / self.size
         E = fitted(P, Y)
         for _ in range(2):
             size = np.abs(E) / np.maximum(np.quantile(np.abs(E), 0.9, axis=0), _SMALLEST)
@@ -203,16 +203,16 @@ def information(E: Float[np.ndarray, "M n"], fine: Float[np.ndarray, " n"]) -> F
     return np.array([-0.5 * np.linalg.slogdet(S + np.diag(floor))[1] for floor in floors])
 
 
-def runs(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "r 2"]:
+def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
     """Return [first, last) of each stretch of True."""
     edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
-    return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
+    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
 
-def listed(places: tuple[Place, ...], most: int = 3) -> str:
-    """Return the first places in words, and how many more there are."""
-    shown = "; ".join(str(place) for place in places[:most])
-    return shown + (f"; and {len(places) - most} more" if len(places) > most else "")
+def listed(places: tuple[Place, ...]) -> str:
+    """Return the first three places in words, and how many more there are."""
+    shown = "; ".join(str(place) for place in places[:3])
+    return shown + (f"; and {len(places) - 3} more" if len(places) > 3 else "")
 
 
 def episodes_of_places(places: tuple[Place, ...]) -> str:

@@ -1,4 +1,7 @@
-"""Faults that single values show: the noise of a live sensor never repeats a number, a faulty one does."""
+"""Faults that the rows themselves show: numbers repeat or stand still where a live signal moves, or leave its path.
+
+The noise of a live sensor never repeats a number, a faulty one does.
+"""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -6,8 +9,10 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import short
 from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, episodes_of_places, listed, runs
+from koopmpc.validate.sufficiency import persistency
 from koopmpc.validate.text import percent
 
 _GRID = 0.95  # share of a sensor's different values that stand on a grid
@@ -54,7 +59,7 @@ def repeated_episodes(log: Log) -> Iterator[LogFault]:
         again = np.array([key in seen and seen[key][0] != e for key in keys])
         for a, b in runs(again):
             if b - a >= _OVERLAP and (np.ptp(rows[a:b], axis=0) > 0).any():
-                places.append(Place(e, int(a), int(b) + 1))
+                places.append(Place(e, a, b + 1))
                 first_of.add(seen[keys[a]][0])
         for k, key in enumerate(keys):
             seen.setdefault(key, (e, k))
@@ -86,12 +91,11 @@ def grid(column: Float[np.ndarray, " M"]) -> float:
 def quantised(log: Log) -> Iterator[LogFault]:
     """Find sensors whose resolution is coarse against their usual step."""
     for i, step in coarse(log).items():
-        name = short(log.data.states[i])
-        changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
+        name, usual = short(log.data.states[i]), np.median(np.abs(log.changes[:, i]))
         yield LogFault(
             "quantised",
             f"{name} moves in steps of {step:.3g}, and half of its changes from row to row are below "
-            f"{np.median(changes):.3g}: its resolution hides what a model is to learn",
+            f"{usual:.3g}: its resolution hides what a model is to learn",
             "log it with more digits, or sample more slowly; else let the model see more rows: embedding=km.Delay(2)",
             (log.data.states[i],),
         )
@@ -103,7 +107,7 @@ def coarse(log: Log) -> dict[int, float]:
     for i in range(log.data.nx):
         step = grid(log.X[:, i])
         if step > 0:
-            changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
+            changes = np.abs(log.changes[:, i])
             if step > _COARSE * float(np.quantile(changes, 0.75)) or np.mean(changes == 0) > 0.2:
                 found[i] = step
     return found
@@ -112,7 +116,7 @@ def coarse(log: Log) -> dict[int, float]:
 def slow(log: Log) -> Iterator[LogFault]:
     """Find sensors that show a new value every second row, or less often."""
     for i in slow_states(log):
-        zero = np.concatenate([np.diff(e.X[:, i]) == 0 for e in log.data])
+        zero = log.changes[:, i] == 0
         every = round(1 / max(1 - float(zero.mean()), 1e-3))
         name = short(log.data.states[i])
         yield LogFault(
@@ -145,19 +149,19 @@ def stuck(log: Log) -> Iterator[LogFault]:
     places: dict[int, list[Place]] = {}
     at_end: dict[int, list[Place]] = {}
     low, high = log.X.min(axis=0), log.X.max(axis=0)
-    for e, i, column in log.columns():
-        if i in lazy or low[i] == high[i]:
-            continue
-        others = np.delete(log.data[e].X, i, axis=1) / np.delete(log.size, i)
-        others = np.hstack([others, np.vstack([log.data[e].U, log.data[e].U[-1:]]) / log.input_size])
-        usual = _longest_usual(log, i) if i in rough else 0
-        for a, b in runs(np.diff(column) == 0):
-            if b - a < max(_LONG, 6 * usual) or not others.shape[1]:
-                continue
-            moved = np.mean(np.diff(others[a : b + 1], axis=0) != 0, axis=0) > 0.5
-            if np.ptp(others[a : b + 1], axis=0)[moved].max(initial=0.0) > 0.05:
-                where = at_end if column[a] in (low[i], high[i]) else places
-                where.setdefault(i, []).append(Place(e, int(a), int(b) + 1))
+    moving = [i for i in range(log.data.nx) if i not in lazy and low[i] != high[i]]
+    longest = {i: max(_LONG, 6 * _longest_usual(log, i)) if i in rough else _LONG for i in moving}
+    for e, episode in enumerate(log.data):
+        for i in moving:
+            others = np.delete(episode.X, i, axis=1) / np.delete(log.size, i)
+            others = np.hstack([others, np.vstack([episode.U, episode.U[-1:]]) / log.input_size])
+            for a, b in runs(np.diff(episode.X[:, i]) == 0):
+                if b - a < longest[i] or not others.shape[1]:
+                    continue
+                moved = np.mean(np.diff(others[a : b + 1], axis=0) != 0, axis=0) > 0.5
+                if np.ptp(others[a : b + 1], axis=0)[moved].max(initial=0.0) > 0.05:
+                    where = at_end if episode.X[a, i] in (low[i], high[i]) else places
+                    where.setdefault(i, []).append(Place(e, a, b + 1))
     for i, found in at_end.items():
         values = {float(log.data[p.episode].X[p.first, i]) for p in found}
         alone = len(found) == 1 or any(p.last - p.first == len(log.data[p.episode].X) for p in found)
@@ -182,23 +186,24 @@ def _longest_usual(log: Log, i: int) -> int:
 def limits(log: Log) -> dict[int, tuple[float, ...]]:
     """Return for each state the extreme values at which its sensor stays, though the others tell that it moves on."""
     found: dict[int, tuple[float, ...]] = {}
+    known = {*coarse(log), *slow_states(log)}  # their numbers repeat in any case
     for i in range(log.data.nx):
         low, high = float(log.X[:, i].min()), float(log.X[:, i].max())
-        if low == high:
+        if low == high or i in known:
             continue
         for end in (low, high):
             stays = [b - a for e in log.data for a, b in runs(e.X[:, i] == end)]
             often = sum(stays) >= max(_AT_LIMIT, 0.002 * len(log.X)) and len(stays) > 1
             if often and np.mean(np.array(stays) > 1) > 0.2 and not _at_rest(log, i, end):
                 found[i] = (*found.get(i, ()), end)
-    return {i: ends for i, ends in found.items() if i not in coarse(log) and i not in slow_states(log)}
+    return found
 
 
 def _at_rest(log: Log, i: int, end: float) -> bool:
     """Return True where the one-step law has this state stand still at this value: the plant rests there."""
     stays = [(e.X[1:, i] == end) & (e.X[:-1, i] == end) for e in log.data]
     missed = np.concatenate([E[own, i] for E, own in zip(log.residuals, stays, strict=True)])
-    changes = np.concatenate([np.diff(e.X[:, i]) for e in log.data]) / log.size[i]
+    changes = log.changes[:, i] / log.size[i]
     return bool((missed**2).sum() < _RESTS**2 * len(missed) * (changes**2).mean())
 
 
@@ -206,10 +211,9 @@ def saturated(log: Log) -> Iterator[LogFault]:
     """Find sensors that stay at the same extreme value again and again."""
     for i, ends in limits(log).items():
         places = tuple(
-            Place(e, int(a), int(b))
-            for e, j, column in log.columns()
-            if j == i
-            for a, b in runs(np.isin(column, ends))
+            Place(e, a, b)
+            for e, episode in enumerate(log.data)
+            for a, b in runs(np.isin(episode.X[:, i], ends))
             if b - a > 1
         )
         share = np.mean(np.isin(log.X[:, i], ends))
@@ -226,7 +230,8 @@ def saturated(log: Log) -> Iterator[LogFault]:
 
 def held(log: Log) -> Iterator[LogFault]:
     """Find rows in which no sensor moves though the plant did: held samples, or rows written twice."""
-    whole = [i for i in range(log.data.nx) if i not in coarse(log) and np.ptp(log.X[:, i]) > 0]
+    rough = coarse(log)
+    whole = [i for i in range(log.data.nx) if i not in rough and np.ptp(log.X[:, i]) > 0]
     if not whole or len(slow_states(log)) == len(whole):
         return
     places: list[Place] = []
@@ -240,17 +245,17 @@ def held(log: Log) -> Iterator[LogFault]:
                 continue
             contradiction = np.array_equal(U[b - 1], U[b]) or (np.ptp(U[a:b], axis=0) > 0).any()
             if contradiction or not episode.U.shape[1] or b - a == 1:
-                places.append(Place(e, int(a) + 1, int(b) + 1))
+                places.append(Place(e, a + 1, b + 1))
                 around = [abs(X[a, smooth] - X[a - 1, smooth])]
                 if b + 2 < len(X):
                     around.append(abs(X[b + 2, smooth] - X[b + 1, smooth]))
                 step = float(np.mean(around))
                 if step > 0:
                     travels.append(abs(X[b + 1, smooth] - X[b, smooth]) / step / (b - a + 1))
-    if not places or (len(places) < 3 and max(p.last - p.first for p in places) < 3):
+    lengths = [p.last - p.first for p in places]
+    if not places or (len(places) < 3 and max(lengths) < 3):
         return
-    found, rows = tuple(places), sum(p.last - p.first for p in places)
-    longest = max(p.last - p.first for p in places)
+    found, rows, longest = tuple(places), sum(lengths), max(lengths)
     if longest > 2 or not travels or float(np.median(travels)) > 0.72:
         yield LogFault(
             "held samples",
@@ -280,10 +285,11 @@ def _smoothest(log: Log, among: list[int]) -> int:
 
 def outliers(log: Log) -> Iterator[LogFault]:
     """Find single rows far off both neighbours: the same number each time, a mark of loss, or spikes."""
+    rough = coarse(log)
     for i in range(log.data.nx):
         name = short(log.data.states[i])
-        changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
-        if i in coarse(log) and np.mean(changes == 0) > 0.9:
+        changes = np.abs(log.changes[:, i])
+        if i in rough and np.mean(changes == 0) > 0.9:
             continue
         marks = _marked(log, i, changes)
         if marks is not None:
@@ -318,7 +324,7 @@ def _marked(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, 
             for a, b in runs(column == value):
                 before = column[a - 1] if a else column[min(b, len(column) - 1)]
                 after = column[b] if b < len(column) else column[a - 1]
-                places.append(Place(e, int(a), int(b)))
+                places.append(Place(e, a, b))
                 sizes.append(min(abs(value - before), abs(value - after)))
         rows = sum(p.last - p.first for p in places)
         if len(places) >= 3 and rows < 0.2 * len(log.X) and np.median(sizes) > 2 * _FAR * usual:
@@ -357,7 +363,7 @@ def turns(log: Log) -> dict[int, float]:
     """Return the whole turn, 2π or 360, of each angle that jumps by it."""
     found: dict[int, float] = {}
     for i in range(log.data.nx):
-        changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
+        changes = np.abs(log.changes[:, i])
         for turn in (2 * np.pi, 360.0):
             jumps = np.abs(changes - turn) < 0.25 * turn
             small = np.median(changes) < 0.15 * turn and np.mean(changes[~jumps] > 0.5 * turn) < 0.001
@@ -369,7 +375,7 @@ def turns(log: Log) -> dict[int, float]:
 def wrapped(log: Log) -> Iterator[LogFault]:
     """Find angles that jump by a whole turn."""
     for i, turn in turns(log).items():
-        changes = np.abs(np.concatenate([np.diff(e.X[:, i]) for e in log.data]))
+        changes = np.abs(log.changes[:, i])
         count = int((np.abs(changes - turn) < 0.25 * turn).sum())
         yield LogFault(
             "wrapped angle",
@@ -377,3 +383,69 @@ def wrapped(log: Log) -> Iterator[LogFault]:
             f"unwrap it along each episode (koopmpc fit does), or lift it by km.Fourier(2, states=[{i}]) alone",
             (log.data.states[i],),
         )
+
+
+_JUMP = 1.5  # times the largest usual change from row to row
+_OFF = 10.0  # times the largest usual residual
+
+
+def jumps(log: Log) -> Iterator[LogFault]:
+    """Find places where the states jump, for rows are missing or an episode holds two runs."""
+    E = np.concatenate(log.residuals)
+    usual = np.maximum(np.quantile(np.abs(E), 0.97, axis=0), 1e-9)
+    widest = np.quantile(np.abs(log.changes), 0.99, axis=0)
+    places: list[Place] = []
+    for e, episode in enumerate(log.data):
+        d = np.diff(episode.X, axis=0)
+        off = np.where(log.leverage[e] < ALONE, (np.abs(log.residuals[e]) / usual).max(axis=1), 0.0)
+        wide = (np.abs(d) > _JUMP * widest) & (widest > 0)
+        for k in 1 + np.flatnonzero(((off > _OFF) & wide.any(axis=1))[1:]):
+            if not (np.abs(log.residuals[e][k]) * log.size > 0.5 * np.abs(d[k]))[wide[k]].any():
+                continue
+            i = int(np.argmax(np.abs(d[k]) / np.where(widest > 0, widest, np.inf)))
+            back = k + 1 < len(d) and d[k + 1, i] * d[k, i] < 0 and abs(d[k + 1, i]) > 0.5 * abs(d[k, i])
+            since = d[k - 1, i] * d[k, i] < 0 and abs(d[k - 1, i]) > 0.5 * abs(d[k, i])
+            alone = (k + 1 >= len(d) or off[k + 1] < 0.5 * off[k]) and off[k - 1] < 0.5 * off[k]
+            if not back and not since and alone and log.leverage[e][k - 1] < ALONE:
+                places.append(Place(e, int(k), int(k) + 2, jump=True))
+    if places and len(places) < 0.02 * log.steps:
+        yield LogFault(
+            "jump",
+            f"the states go on from elsewhere {len(places)} times: {listed(tuple(places))}",
+            "rows are missing there, or a new run begins: cut the episode in two",
+            places=tuple(places),
+        )
+
+
+def constant(log: Log) -> Iterator[LogFault]:
+    """Find inputs that never move."""
+    for j in np.flatnonzero(np.ptp(log.U, axis=0) == 0):
+        name = short(log.data.inputs[j])
+        yield LogFault(
+            "constant input",
+            f"{name} is {log.U[0, j]:.4g} throughout: what it does cannot be learned",
+            f"excite {name}, with km.Noise or km.PRBS, or leave it out",
+            (log.data.inputs[j],),
+        )
+
+
+def excitation(log: Log) -> Iterator[LogFault]:
+    """Find inputs that excite to a lower order than the plant has states."""
+    order = log.data.nx + 1
+    for j in np.flatnonzero(np.ptp(log.U, axis=0) > 0):
+        long = [e for e in log.data if len(e) > order + 1]
+        if not long:
+            continue
+        # differences, for a constant level raises the order by one and excites nothing
+        alone = Episodes([Episode(X=e.X[1:], U=np.diff(e.U[:, [j]], axis=0)) for e in long], log.data.dt)
+        found = persistency(alone, order)
+        good = int((found.conditions < 1e7).sum())
+        if good < min(order, 3):
+            name = short(log.data.inputs[j])
+            yield LogFault(
+                "little excitation",
+                f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or steps "
+                "that hardly ever come",
+                f"excite {name} with km.Noise, km.PRBS or km.Multisine",
+                (log.data.inputs[j],),
+            )

@@ -1,4 +1,4 @@
-"""Coverage: the part of the state and input space that the data visited."""
+"""Whether data suffice for a fit: the space that they visited, the excitation of the inputs, and feedback in them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,11 +10,23 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.moments.moments import Moments, both_sides
+from koopmpc.identify.solve import norms, orthonormal, unit
+from koopmpc.lifting.base import Lifting
+from koopmpc.validate.residuals import moments_of
+from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
+_ROWS = 4096  # samples that are binned at once
+_BINS = 10  # bins of a coordinate, at most
+_IN_CELL = 10  # samples that a cell of a pair holds on average, at least
+_PAIRED = 40  # coordinates up to which pairs are looked at
+_WINDOWS = 4096  # windows of the inputs that are held at once
 _SAID = 0.05  # share of the pair's box from which an empty rectangle is worth a sentence
 
 
@@ -42,53 +54,6 @@ class Region(Value):
         ends = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
         parts = [quantity(name, _interval(low, high)) for name, low, high in ends if np.isfinite([low, high]).any()]
         return f"{' with '.join(parts)} was never visited"
-
-
-def empty_regions(
-    names: tuple[str, ...],
-    low: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
-    held: Bool[np.ndarray, "np bins bins"],
-) -> tuple[Region, ...]:
-    """Return the largest empty rectangle of each pair, the largest first; those below 5 % of the box are left out."""
-    if not held.size:
-        return ()
-    bins = held.shape[1]
-    first, last = np.triu_indices(bins)
-    last = last + 1
-    total = np.zeros((len(held), bins + 1, bins + 1), dtype=np.int64)
-    total[:, 1:, 1:] = held.cumsum(axis=1).cumsum(axis=2)
-    strips = total[:, last] - total[:, first]  # samples in each interval of the first coordinate
-    area = np.outer(last - first, last - first)
-    box = list(zip(low.tolist(), high.tolist(), strict=True))
-    found: list[Region] = []
-    for strip, (i, j) in zip(strips, combinations(range(len(names)), 2), strict=True):
-        free = np.where(strip[:, last] == strip[:, first], area, 0)
-        a, b = np.unravel_index(int(free.argmax()), free.shape)
-        share = float(free[a, b]) / bins**2
-        if share < _SAID or high[i] == low[i] or high[j] == low[j]:
-            continue
-        edges = np.array([_edges(int(first[k]), int(last[k]), bins, *box[c]) for k, c in ((a, i), (b, j))])
-        found.append(Region((names[i], names[j]), edges[:, 0].copy(), edges[:, 1].copy(), share))
-    found.sort(key=lambda region: -region.share)
-    return tuple({str(region): region for region in found}.values())
-
-
-def _edges(first: int, last: int, bins: int, low: float, high: float) -> tuple[float, float]:
-    width = (high - low) / bins
-    return (-np.inf if first == 0 else low + first * width), (np.inf if last == bins else low + last * width)
-
-
-def _interval(low: float, high: float) -> str:
-    if np.isinf(high):
-        return f"> {low:.3g}"
-    return f"< {high:.3g}" if np.isinf(low) else f"in [{low:.3g}, {high:.3g}]"
-
-
-_ROWS = 4096  # samples that are binned at once
-_BINS = 10  # bins of a coordinate, at most
-_IN_CELL = 10  # samples that a cell of a pair holds on average, at least
-_PAIRED = 40  # coordinates up to which pairs are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +102,27 @@ class Coverage(Value):
     @cached_property
     def empty(self) -> tuple[Region, ...]:
         """The largest empty rectangle of each pair, those above 5 % of the pair's box, the largest first."""
-        return empty_regions(self.names, self.low, self.high, self.pairs > 0)
+        if not self.pairs.size:
+            return ()
+        names, low, high, bins = self.names, self.low, self.high, self.bins
+        first, last = np.triu_indices(bins)
+        last = last + 1
+        total = np.zeros((len(self.pairs), bins + 1, bins + 1), dtype=np.int64)
+        total[:, 1:, 1:] = self._paired.cumsum(axis=1).cumsum(axis=2)
+        strips = total[:, last] - total[:, first]  # cells with samples in each interval of the first coordinate
+        area = np.outer(last - first, last - first)
+        box = list(zip(low.tolist(), high.tolist(), strict=True))
+        found: list[Region] = []
+        for strip, (i, j) in zip(strips, combinations(range(len(names)), 2), strict=True):
+            free = np.where(strip[:, last] == strip[:, first], area, 0)
+            a, b = np.unravel_index(int(free.argmax()), free.shape)
+            share = float(free[a, b]) / bins**2
+            if share < _SAID or high[i] == low[i] or high[j] == low[j]:
+                continue
+            edges = np.array([_edges(int(first[k]), int(last[k]), bins, *box[c]) for k, c in ((a, i), (b, j))])
+            found.append(Region((names[i], names[j]), edges[:, 0].copy(), edges[:, 1].copy(), share))
+        found.sort(key=lambda region: -region.share)
+        return tuple({str(region): region for region in found}.values())
 
     def share(self, x: ArrayLike, u: ArrayLike | None = None) -> Float[np.ndarray, "..."]:
         """Return the share, 0 … 1, of the coordinates and pairs of (x, u) that lie in cells that the data visited.
@@ -162,7 +147,8 @@ class Coverage(Value):
                 f"{len(self.names) - self.nx} inputs; pass (nx,) and (nu,), or rows of both"
             )
         V = np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
-        cells, inside = self._cells(V)
+        cells = _cells(V, self.low[:wanted], self.high[:wanted], self.bins)
+        inside = (self.seen_low[:wanted] <= V) & (self.seen_high[:wanted] >= V)
         hits = [self._held[np.arange(wanted), cells] & inside]
         if len(self.pairs):
             first, second, order = self._columns[wanted]
@@ -178,12 +164,6 @@ class Coverage(Value):
         """
         return np.asarray(self.share(x, u) == 1.0)
 
-    def _cells(self, V: Float[np.ndarray, "M n"]) -> tuple[np.ndarray, np.ndarray]:
-        n = V.shape[1]
-        return _cells(V, self.low[:n], self.high[:n], self.bins), np.logical_and(
-            self.seen_low[:n] <= V, self.seen_high[:n] >= V
-        )
-
     @cached_property
     def _held(self) -> np.ndarray:
         return self.counts > 0
@@ -198,6 +178,17 @@ class Coverage(Value):
         every = np.array(list(combinations(range(len(self.names)), 2)), dtype=np.intp).reshape(-1, 2)
         places = {wanted: np.flatnonzero(every[:, 1] < wanted) for wanted in (self.nx, len(self.names))}
         return {wanted: (every[order, 0], every[order, 1], order) for wanted, order in places.items()}
+
+
+def _edges(first: int, last: int, bins: int, low: float, high: float) -> tuple[float, float]:
+    width = (high - low) / bins
+    return (-np.inf if first == 0 else low + first * width), (np.inf if last == bins else low + last * width)
+
+
+def _interval(low: float, high: float) -> str:
+    if np.isinf(high):
+        return f"> {low:.3g}"
+    return f"< {high:.3g}" if np.isinf(low) else f"in [{low:.3g}, {high:.3g}]"
 
 
 def coverage(
@@ -271,3 +262,128 @@ def _cells(
     width = np.where(high > low, high - low, 1.0)
     place = (np.clip(np.nan_to_num(rows), low, high) - low) / width
     return np.minimum((place * bins).astype(np.intp), bins - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Persistency(Value):
+    """The order to which the inputs are persistently exciting.
+
+    Attributes
+    ----------
+    order
+        The largest L ≤ `asked` for which the windows (u_k, …, u_{k+L−1}) of all episodes span R^(nu L).
+    asked
+        The largest order that was looked at.
+    conditions
+        (asked,) condition number of the windows of each order 1 … asked, on inputs of unit norm; infinite beyond
+        `order`.
+    windows
+        Number of windows of `asked` steps.
+    """
+
+    order: int
+    asked: int
+    conditions: Float[np.ndarray, " asked"]
+    windows: int
+
+
+def persistency(episodes: Episodes, order: int) -> Persistency:
+    """Return up to which order L ≤ `order` the block-Hankel matrix of the inputs has full row rank nu L.
+
+    Inputs of order n + 1 make [x; u] of a controllable linear system of n states full rank, so that its A and B
+    can be found. A sum of m sines is of order 2m, a constant of order 1, white noise of any order that the data
+    are long enough for. Windows never span two episodes.
+
+    Parameters
+    ----------
+    episodes
+        Episodes with inputs.
+    order
+        The largest L to look at.
+
+    Raises
+    ------
+    DataError
+        There are no inputs, or no episode is as long as `order`.
+
+    References
+    ----------
+    Willems et al., "A note on persistency of excitation", Syst. Control Lett. 54, 2005; for several episodes van
+    Waarde et al., "Willems' fundamental lemma for state-space systems and its extension to multiple datasets",
+    IEEE Control Syst. Lett. 4, 2020.
+    """
+    order = checks.count(order, "order")
+    if episodes.nu == 0:
+        raise DataError("the episodes have no inputs, so there is no excitation to look at")
+    longest = max(len(episode) for episode in episodes)
+    if longest < order:
+        raise DataError(f"order is {order}, the longest episode has {longest} steps; pass {longest} or less")
+    width = episodes.nu * order
+    R, windows = np.zeros((0, width)), 0
+    waiting: list[np.ndarray] = []
+    held = 0
+    for episode in episodes:
+        for first in range(0, len(episode) - order + 1, _WINDOWS):
+            piece = episode.U[first : first + _WINDOWS + order - 1]
+            table = np.lib.stride_tricks.sliding_window_view(piece, order, axis=0)
+            waiting.append(table.transpose(0, 2, 1).reshape(len(table), width))
+            held += len(table)
+            if held >= _WINDOWS:
+                R, windows = np.linalg.qr(np.concatenate([R, *waiting]), mode="r"), windows + held
+                waiting, held = [], 0
+    R, windows = np.linalg.qr(np.concatenate([R, *waiting]), mode="r"), windows + held
+    R = unit(np.asarray(R, dtype=np.float64))
+    cut = np.finfo(float).eps * max(windows, width)
+    conditions = np.full(order, np.inf)
+    for L in range(1, order + 1):
+        s = np.linalg.svd(R[:, : episodes.nu * L], compute_uv=False)
+        if len(s) < episodes.nu * L or s[-1] <= cut * s[0]:
+            break
+        conditions[L - 1] = s[0] / s[-1]
+    return Persistency(int(np.isfinite(conditions).sum()), order, conditions, windows)
+
+
+def feedback_share(
+    episodes: Episodes | Source, lifting: Lifting | AnyPredictor, *, embedding: Delay | None = None
+) -> Float[np.ndarray, " nu"]:
+    """Return for each input the share R² of its energy that is a linear function of ψ(x), 0 … 1.
+
+    At 1 the input was a feedback u = K ψ(x), and A and B cannot be told apart. Where ψ holds a Constant, the energy
+    is that around the mean.
+
+    Parameters
+    ----------
+    episodes
+        Episodes with inputs, or a source of them; measured disturbances count as inputs behind u.
+    lifting
+        ψ; or a predictor, for its lifting and embedding.
+    embedding
+        What a lifting of the state and its past acts on.
+
+    Raises
+    ------
+    ShapeError, DataError
+        The episodes and the predictor differ in states, inputs, disturbances or dt.
+    """
+    return explained_inputs(moments_of(episodes, lifting, embedding=embedding))
+
+
+def explained_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
+    """Return the shares of `feedback_share` from the moments, in the order of their inputs."""
+    P, _, cut = both_sides(total)
+    nz, nu = total.nz, len(total.inputs)
+    one = total.lifting.constant_index
+    constant = [] if one is None else [one]
+    U = P[:, nz : nz + nu]
+    around = _outside(U, P[:, constant], cut)
+    left = _outside(U, P[:, :nz], cut)
+    varies = around > cut * norms(U)
+    return 1.0 - np.divide(left**2, around**2, out=np.zeros(nu), where=varies)
+
+
+def _outside(U: Float[np.ndarray, "m nu"], columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, " nu"]:
+    """Return the norm of what each column of U has outside the span of `columns`."""
+    if columns.shape[1] == 0:
+        return norms(U)
+    basis = orthonormal(columns, cut)
+    return norms(U - basis @ (basis.T @ U))
