@@ -6,8 +6,7 @@ from jaxtyping import Float
 from scipy.linalg import solve
 
 from koopmpc.codegen.linear import daqp_defaults, memory_shares, solver_settings
-from koopmpc.codegen.tables import CFunction, Tables, add_observer, amplified, columns, model_tables
-from koopmpc.codegen.text import traced
+from koopmpc.codegen.tables import CFunction, Tables, add_observer, amplified, columns, model_tables, traced
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED, BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.codegen.text import Graph, traced
 from koopmpc.control.limits import Interval
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
@@ -18,11 +17,13 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import DisturbanceObserver
 from koopmpc.estimate.kalman_filter import KalmanFilter
 from koopmpc.estimate.observer import Measured
+from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 CArrays = dict[str, np.ndarray]
 Exportable = LQR | KoopmanMPC | BilinearMPC
+Precision = Literal["double", "float"]
 
 
 class CFunction(NamedTuple):
@@ -64,8 +65,14 @@ class Tables:
         return bool(self.sizes["IS_STAGED"])
 
 
-def refusal(controller: object) -> DataError | None:
-    """Return why a controller cannot be written in C, which part of it is the reason, and what would do; else None."""
+def exportable(controller: object) -> Exportable:
+    """Return a controller that can be written in C.
+
+    Raises
+    ------
+    DataError
+        It cannot; the message says which part of it is the reason, and what would do.
+    """
     if not isinstance(controller, Exportable):
         name = type(controller).__name__
         why = {
@@ -74,27 +81,41 @@ def refusal(controller: object) -> DataError | None:
             "Guarded": "it holds two controllers; export each of them",
         }.get(name, "it is no controller that koopmpc can write in C")
         would = "a BilinearMPC of the same model" if name == "NonlinearMPC" else "a BilinearMPC, a LinearMPC or an LQR"
-        return DataError(f"a {name} cannot be exported: {why}; export a KoopmanMPC, {would}")
+        raise DataError(f"a {name} cannot be exported: {why}; export a KoopmanMPC, {would}")
     if isinstance(controller, LQR):
-        return None
+        return controller
     if controller._time_limit is not None:
         bound = "" if isinstance(controller, BilinearMPC) else ', settings={"iter_limit": 100}'
-        return DataError(
+        raise DataError(
             "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
             + ("sqp_iterations=1" if not bound else f'solver="daqp"{bound}')
         )
     if controller.watch is not None:
-        return DataError(
+        raise DataError(
             "the controller has a monitor, whose data are not written in C; export the controller without monitor=, "
             "and have a Python loop or a log ask the monitor"
         )
     observer = controller._initial.observer
     if type(observer) not in (Measured, DisturbanceObserver, KalmanFilter):
-        return DataError(
+        raise DataError(
             f"the estimator {type(controller._estimator).__name__} cannot be written in C; "
             "use LiftedDisturbance or LiftedKalman"
         )
-    return None
+    return controller
+
+
+def traced(function: ca.Function, what: str) -> Graph:
+    """Return the graph of a function with one result.
+
+    Raises
+    ------
+    DataError
+        It holds what cannot be written in C; the message says what it is and what would do.
+    """
+    try:
+        return Graph.trace(function)
+    except DataError as error:
+        raise DataError(f"{what} cannot be written in C: {error}") from error
 
 
 def columns(matrix: np.ndarray) -> np.ndarray:
