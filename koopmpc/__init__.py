@@ -52,7 +52,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.data.excitation import Feedback as Feedback
     from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
-    from koopmpc.data.files.storage import load_episodes as load_episodes
+    from koopmpc.data.storage import load_episodes as load_episodes
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance

@@ -6,8 +6,8 @@ from os import PathLike
 from typing import Any, TypeVar
 
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.files.sampling import UnevenSamplingError
-from koopmpc.data.files.storage import Files
+from koopmpc.data.sampling import UnevenSamplingError
+from koopmpc.data.storage import Files
 from koopmpc.errors import DataError
 from koopmpc.validate.logs.audit import audit
 

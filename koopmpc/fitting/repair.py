@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes, joined
-from koopmpc.data.files.storage import Files
 from koopmpc.data.source import Changed, Held, Source, Subset
+from koopmpc.data.storage import Files
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
 from koopmpc.fitting.audited import audited
 from koopmpc.synthesis.candidates import jumps

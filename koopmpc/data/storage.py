@@ -13,15 +13,14 @@ from typing import Any, cast
 import numpy as np
 
 from koopmpc import disk
+from koopmpc.data import formats
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature, joined
-from koopmpc.data.files import csv, parquet
-from koopmpc.data.files.parquet import row_groups
-from koopmpc.data.files.tables import Told, read_table
 from koopmpc.data.source import Part, Source
+from koopmpc.data.tables import Told, read_table
 from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
-_WRITERS = {".parquet": parquet.write, ".csv": csv.write}
+_WRITERS = {".parquet": formats.write_parquet, ".csv": formats.write_csv}
 _READERS = {".rrd": ("koopmpc.recording.format.reader", "run_episodes")}  # imported when such a file is opened
 
 
@@ -34,13 +33,15 @@ def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     U = np.concatenate([episode.U for episode in driven])
     steps = np.array([len(episode) for episode in episodes])
     # Python writes a float so that it reads back to the bit.
-    names = {"states": episodes.states, "inputs": episodes.inputs, "disturbances": episodes.disturbances}
-    about = json.dumps({"dt": episodes.dt, **names})
-    if suffix in _WRITERS:
-        parquet.check_names(driven.states + driven.inputs, suffix)
+    named = {"states": episodes.states, "inputs": episodes.inputs, "disturbances": episodes.disturbances}
+    about = json.dumps({"dt": episodes.dt, **named})
+    names = driven.states + driven.inputs
+    for own in ("episode", "step"):
+        if suffix in _WRITERS and own in names:
+            raise DataError(f"a {suffix} file has a column {own!r} of its own; rename the state, or save as .npz")
     with disk.writing(file) as stream:
         if suffix in _WRITERS:
-            _WRITERS[suffix](stream, X, U, steps, driven.states + driven.inputs, about)
+            _WRITERS[suffix](stream, X, U, steps, names, about)
         else:
             np.savez(stream, X=X, U=U, steps=steps, about=np.array(about))
 
@@ -100,14 +101,14 @@ def load_episodes(
 def _read(file: Path, told: Told) -> Episodes:
     suffix = _suffix(file, (".npz", *_WRITERS, *_READERS))
     disk.existing(file, ADVICE)
-    about = csv.described(file) if suffix == ".csv" else None
+    about = formats.csv_about(file) if suffix == ".csv" else None
     if suffix == ".csv" and about is None:
-        names, held = csv.columns(file)
+        names, held = formats.csv_columns(file)
         return read_table(file, names, held, told)
-    if suffix == ".parquet" and not parquet.described(file):
-        names = parquet.names(file)
+    if suffix == ".parquet" and not formats.own_parquet(file):
+        names = formats.parquet_names(file)
         distinct = [name for name in names if names.count(name) == 1]
-        return read_table(file, names, parquet.columns(file, distinct), told)
+        return read_table(file, names, formats.parquet_columns(file, distinct), told)
     if not told.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
     if suffix in _READERS:
@@ -130,9 +131,9 @@ def _read(file: Path, told: Told) -> Episodes:
 def _own(file: Path, suffix: str, about: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     """Return X, U, steps and the text beside them, of a file that `save_episodes` wrote."""
     if about is not None:
-        return csv.read(file, about)
+        return formats.read_csv(file, about)
     if suffix == ".parquet":
-        return parquet.read(file)
+        return formats.read_parquet(file)
     with disk.Members(file) as held:
         held.require("X", "U", "steps", "about")
         return held["X"], held["U"], held["steps"], str(held["about"])
@@ -216,7 +217,7 @@ class Files(Source):
         """Return the parts of a large file that can be read in groups of rows."""
         if not self._plain or file.suffix != ".parquet" or file.stat().st_size < _LARGE:
             return None
-        return row_groups(file, history, plant)
+        return formats.row_groups(file, history, plant)
 
 
 def _together(files: tuple[Path, ...], reader: Reader, plant: PlantSignature) -> Part:
