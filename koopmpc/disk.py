@@ -61,12 +61,16 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         part = beside(file)
-        with discarded(part, file):  # before the file is there, so that no interrupt leaves it
+        try:  # before the file is there, so that no interrupt leaves it
             stream = _Stream(part, "wb" if part == file else "xb")
             with io.BufferedWriter(stream) as buffered:
                 yield cast("BinaryIO", buffered)
                 buffered.flush()
                 settle(part, file, stream.fileno())
+        except BaseException:
+            if part != file:
+                part.unlink(missing_ok=True)
+            raise
     except Exception as error:
         failure = stream.failure if stream is not None else None
         if failure is None and not isinstance(error, OSError):
@@ -100,17 +104,6 @@ def beside(file: Path) -> Path:
 
 
 PART = ".part"  # ends the name of a file that is being written
-
-
-@contextmanager
-def discarded(part: Path, file: Path) -> Generator[None]:
-    """Remove the unfinished file where the block does not end well."""
-    try:
-        yield
-    except BaseException:
-        if part != file:
-            part.unlink(missing_ok=True)
-        raise
 
 
 def settle(part: Path, file: Path, number: int) -> None:

@@ -374,7 +374,7 @@ class Compiled:
         `simulate` asks for it where nothing between two steps needs Python.
         """
         misfit = rows.shape[1] != self._nr or Y.shape[1] != self._ny or (W is not None and W.shape[1] != self._nw)
-        code = None if misfit or self.precision == "float" else self._machine_of(plant)
+        code = None if misfit else self._machine_of(plant)
         if code is None:
             return None
         self._aim(rows)
@@ -415,7 +415,7 @@ class Compiled:
                 f"the plant measures {len(plant.outputs)} values and takes {len(plant.inputs)} inputs, the controller "
                 f"takes {self._ny} and returns {self.nu}"
             )
-        code = None if self.precision == "float" else self._machine_of(plant)
+        code = self._machine_of(plant)
         if code is None:
             raise DataError("the plant, or a controller of floats, cannot run in C as a whole; use km.simulate")
         rows = np.ascontiguousarray(given[np.minimum(np.arange(T + self.horizon + 1), len(given) - 1)])
@@ -430,14 +430,14 @@ class Compiled:
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
     def _machine_of(self, plant: StepMap) -> ctypes.CDLL | None:
-        """Return the plant in machine code, built when it is first driven."""
+        """Return the plant in machine code, built when it is first driven; None where it cannot run with this one."""
         known = self._plants.get(id(plant))
         if known is not None:
             return known[1]
         command = compiler()
+        if command is None or self.precision == "float":
+            return None
         try:
-            if command is None:
-                return None
             code = library(_PLANT + plant_functions(plant.F, plant.h, Language()), command, private_cache())
         except (DataError, OSError, subprocess.SubprocessError):
             return None

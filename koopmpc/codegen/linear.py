@@ -5,7 +5,7 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.codegen.tables import Tables, add_observer, amplified, columns, model_tables
+from koopmpc.codegen.tables import Tables, add_limits, add_observer, amplified, columns, model_tables
 from koopmpc.control.limits import Interval
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
@@ -30,7 +30,6 @@ def lqr_tables(controller: LQR, *, single: bool) -> Tables:
     predictor, targets = controller.predictor, controller._targets
     tables = _shared(predictor, targets, controller._inputs)
     given, rates = controller._given_rows, controller._rates
-    nothing = np.zeros(predictor.nu)
     tables.sizes |= {
         "IS_LQR": 1,
         "HORIZON": 0,
@@ -40,8 +39,7 @@ def lqr_tables(controller: LQR, *, single: bool) -> Tables:
         "RATED": int(rates is not None),
         "GIVEN": 0 if given is None else len(given),
     }
-    low, high = (nothing, nothing) if rates is None else rates
-    tables.limits |= {"rate_low": low, "rate_high": high}
+    add_limits(tables, rate=rates)
     na = targets.Z.shape[1]
     tables.plan = {
         "E": columns(predictor.E),
@@ -84,13 +82,10 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
             "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
         )
     track, maps, qp = plan.track, plan.maps, plan.qp
-    N, nu, nz, na = twin._N, predictor.nu, predictor.nz, max(1, plan.targets.Z.shape[1])
-    observer = twin._initial.observer
-    driven = plan.disturbance.shape[1] > 0
-    checked = int(plan.checked.sum())
+    nz, checked, aimed = predictor.nz, int(plan.checked.sum()), bool(plan.aimed and plan.targets.Z.shape[1])
     given = track.given
     tables.sizes |= {
-        "N": N,
+        "N": twin._N,
         "LATENCY": twin._latency,
         "HORIZON": twin.horizon,
         "WITH_RATES": int(track.with_rates),
@@ -100,24 +95,20 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
         "NT": len(plan.matrix),
         "MOVES": plan.moves,
         "PLANNED": plan.planned,
-        "AIMED": int(plan.aimed),
+        "AIMED": int(aimed),
         "CHECKED": checked,
-        "CHECKED_LIMITS": int(driven),
+        "CHECKED_LIMITS": int(plan.disturbance.shape[1] > 0),
         "GIVEN": 0 if given is None else len(given),
         "CONSTANT": -1 if predictor.lifting.constant_index is None else predictor.lifting.constant_index,
         "ESTIMATOR": 0,
         "NS": nz,
     }
-    none = np.zeros(nu)
-    for name, box in (("rate", track.rates), ("hard_rate", track.hard_rates)):
-        low, high = (none, none) if box is None else box
-        tables.limits |= {f"{name}_low": low, f"{name}_high": high}
+    add_limits(tables, rate=track.rates, hard_rate=track.hard_rates)
     tables.limits["move_of"] = np.asarray(twin._move_of, dtype=np.intc)
     solver = cast("DAQP", twin._qps._solvers[0])
     M, scaling = _normalised(solver._M)
     rate_input = np.full(len(qp.source), -1, dtype=np.intc)
     rate_input[qp.rate_rows] = qp.rate_inputs
-    shift = np.asarray(qp.shift_dual, dtype=np.intc)
     if not np.array_equal(solver._H, np.eye(plan.moves)):
         raise AssertionError("the Hessian of Riccati coordinates is the identity")
     tables.plan = {
@@ -126,7 +117,7 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
         "high": plan.high,
         "offset": maps.offset,
         "from_reference": columns(maps.from_reference),
-        "from_target": columns(maps.from_target) if plan.aimed and plan.targets.Z.shape[1] else np.zeros(0),
+        "from_target": columns(maps.from_target) if aimed else np.zeros(0),
         "from_given": np.zeros(0) if given is None else columns(maps.from_given),
         "given": np.zeros(0) if given is None else given,
         "checked": plan.targets.rows[plan.checked] if checked else np.zeros(0),
@@ -143,12 +134,10 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
         "qp_high": np.minimum(qp.high, 1e30),
         "allowance": qp.softness.allowance,
         "rate_input": rate_input,
-        "shift": shift,
+        "shift": np.asarray(qp.shift_dual, dtype=np.intc),
         "deviation": columns(plan.deviation),
     }
-    if tables.sizes["AIMED"] and not plan.targets.Z.shape[1]:
-        tables.sizes["AIMED"] = 0
-    add_observer(tables, observer, predictor, twin._latency)
+    add_observer(tables, twin._initial.observer, predictor, twin._latency)
     solver_settings(tables, dict(solver._model.settings), single=single)
     _memory(tables, plan.moves, len(qp.source), int((solver._sense != 0).sum()))
     steep = bool(len(qp.source)) and solver._steep()
@@ -156,7 +145,6 @@ def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
     if steep:
         values, V = np.linalg.eigh(solver._metric())
         tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver._M @ V}
-    assert na == tables.sizes["NA"]
     tables.conditioning = _amplified(tables, predictor, plan.matrix[: plan.moves, :nz])
     return tables
 

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from scipy.linalg import solve
 
 from koopmpc.codegen.linear import daqp_defaults, memory_shares, solver_settings
-from koopmpc.codegen.tables import CFunction, Tables, add_observer, amplified, columns, model_tables, traced
+from koopmpc.codegen.tables import CFunction, Tables, add_limits, add_observer, amplified, columns, model_tables, traced
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED, BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
@@ -91,10 +91,7 @@ def bilinear_tables(
     sizes |= {"GOAL": goal, "END": goal + nu * problem.with_rates}
     tables = model_tables(given.model, sizes, lambda zeta: zeta, given.embedding, outputs.inputs)
     _add_functions(tables, controller)
-    none = np.zeros(nu)
-    for name, limit in (("rate", outputs.rates), ("hard_rate", outputs.hard_rates), ("change", problem.inputs)):
-        low, high = (none, none) if limit is None else limit
-        tables.limits |= {f"{name}_low": low, f"{name}_high": high}
+    add_limits(tables, rate=outputs.rates, hard_rate=outputs.hard_rates, change=problem.inputs)
     tables.limits["move_of"] = np.arange(N, dtype=np.intc)
     low, high = (
         np.tile(np.concatenate([problem.inputs[i], problem.box[i]]), (N if problem.margin.any() else 1, 1))

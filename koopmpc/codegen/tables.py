@@ -154,6 +154,14 @@ def model_tables(
     return tables
 
 
+def add_limits(tables: Tables, **limits: Interval | None) -> None:
+    """Write both ends of further limits of the inputs, zeros where there is none."""
+    none = np.zeros(tables.sizes["NU"])
+    for name, limit in limits.items():
+        low, high = (none, none) if limit is None else limit
+        tables.limits |= {f"{name}_low": low, f"{name}_high": high}
+
+
 def add_observer(tables: Tables, observer: object, predictor: LinearPredictor | None, latency: int) -> None:
     """Write the filter, and the linear model where it is advanced."""
     plan, sizes = tables.observer, tables.sizes

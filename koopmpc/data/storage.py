@@ -8,7 +8,7 @@ from functools import partial
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +21,13 @@ from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
 _WRITERS = {".parquet": formats.write_parquet, ".csv": formats.write_csv}
-_READERS = {".rrd": ("koopmpc.recording.format.reader", "run_episodes")}  # imported when such a file is opened
+SUFFIXES = (".npz", *_WRITERS, ".rrd")
 
 
 def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     """Write the episodes to a .npz, .parquet or .csv file; `Episodes.save` is this."""
     file = disk.path_of(path)
-    suffix = _suffix(file, (".npz", *_WRITERS))
+    suffix = _suffix(file, SUFFIXES[:-1])
     X = np.concatenate([episode.X for episode in episodes])
     driven = episodes.driven()  # U with W behind it
     U = np.concatenate([episode.U for episode in driven])
@@ -99,7 +99,7 @@ def load_episodes(
 
 
 def _read(file: Path, told: Told) -> Episodes:
-    suffix = _suffix(file, (".npz", *_WRITERS, *_READERS))
+    suffix = _suffix(file, SUFFIXES)
     disk.existing(file, ADVICE)
     about = formats.csv_about(file) if suffix == ".csv" else None
     if suffix == ".csv" and about is None:
@@ -111,9 +111,8 @@ def _read(file: Path, told: Told) -> Episodes:
         return read_table(file, names, formats.parquet_columns(file, distinct), told)
     if not told.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
-    if suffix in _READERS:
-        module, reader = _READERS[suffix]
-        return cast("Episodes", getattr(import_module(module), reader)(file))
+    if suffix == ".rrd":
+        return import_module("koopmpc.recording.format.reader").run_episodes(file)  # of a room below this one
     try:
         X, U, steps, text = _own(file, suffix, about)
         named = json.loads(text)
@@ -146,7 +145,6 @@ def _suffix(file: Path, known: Sequence[str]) -> str:
 
 
 Reader = Callable[[Path], Episodes]
-SUFFIXES = (".npz", ".parquet", ".csv", ".rrd")
 _PART = 8_000_000  # bytes of a part of several files
 _LARGE = 32_000_000  # bytes from which a file is read in groups of rows
 
