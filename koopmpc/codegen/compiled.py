@@ -5,7 +5,6 @@ import platform
 import subprocess
 import warnings
 from pathlib import Path
-from threading import Lock
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.codegen.sources import Language, one_source, plant_functions, tables_of
-from koopmpc.codegen.staged import target_rows
+from koopmpc.codegen.staged import TargetTable
 from koopmpc.codegen.tables import Exportable, Precision, exportable
 from koopmpc.control.linear.plan import planned_states
 from koopmpc.control.lqr import LQR
@@ -28,7 +27,6 @@ from koopmpc.plants.step_map import StepMap
 
 _STATUS, _FALLBACK = list(Status), list(Fallback)
 _PLANTS = 8  # plants whose machine code a controller keeps
-_ROWS = 100_000  # reference rows whose targets a controller keeps
 _PLANT = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
 
 
@@ -128,29 +126,6 @@ def _at(array: np.ndarray | None) -> ctypes.c_void_p | None:
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
-class _Targets:
-    """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
-
-    def __init__(self, controller: BilinearMPC) -> None:
-        self._controller, self._lock = controller, Lock()
-        self._known: set[bytes] = set()
-        self._table = np.zeros((0, 1))
-
-    def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "rows size"]:
-        """Return the table with the rows of this reference in it."""
-        with self._lock:
-            rows = np.atleast_2d(reference)
-            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
-            if len(self._known) + len(rows) > _ROWS:
-                self._known, self._table = set(), np.zeros((0, 1))
-            new = [row for row in rows if row.tobytes() not in self._known]
-            if new:
-                found = target_rows(self._controller, np.array(new))
-                self._table = np.vstack([self._table, found]) if len(self._table) else found
-                self._known |= {row.tobytes() for row in new}
-            return self._table
-
-
 # One call with one pointer: that is what ctypes does fastest. The structures are those of c/door.c.
 class _Rows(ctypes.Structure):
     """Rows of a preview: their address, and how many count."""
@@ -206,7 +181,7 @@ class Compiled:
         sizes = self._sizes
         self.dt, self.nu, self.horizon = controller.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits = controller.cost, controller.limits
-        self._targets = _Targets(controller) if isinstance(controller, BilinearMPC) else None
+        self._targets = TargetTable(controller) if isinstance(controller, BilinearMPC) else None
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # of a linear plan, from its inputs and its start
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
         self._memory = np.zeros(-(-int(self._code.koopmpc_state_size()) // 8))

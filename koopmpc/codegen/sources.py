@@ -10,9 +10,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.codegen.linear import koopman_tables, lqr_tables
 from koopmpc.codegen.staged import bilinear_tables
-from koopmpc.codegen.tables import Exportable, Tables, traced
+from koopmpc.codegen.tables import Exportable, Tables, koopman_tables, lqr_tables, traced
 from koopmpc.control.lqr import LQR
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.errors import DataError

@@ -101,7 +101,9 @@ def _on_grid(part: Signals, dt: float) -> Signals:
     grid = t[0] + dt * np.arange(count)
     before = np.asarray(np.searchsorted(t, grid + 1e-9 * dt, side="right"), dtype=np.intp)
     held = np.clip(before - 1, 0, len(t) - 1)
-    states = np.column_stack([np.interp(grid, t, column) for column in part.X.T])
+    states = np.empty((count, part.X.shape[1]))
+    for i in range(part.X.shape[1]):
+        states[:, i] = np.interp(grid, t, part.X[:, i])
     return Signals(grid, states, part.U[held], part.W[held], part.rows[held])
 
 

@@ -49,7 +49,7 @@ OPERATIONS = {
     "neg": Operation(1, np.negative, operator.neg),
     "sq": Operation(1, np.square, _symbolic_square),
     "twice": Operation(1, partial(np.multiply, 2.0), partial(operator.mul, 2)),
-    "inv": Operation(1, partial(np.divide, 1.0), partial(operator.truediv, 1)),
+    "inv": Operation(1, partial(np.divide, 1.0), partial(ca.rdivide, 1)),
     "sqrt": Operation(1, np.sqrt, ca.sqrt),
     "pow": Operation(2, np.power, ca.power),
     "constpow": Operation(2, np.power, ca.power),
