@@ -12,7 +12,6 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, cast
 from zipfile import ZipFile, ZipInfo, is_zipfile
 
@@ -160,9 +159,7 @@ class Members:
     def __enter__(self) -> "Members":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._zip.close()
 
     def __getitem__(self, name: str) -> np.ndarray:
