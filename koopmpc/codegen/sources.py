@@ -79,13 +79,16 @@ class Language:
             return short + ("F" if any(mark in short for mark in ".en") else ".0F")
         return repr(value)
 
-    def array(self, name: str, values: np.ndarray, kind: str = "koopmpc_real") -> str:
-        """Return the definition of a constant array; an empty one holds one zero, for C has none of length 0."""
+    def array(self, name: str, values: np.ndarray) -> str:
+        """Return the definition of a constant array, of integers or of numbers as `values` are.
+
+        An empty one holds one zero, for C has none of length 0.
+        """
         flat = np.asarray(values).ravel()
-        if kind == "int":
-            words = [str(int(value)) for value in flat] or ["0"]
+        if flat.dtype.kind in "iu":
+            kind, words = "int", [str(int(value)) for value in flat] or ["0"]
         else:
-            words = [self.number(value) for value in flat] or [self.number(0.0)]
+            kind, words = "koopmpc_real", [self.number(value) for value in flat] or [self.number(0.0)]
         lines = [f"static const {kind} {name}[{len(words)}] = {{"]
         line = " "
         for word in words:
@@ -96,12 +99,8 @@ class Language:
         return "\n".join([*lines, line, "};"])
 
     def arrays(self, table: Mapping[str, np.ndarray]) -> str:
-        """Return the definitions of all arrays, integers for integer ones."""
-        parts = [
-            self.array(f"koopmpc_{name}", values, "int" if np.asarray(values).dtype.kind in "iu" else "koopmpc_real")
-            for name, values in table.items()
-        ]
-        return "\n".join(parts) + "\n"
+        """Return the definitions of all arrays."""
+        return "\n".join(self.array(f"koopmpc_{name}", values) for name, values in table.items()) + "\n"
 
 
 class Function(NamedTuple):

@@ -71,10 +71,10 @@ def roles(names: Sequence[str], numeric: Sequence[str], told: "Told", where: str
         A given column is missing or stands twice, or no column is left for a state.
     """
     states, inputs, disturbances = told.states, told.inputs, told.disturbances
-    for what, given in (("states", states), ("inputs", inputs), ("disturbances", disturbances)):
+    for what, given in told.given.items():
         if isinstance(given, str):
             raise DataError(f"{what} is {given!r}; pass a tuple of names")
-        for name in given or ():
+        for name in given:
             if names.count(name) != 1:
                 has = "has two columns" if name in names else "has no column"
                 raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
@@ -154,20 +154,19 @@ class Told:
             once = name not in names and stems.count(name.strip().lower()) == 1
             return names[stems.index(name.strip().lower())] if once else name
 
-        given = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
-        return replace(
-            self,
-            **{
-                what: tuple(map(own, some))
-                for what, some in given.items()
-                if some is not None and not isinstance(some, str)
-            },
-        )
+        own_names = {what: tuple(map(own, some)) for what, some in self.given.items() if not isinstance(some, str)}
+        return replace(self, **own_names)
+
+    @property
+    def given(self) -> dict[str, Sequence[str]]:
+        """The names that the caller gives, by their role."""
+        every = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
+        return {what: some for what, some in every.items() if some is not None}
 
     @property
     def columns(self) -> set[str]:
         """The columns that the caller names."""
-        return {name for given in (self.states, self.inputs, self.disturbances) for name in given or ()}
+        return {name for some in self.given.values() for name in some}
 
 
 def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], told: Told) -> Episodes:
@@ -207,8 +206,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         _plausible(column, name, where)
     if told.states is None:
         found = _without_counters(found, table, where)
-    kinds = {name: columns[name].dtype.kind for name in names if name in columns}
-    text = [name for name, kind in kinds.items() if every and kind == "O" and not label(name)]
+    text = [name for name, column in columns.items() if every and column.dtype.kind == "O" and not label(name)]
     if text:
         warnings.warn(
             f"{where}: {', '.join(map(repr, text))} hold{'s' * (len(text) == 1)} text, and no part of it is a state or "
