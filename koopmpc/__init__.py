@@ -52,7 +52,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.data.excitation import Feedback as Feedback
     from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
-    from koopmpc.data.files.storage import load_episodes as load_episodes
+    from koopmpc.data.storage import load_episodes as load_episodes
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
@@ -78,14 +78,14 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.loop.realtime import realtime as realtime
     from koopmpc.loop.run import Run as Run
     from koopmpc.loop.simulate import simulate as simulate
-    from koopmpc.plants.black_box import black_box as black_box
+    from koopmpc.plants.dynamics import CVODES as CVODES
+    from koopmpc.plants.dynamics import RK4 as RK4
+    from koopmpc.plants.dynamics import Collocation as Collocation
     from koopmpc.plants.dynamics import Dynamics as Dynamics
-    from koopmpc.plants.dynamics import Plant as Plant
-    from koopmpc.plants.integrators import CVODES as CVODES
-    from koopmpc.plants.integrators import RK4 as RK4
-    from koopmpc.plants.integrators import Collocation as Collocation
-    from koopmpc.plants.integrators import Euler as Euler
-    from koopmpc.plants.integrators import ImplicitMidpoint as ImplicitMidpoint
+    from koopmpc.plants.dynamics import Euler as Euler
+    from koopmpc.plants.dynamics import ImplicitMidpoint as ImplicitMidpoint
+    from koopmpc.plants.plant import Plant as Plant
+    from koopmpc.plants.plant import black_box as black_box
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
     from koopmpc.predict import spectrum as spectrum

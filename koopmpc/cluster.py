@@ -18,7 +18,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 AHEAD = 2  # tasks for each worker that may be under way, or done before their turn
-ONE_THREAD: dict[str, str] = dict.fromkeys(
+ONE_THREAD: dict[str, str] = dict.fromkeys(  # the environment of a worker; numpy reads it when it is imported
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 _SHOWN = 200  # characters of a task that a message shows

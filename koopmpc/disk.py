@@ -12,7 +12,6 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, cast
 from zipfile import ZipFile, ZipInfo, is_zipfile
 
@@ -61,12 +60,16 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         part = beside(file)
-        with discarded(part, file):  # before the file is there, so that no interrupt leaves it
+        try:  # before the file is there, so that no interrupt leaves it
             stream = _Stream(part, "wb" if part == file else "xb")
             with io.BufferedWriter(stream) as buffered:
                 yield cast("BinaryIO", buffered)
                 buffered.flush()
                 settle(part, file, stream.fileno())
+        except BaseException:
+            if part != file:
+                part.unlink(missing_ok=True)
+            raise
     except Exception as error:
         failure = stream.failure if stream is not None else None
         if failure is None and not isinstance(error, OSError):
@@ -100,17 +103,6 @@ def beside(file: Path) -> Path:
 
 
 PART = ".part"  # ends the name of a file that is being written
-
-
-@contextmanager
-def discarded(part: Path, file: Path) -> Generator[None]:
-    """Remove the unfinished file where the block does not end well."""
-    try:
-        yield
-    except BaseException:
-        if part != file:
-            part.unlink(missing_ok=True)
-        raise
 
 
 def settle(part: Path, file: Path, number: int) -> None:
@@ -167,9 +159,7 @@ class Members:
     def __enter__(self) -> "Members":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._zip.close()
 
     def __getitem__(self, name: str) -> np.ndarray:

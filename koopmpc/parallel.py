@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from itertools import islice
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
@@ -172,7 +172,7 @@ class _Pool:
         """
         sent = _pickled(job.task, str(job))
         try:
-            with _one_thread(), _undisturbed():  # `submit` starts the processes
+            with _environment(ONE_THREAD), _undisturbed():  # `submit` starts the processes
                 return self._executor.submit(_work, sent, self._number, self._code)
         except OSError as error:  # another worker died meanwhile, and the executor has closed what this one inherits
             if self._executor._broken:
@@ -269,7 +269,7 @@ def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
     for _ in range(_TRIES):
         pool = _Pool(function, 1)
         try:
-            with _one_thread(), _undisturbed():
+            with _environment(ONE_THREAD), _undisturbed():
                 begun = pool._executor.submit(os.getpid)
             processes = list((pool._executor._processes or {}).values())
             try:
@@ -316,11 +316,6 @@ def _quiet_tracker() -> None:
 
         with _environment({"PYTHONWARNINGS": "ignore::UserWarning"}):
             resource_tracker.ensure_running()
-
-
-def _one_thread() -> AbstractContextManager[None]:
-    """Let processes that start meanwhile inherit one BLAS thread each; numpy reads it when it is imported."""
-    return _environment(ONE_THREAD)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 import koopmpc as km
-from koopmpc.plants.integrators import Integrator
+from koopmpc.plants.dynamics import Integrator
 
 n = 128  # points of the ring [−π, π)
 place = 2 * np.pi * np.arange(n) / n - np.pi

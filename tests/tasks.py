@@ -94,7 +94,7 @@ def always_dying(path: Path) -> km.Episodes:
 
 
 def _loaded(path: Path) -> km.Episodes:
-    from koopmpc.data.files.storage import load_episodes  # km.load_episodes brings all of koopmpc along
+    from koopmpc.data.storage import load_episodes  # km.load_episodes brings all of koopmpc along
 
     return load_episodes(path)
 

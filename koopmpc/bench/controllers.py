@@ -34,8 +34,9 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.online import OnlineEDMD
-from koopmpc.plants.dynamics import Dynamics, Plant
-from koopmpc.plants.step_map import SimulatedPlant, StepMap, discretize
+from koopmpc.plants.dynamics import Dynamics
+from koopmpc.plants.plant import Plant, SimulatedPlant
+from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor, load_model
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import AnyMPC, Design, load_controller, made

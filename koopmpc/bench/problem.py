@@ -17,8 +17,8 @@ from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.faults import Fault
-from koopmpc.plants.dynamics import Dynamics, Plant
-from koopmpc.plants.integrators import RK4, Euler, Integrator
+from koopmpc.plants.dynamics import RK4, Dynamics, Euler, Integrator
+from koopmpc.plants.plant import Plant
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.scene import Scene
 

@@ -1,9 +1,10 @@
 """A controller in machine code: the C of `export`, built with the compiler at hand, behind the Controller protocol."""
 
 import ctypes
+import platform
 import subprocess
 import warnings
-from threading import Lock
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -13,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
-from koopmpc.codegen.machine import CRows, Frame, Precision, SingleFrame, built_of, first_error, plant_text, whole_call
-from koopmpc.codegen.staged import target_rows
-from koopmpc.codegen.tables import Exportable, refusal
+from koopmpc.codegen.sources import Language, one_source, plant_functions, tables_of
+from koopmpc.codegen.staged import TargetTable
+from koopmpc.codegen.tables import Exportable, Precision, exportable
 from koopmpc.control.linear.plan import planned_states
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, WholeRun, alone, busy
@@ -26,7 +27,7 @@ from koopmpc.plants.step_map import StepMap
 
 _STATUS, _FALLBACK = list(Status), list(Fallback)
 _PLANTS = 8  # plants whose machine code a controller keeps
-_ROWS = 100_000  # reference rows whose targets a controller keeps
+_PLANT = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
 
 
 class NoCompilerWarning(UserWarning):
@@ -56,23 +57,58 @@ def compiled(controller: Controller, *, precision: Precision = "double") -> Cont
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     if isinstance(controller, Compiled):
         return controller
-    error = refusal(controller)
-    if error is not None:
-        raise error
-    assert isinstance(controller, Exportable), "all others are refused"
-    command = compiler()
+    original, command = exportable(controller), compiler()
     if command is None:
         warnings.warn(
             "no C compiler was found ($CC, cc, gcc, clang); the controller stays in Python", NoCompilerWarning, 2
         )
         return controller
     try:
-        return Compiled(controller, precision, command)
+        return Compiled(original, precision, command)
     except (OSError, subprocess.SubprocessError) as error:
         warnings.warn(
-            f"the C compiler failed, the controller stays in Python: {first_error(error)}", NoCompilerWarning, 2
+            f"the C compiler failed, the controller stays in Python: {_first_error(error)}", NoCompilerWarning, 2
         )
         return controller
+
+
+def _first_error(error: Exception) -> str:
+    """Return the first error that a compiler printed, or what the system says."""
+    printed = getattr(error, "stderr", None) or b""
+    text = printed.decode(errors="replace") if isinstance(printed, bytes) else str(printed)
+    lines = [line for line in text.splitlines() if "error" in line.lower()]
+    return lines[0] if lines else str(error)
+
+
+def _processor() -> str:
+    """Return what tells this processor from others whose machine code it may not run."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith("flags")), platform.processor())
+
+
+def _built(controller: Exportable, precision: Precision, command: list[str]) -> tuple[ctypes.CDLL, dict[str, int]]:
+    """Return the machine code of a controller, for this very processor where the compiler takes its flags, and sizes.
+
+    Raises
+    ------
+    OSError, subprocess.SubprocessError
+        The compiler fails or its output does not load.
+    """
+    single = precision == "float"
+    tables = tables_of(controller, single=single)
+    text = one_source(tables, single=single) + f"/* {_processor()} */\n"
+    cache = private_cache()
+    machine = ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
+    try:
+        code = library(text, [*command, *machine], cache)
+    except subprocess.SubprocessError:
+        code = library(text, command, cache)  # it may not know this processor
+    code.koopmpc_state_size.restype = ctypes.c_long
+    code.koopmpc_init.restype = code.koopmpc_call.restype = None
+    return code, tables.sizes
 
 
 class ManyRuns(NamedTuple):
@@ -85,27 +121,52 @@ class ManyRuns(NamedTuple):
     slack: Float[np.ndarray, "E T"]
 
 
-class _Targets:
-    """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
+def _at(array: np.ndarray | None) -> ctypes.c_void_p | None:
+    """Return the address of an array's first number, for C; None, C's null pointer, for None."""
+    return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
-    def __init__(self, controller: BilinearMPC) -> None:
-        self._controller, self._lock = controller, Lock()
-        self._known: set[bytes] = set()
-        self._table = np.zeros((0, 1))
 
-    def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "rows size"]:
-        """Return the table with the rows of this reference in it."""
-        with self._lock:
-            rows = np.atleast_2d(reference)
-            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
-            if len(self._known) + len(rows) > _ROWS:
-                self._known, self._table = set(), np.zeros((0, 1))
-            new = [row for row in rows if row.tobytes() not in self._known]
-            if new:
-                found = target_rows(self._controller, np.array(new))
-                self._table = np.vstack([self._table, found]) if len(self._table) else found
-                self._known |= {row.tobytes() for row in new}
-            return self._table
+# One call with one pointer: that is what ctypes does fastest. The structures are those of c/door.c.
+class _Rows(ctypes.Structure):
+    """Rows of a preview: their address, and how many count."""
+
+    _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
+
+
+_FIELDS = (
+    ("state", ctypes.c_void_p),
+    ("y", ctypes.c_void_p),
+    ("reference", _Rows),
+    ("applied", ctypes.c_void_p),
+    ("w", _Rows),
+    ("u", ctypes.c_void_p),
+    ("status", ctypes.c_int),
+    ("fallback", ctypes.c_int),
+    ("iterations", ctypes.c_int),
+)
+
+
+class _Frame(ctypes.Structure):
+    """What a call passes; the same fields as in C."""
+
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_double))
+
+
+class _SingleFrame(ctypes.Structure):
+    """A `_Frame` in single precision."""
+
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_float))
+
+
+class _Whole(ctypes.Structure):
+    """What a whole run passes; the same fields as in C."""
+
+    _fields_ = (
+        ("steps", ctypes.c_long),
+        *((name, ctypes.c_int) for name in ("nx", "ny", "preview", "measured")),
+        *((name, ctypes.c_void_p) for name in ("step", "measure", "rows", "W", "X", "Y", "U")),
+        *((name, ctypes.c_void_p) for name in ("slack", "times", "reports")),
+    )
 
 
 class Compiled:
@@ -116,14 +177,14 @@ class Compiled:
 
     def __init__(self, controller: Exportable, precision: Precision, command: list[str]) -> None:
         self.original, self.precision = controller, precision
-        self._built = built = built_of(controller, precision, command)
-        sizes = built.sizes
+        self._code, self._sizes = _built(controller, precision, command)
+        sizes = self._sizes
         self.dt, self.nu, self.horizon = controller.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits = controller.cost, controller.limits
-        self._targets = _Targets(controller) if isinstance(controller, BilinearMPC) else None
+        self._targets = TargetTable(controller) if isinstance(controller, BilinearMPC) else None
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # of a linear plan, from its inputs and its start
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
-        self._memory = np.zeros(-(-built.state_size // 8))
+        self._memory = np.zeros(-(-int(self._code.koopmpc_state_size()) // 8))
         self._plants: dict[int, tuple[StepMap, ctypes.CDLL]] = {}
         self._connect()
         self.reset()
@@ -132,18 +193,18 @@ class Compiled:
         """Make the arrays and the frame that a call passes."""
         self._token, self._inside = [0], 0
         single = self.precision == "float"
-        kind, sizes = np.float32 if single else np.float64, self._built.sizes
+        kind, sizes = np.float32 if single else np.float64, self._sizes
         rows = sizes["HORIZON"] + 1
         self._y, self._u, self._applied = (np.zeros(n, kind) for n in (self._ny, self.nu, self.nu))
         self._reference = np.zeros((rows, self._nr), kind)
         self._w = np.zeros((rows, max(1, self._nw)), kind)
-        frame = self._frame = SingleFrame() if single else Frame()
+        frame = self._frame = _SingleFrame() if single else _Frame()
         frame.state, frame.y, frame.u = (a.ctypes.data for a in (self._memory, self._y, self._u))
-        frame.reference = CRows(self._reference.ctypes.data, 1)
-        frame.w = CRows(self._w.ctypes.data, 0)
+        frame.reference = _Rows(self._reference.ctypes.data, 1)
+        frame.w = _Rows(self._w.ctypes.data, 0)
         self._applied_address = self._applied.ctypes.data
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
-        self._call = self._built.code.koopmpc_call
+        self._call = self._code.koopmpc_call
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._count, self._told, self._is_double = 1, False, not single
         self._solver = "" if self._targets is not None else "daqp"
@@ -154,16 +215,11 @@ class Compiled:
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; see the original."""
         kind = self._y.dtype
-        given = (
+        start, last = (
             None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
-            for value, name, size in ((x0, "x0", self._built.sizes["NX"]), (u_prev, "u_prev", self.nu))
+            for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))
         )
-        start, last = given
-        self._built.code.koopmpc_init(
-            ctypes.c_void_p(self._memory.ctypes.data),
-            None if start is None else ctypes.c_void_p(start.ctypes.data),
-            None if last is None else ctypes.c_void_p(last.ctypes.data),
-        )
+        self._code.koopmpc_init(_at(self._memory), _at(start), _at(last))
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
@@ -171,9 +227,7 @@ class Compiled:
         if self._targets is not None:
             self._aimed = rows.tobytes()
             self._table = self._targets.of(rows).astype(self._y.dtype)
-            self._built.code.koopmpc_use_targets(
-                ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_void_p(self._table.ctypes.data), len(self._table)
-            )
+            self._code.koopmpc_use_targets(_at(self._memory), _at(self._table), len(self._table))
 
     def __call__(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
@@ -243,8 +297,10 @@ class Compiled:
             self._applied[:] = got
             frame.applied, self._told = self._applied_address, True
         if w is not None:
-            frame.w.count = self._disturbances(numbers(w, "w"))
-            self._told = True
+            pushes = numbers(w, "w")
+            if not self._nw:
+                raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
+            frame.w.count, self._told = self._rows(pushes, self._w, self._nw, "w"), True
 
     def _rows(self, rows: Float[np.ndarray, "..."], to: Float[np.ndarray, "..."], width: int, name: str) -> int:
         """Copy a preview; return how many of its rows count."""
@@ -256,22 +312,17 @@ class Compiled:
         to[: len(table)] = table
         return len(table)
 
-    def _disturbances(self, w: Float[np.ndarray, "..."]) -> int:
-        if not self._nw:
-            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
-        return self._rows(w, self._w, self._nw, "w")
-
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
-        original, sizes, memory = self.original, self._built.sizes, ctypes.c_void_p(self._memory.ctypes.data)
+        original, sizes, memory = self.original, self._sizes, _at(self._memory)
         if isinstance(original, LQR):
             return None
         U = np.zeros((sizes["N"], self.nu), self._y.dtype)
-        if not self._built.code.koopmpc_plan(memory, ctypes.c_void_p(U.ctypes.data)):
+        if not self._code.koopmpc_plan(memory, _at(U)):
             return None
         if isinstance(original, BilinearMPC):
             X = np.zeros((sizes["N"] + 1, sizes["NX"]), self._y.dtype)
-            self._built.code.koopmpc_plan_states(memory, ctypes.c_void_p(X.ctypes.data))
+            self._code.koopmpc_plan_states(memory, _at(X))
             return Plan(X.astype(np.float64), U.astype(np.float64))
         if self._states is None:
             rates, disturbed = bool(sizes["WITH_RATES"]), bool(sizes["ESTIMATOR"])
@@ -298,15 +349,15 @@ class Compiled:
         `simulate` asks for it where nothing between two steps needs Python.
         """
         misfit = rows.shape[1] != self._nr or Y.shape[1] != self._ny or (W is not None and W.shape[1] != self._nw)
-        code = None if misfit or self.precision == "float" else self._machine_of(plant)
+        code = None if misfit else self._machine_of(plant)
         if code is None:
             return None
         self._aim(rows)
         rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
         slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
-        whole = whole_call(code, len(U), arrays, W, preview=preview)
-        self._built.code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
+        whole = _whole_call(code, len(U), arrays, W, preview=preview)
+        self._code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
         return WholeRun(reports[:, 0], reports[:, 1], reports[:, 2], slack, times)
 
     @alone
@@ -339,7 +390,7 @@ class Compiled:
                 f"the plant measures {len(plant.outputs)} values and takes {len(plant.inputs)} inputs, the controller "
                 f"takes {self._ny} and returns {self.nu}"
             )
-        code = None if self.precision == "float" else self._machine_of(plant)
+        code = self._machine_of(plant)
         if code is None:
             raise DataError("the plant, or a controller of floats, cannot run in C as a whole; use km.simulate")
         rows = np.ascontiguousarray(given[np.minimum(np.arange(T + self.horizon + 1), len(given) - 1)])
@@ -349,20 +400,20 @@ class Compiled:
         X[:, 0] = starts
         slack, reports = np.zeros((E, T)), np.zeros((E, T, 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
-        whole = whole_call(code, T, arrays, None, preview=True)
-        self._built.code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
+        whole = _whole_call(code, T, arrays, None, preview=True)
+        self._code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
     def _machine_of(self, plant: StepMap) -> ctypes.CDLL | None:
-        """Return the plant in machine code, built when it is first driven."""
+        """Return the plant in machine code, built when it is first driven; None where it cannot run with this one."""
         known = self._plants.get(id(plant))
         if known is not None:
             return known[1]
         command = compiler()
+        if command is None or self.precision == "float":
+            return None
         try:
-            if command is None:
-                return None
-            code = library(plant_text(plant), command, private_cache())
+            code = library(_PLANT + plant_functions(plant.F, plant.h, Language()), command, private_cache())
         except (DataError, OSError, subprocess.SubprocessError):
             return None
         while len(self._plants) >= _PLANTS:
@@ -383,6 +434,24 @@ class Compiled:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (self.original, self.precision, self._memory)
+
+
+def _whole_call(
+    code: ctypes.CDLL,
+    steps: int,
+    arrays: dict[str, np.ndarray],
+    W: Float[np.ndarray, "wrows nw"] | None,
+    *,
+    preview: bool,
+) -> _Whole:
+    """Return what a whole run passes; it holds no reference to the arrays."""
+    whole = _Whole(steps, arrays["X"].shape[-1], arrays["Y"].shape[-1], preview, W is not None)
+    for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
+        setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
+    for name, array in ({"W": W} | arrays if W is not None else arrays).items():
+        assert array.flags.c_contiguous, "machine code reads contiguous arrays"
+        setattr(whole, name, array.ctypes.data)
+    return whole
 
 
 def _rebuilt(controller: Exportable, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:

@@ -11,10 +11,18 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.codegen.machine import Precision
-from koopmpc.codegen.sources import constants, flops, iteration_flops, named, shipped, sources_of, tables_of
-from koopmpc.codegen.tables import Exportable, Tables, refusal
-from koopmpc.codegen.text import Language, function, traced
+from koopmpc.codegen.sources import (
+    Language,
+    constants,
+    flops,
+    iteration_flops,
+    named,
+    plant_functions,
+    shipped,
+    sources_of,
+    tables_of,
+)
+from koopmpc.codegen.tables import Exportable, Precision, Tables, exportable
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.lqr import LQR
 from koopmpc.control.move import Controller
@@ -84,12 +92,9 @@ def export(
     if precision not in ("double", "float"):
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     single = precision == "float"
-    error = refusal(controller)
-    if error is not None:
-        raise error
-    assert isinstance(controller, Exportable), "all others are refused"
-    rows = _reference_of(controller, reference)
-    tables = tables_of(controller, rows, single=single)
+    known = exportable(controller)
+    rows = _reference_of(known, reference)
+    tables = tables_of(known, rows, single=single)
     coarse = float(np.finfo(np.float32).eps) * tables.conditioning
     if single and coarse > _DIGITS:
         warnings.warn(
@@ -100,13 +105,13 @@ def export(
         )
     texts = sources_of(tables, single=single)
     texts |= {name: shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
-    texts |= _plant(controller, tables, plant, x0, rows, checks.count(steps, "steps"), Language(single))
+    texts |= _plant(known, tables, plant, x0, rows, checks.count(steps, "steps"), Language(single))
     texts = named(texts, name)
     root = path_of(folder)
     _refuse_others(root, {*texts, "README.md"}, name)
     for path, text in texts.items():
         _write(root / path, text)
-    readme = {"README.md": _readme(controller, tables, _measure_objects(root, name), precision)}
+    readme = {"README.md": _readme(known, tables, _measure_objects(root, name), precision)}
     _write(root / "README.md", named(readme, name)["README.md"])
     return root
 
@@ -158,8 +163,7 @@ def _plant(
         raise DataError(f"the plant has {nu} inputs, the controller {sizes['NU']}; pass the plant that it controls")
     x = ca.SX.sym("x", nx)
     measured = _measured(controller, step_map, x, sizes["NY"])
-    step = traced(step_map.F, "the plant")
-    look = traced(ca.Function("measure", [x], [measured]), "what the plant measures")
+    functions = plant_functions(step_map.F, ca.Function("measure", [x], [measured]), language)
     past = None if plant is not None or isinstance(model, StepMap) else model.embedding
     size = nx if past is None else len(past.states)
     start = _start(model, size) if x0 is None else checks.array(x0, "x0", (size,))
@@ -173,8 +177,7 @@ def _plant(
     code = (
         '/** @file plant.c @brief What the example controls. */\n#include <math.h>\n\n#include "plant.h"\n\n'
         + arrays
-        + function(step, "plant_step", {"x": nx, "u": nu}, "next", language).text
-        + function(look, "plant_measure", {"x": nx}, "y", language).text
+        + functions
     )
     header = (
         "/** @file plant.h @brief What the example controls. */\n#ifndef PLANT_H\n#define PLANT_H\n\n"

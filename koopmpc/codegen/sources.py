@@ -1,26 +1,143 @@
-"""All the C of a controller: files that are the same for every one, and those with its own numbers."""
+"""A controller as C text: its numbers, its functions from their graphs, and all files, shipped ones and its own."""
 
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import files
+from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.codegen.linear import koopman_tables, lqr_tables
 from koopmpc.codegen.staged import bilinear_tables
-from koopmpc.codegen.tables import Exportable, Tables, refusal
-from koopmpc.codegen.text import Language, function
+from koopmpc.codegen.tables import Exportable, Tables, koopman_tables, lqr_tables, traced
 from koopmpc.control.lqr import LQR
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.errors import DataError
+from koopmpc.plants.graph import Graph
 
-OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
+_OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
 _RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c")
 _QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
 _STAGED = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c", "koopmpc_rest.c", "koopmpc_finish.c")
-SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
-_COLUMNS = " Matrices stand column after column."
-SOLVER_FILES = (*SOLVER, "factorization.h", "LICENSE")
+_SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
+_SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
+_CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # of what times a whole run
+_WIDTH = 118
+
+# Each operation of `plants.graph` as C; {0} and {1} are its operands. Names of math.h go through KOOPMPC_FN, which
+# takes the float version in single precision.
+_UNARY = {
+    "assign": "{0}",
+    "neg": "-{0}",
+    "sq": "{0} * {0}",
+    "twice": "{0} + {0}",
+    "inv": "1 / {0}",
+    "not": "(koopmpc_real)({0} == 0)",
+    "sign": "(koopmpc_real)(({0} > 0) - ({0} < 0))",
+}
+_BINARY = {
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "lt": "(koopmpc_real)({0} < {1})",
+    "le": "(koopmpc_real)({0} <= {1})",
+    "eq": "(koopmpc_real)({0} == {1})",
+    "ne": "(koopmpc_real)({0} != {1})",
+    "and": "(koopmpc_real)({0} != 0 && {1} != 0)",
+    "or": "(koopmpc_real)({0} != 0 || {1} != 0)",
+    "if_else_zero": "{0} != 0 ? {1} : 0",
+    "pow": "KOOPMPC_FN(pow)({0}, {1})",
+    "constpow": "KOOPMPC_FN(pow)({0}, {1})",
+}
+_HYPERBOLIC = ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
+_MATH = ("sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "fabs", "floor", "ceil")
+_MATH_OF_TWO = ("hypot", "atan2", "fmin", "fmax", "fmod", "copysign")
+EXPRESSIONS = (
+    _UNARY
+    | _BINARY
+    | {name: f"KOOPMPC_FN({name})({{0}})" for name in (*_MATH, *_HYPERBOLIC)}
+    | {name: f"KOOPMPC_FN({name})({{0}}, {{1}})" for name in _MATH_OF_TWO}
+)
+_FLOPS = {"assign": 0, "neg": 0}  # of one operation where it is not 1; a function of math.h counts 20
+_CALL = 20
+
+
+@dataclass(frozen=True)
+class Language:
+    """How numbers are written: in double or in single precision."""
+
+    single: bool = False
+
+    def number(self, value: float) -> str:
+        """Return a literal that reads back as this number; what is beyond 1e30 becomes ±1e30."""
+        value = float(np.clip(value, -1e30, 1e30))
+        if self.single:
+            short = f"{float(np.float32(value)):.9g}"
+            return short + ("F" if any(mark in short for mark in ".en") else ".0F")
+        return repr(value)
+
+    def array(self, name: str, values: np.ndarray) -> str:
+        """Return the definition of a constant array, of integers or of numbers as `values` are.
+
+        An empty one holds one zero, for C has none of length 0.
+        """
+        flat = np.asarray(values).ravel()
+        if flat.dtype.kind in "iu":
+            kind, words = "int", [str(int(value)) for value in flat] or ["0"]
+        else:
+            kind, words = "koopmpc_real", [self.number(value) for value in flat] or [self.number(0.0)]
+        lines = [f"static const {kind} {name}[{len(words)}] = {{"]
+        line = " "
+        for word in words:
+            if len(line) + len(word) + 2 > _WIDTH:
+                lines.append(line)
+                line = " "
+            line += f" {word},"
+        return "\n".join([*lines, line, "};"])
+
+    def arrays(self, table: Mapping[str, np.ndarray]) -> str:
+        """Return the definitions of all arrays."""
+        return "\n".join(self.array(f"koopmpc_{name}", values) for name, values in table.items()) + "\n"
+
+
+class Function(NamedTuple):
+    """A C function made of a graph, and what it costs."""
+
+    text: str
+    flops: int
+
+
+def function(graph: Graph, name: str, arguments: Mapping[str, int], result: str, language: Language) -> Function:
+    """Return ``void name(const real *argument, …, real *result)``, each register written once."""
+    places: list[str] = [f"{argument}[{i}]" for argument, size in arguments.items() for i in range(size)]
+    registers: dict[int, str] = {}
+    results: list[str] = []
+    lines: list[str] = []
+    flops = 0
+    for count, (step, (target, first, second)) in enumerate(zip(graph.steps, graph.places.tolist(), strict=True)):
+        if step == "output":
+            results.append(f"  {result}[{target}] = {registers[first]};")
+            continue
+        if step == "input":
+            registers[target] = places[first]
+            continue
+        if step == "constant":
+            value = float(graph.constants[first])
+            text = language.number(value)
+            registers[target] = f"({text})" if text.startswith("-") else text
+            continue
+        a, b = registers[first], registers.get(second, "")
+        lines.append(f"  const koopmpc_real v{count} = {EXPRESSIONS[step].format(a, b)};")
+        registers[target] = f"v{count}"
+        flops += _FLOPS.get(step, _CALL if "KOOPMPC_FN" in EXPRESSIONS[step] else 1)
+    # An argument may be the result's own array: it is read before it is written.
+    heads = [f"const koopmpc_real *{argument}" for argument in arguments]
+    unused = [f"  (void){argument};" for argument in arguments if not any(f"{argument}[" in s for s in lines + results)]
+    body = "\n".join([*unused, *lines, *results])
+    return Function(f"void {name}({', '.join(heads)}, koopmpc_real *{result}) {{\n{body}\n}}\n", flops)
 
 
 def tables_of(
@@ -31,11 +148,8 @@ def tables_of(
     Raises
     ------
     DataError
-        It cannot be written in C; the message says which part of it, and what would do.
+        An operation of its model or its lifting cannot be written in C.
     """
-    error = refusal(controller)
-    if error is not None:
-        raise error
     if isinstance(controller, BilinearMPC):
         return bilinear_tables(controller, references, single=single)
     if isinstance(controller, LQR):
@@ -47,23 +161,27 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
     """Return the text of every file by its name: header, controller, model, numbers, solver."""
     language = Language(single)
     if tables.is_staged:
-        own = (*OWN, *_RECEDING, *_STAGED, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
+        own = (*_OWN, *_RECEDING, *_STAGED, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
     else:
         law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
-        own = (*OWN, *_QP, "koopmpc_target.c", *law)
+        own = (*_OWN, *_QP, "koopmpc_target.c", *law)
     result = {name: shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _sizes(tables, single=single)
     result["koopmpc_solver.h"] = _solver(tables, language)
-    result["koopmpc_limits.h"] = _header("limits", "Limits of the inputs.", language.arrays(tables.limits))
-    result["koopmpc_observer.h"] = _header("observer", "The observer's model.", language.arrays(tables.observer))
-    result["koopmpc_plan.h"] = _header("plan", "The plan and its limits.", language.arrays(tables.plan))
-    if "koopmpc_qp.c" in own:
-        result |= {f"daqp/{name}": shipped("daqp", name) for name in SOLVER_FILES}
-        result["koopmpc_names.h"] = _names()
+    arrays = {
+        "limits": ("Limits of the inputs.", language.arrays(tables.limits)),
+        "observer": ("The observer's model.", language.arrays(tables.observer)),
+        "plan": ("The plan and its limits.", language.arrays(tables.plan)),
+    }
     if tables.is_staged:
-        result["koopmpc_table.h"] = _header("table", "Targets of reference rows.", language.arrays(tables.targets))
+        arrays["table"] = "Targets of reference rows.", language.arrays(tables.targets)
     else:
-        result["koopmpc_targets.h"] = _header("targets", "Targets and their limits.", _targets(tables, language))
+        arrays["targets"] = "Targets and their limits.", _targets(tables, language)
+    for name, (what, body) in arrays.items():
+        result[f"koopmpc_{name}.h"] = _header(name, f"{what} Matrices stand column after column.", body)
+    if "koopmpc_qp.c" in own:
+        result |= {f"daqp/{name}": shipped("daqp", name) for name in _SOLVER_FILES}
+        result["koopmpc_names.h"] = _names()
     header = "koopmpc_stages.h" if tables.is_staged else "koopmpc.h"
     result["koopmpc_model.c"] = (
         "/** @file koopmpc_model.c @brief The model, written from CasADi's graph. */\n#include <math.h>\n\n"
@@ -74,6 +192,46 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
         )
     )
     return result
+
+
+def one_source(tables: Tables, *, single: bool) -> str:
+    """Return all C of a controller as one file, with the functions by which Python calls it.
+
+    Each local header stands where it is first included.
+    """
+    texts, seen = sources_of(tables, single=single), set[str]()
+
+    def inlined(text: str, folder: str) -> str:
+        def replaced(match: re.Match[str]) -> str:
+            name = match.group(1)
+            path = next((p for p in (folder + name, name) if p in texts), "")
+            if not path:  # what DAQP includes for its own clock
+                return match.group()
+            if path in seen:
+                return ""
+            seen.add(path)
+            return inlined(texts[path], path.rpartition("/")[0] + "/" if "/" in path else "")
+
+        return re.sub(r'^#include "([^"]+)"$', replaced, text, flags=re.MULTILINE)
+
+    own = [inlined(text, "") for name, text in texts.items() if name.endswith(".c") and "/" not in name]
+    return "\n".join([_CLOCK + own[0], *own[1:], shipped("c", "door.c")])
+
+
+def plant_functions(F: ca.Function, h: ca.Function, language: Language) -> str:
+    """Return ``plant_step(x, u, next)`` and ``plant_measure(x, y)`` of x⁺ = F(x, u), y = h(x).
+
+    Raises
+    ------
+    DataError
+        The equations cannot be written in C.
+    """
+    nx, nu = F.size1_in(0), F.size1_in(1)
+    step, look = traced(F, "the plant"), traced(h, "what the plant measures")
+    return (
+        function(step, "plant_step", {"x": nx, "u": nu}, "next", language).text
+        + function(look, "plant_measure", {"x": nx}, "y", language).text
+    )
 
 
 def named(texts: dict[str, str], name: str) -> dict[str, str]:
@@ -96,11 +254,11 @@ def named(texts: dict[str, str], name: str) -> dict[str, str]:
 def _names() -> str:
     """Return the header that gives DAQP's functions names of this controller, for two may be in one program."""
     found = [
-        re.findall(r"\b(\w*(?:daqp|ldp)_?\w*)\s*\(DAQP", shipped("daqp", name)) for name in SOLVER if name[-1] == "h"
+        re.findall(r"\b(\w*(?:daqp|ldp)_?\w*)\s*\(DAQP", shipped("daqp", name)) for name in _SOLVER if name[-1] == "h"
     ]
     found.append(re.findall(r"\b(\w+)\s*\(DAQP", shipped("daqp", "factorization.h")))
     lines = [f"#define {name} koopmpc_{name}" for name in sorted({name for names in found for name in names})]
-    return _header("names", "DAQP's functions in this controller.", "\n".join(lines) + "\n").replace(_COLUMNS, "")
+    return _header("names", "DAQP's functions in this controller.", "\n".join(lines) + "\n")
 
 
 def shipped(folder: str, name: str) -> str:
@@ -156,8 +314,7 @@ def _header(name: str, what: str, body: str) -> str:
     guard = f"KOOPMPC_{name.upper()}_H"
     includes = '#include "koopmpc.h"\n\n' if name not in ("sizes", "names") else ""
     return (
-        f"/** @file koopmpc_{name}.h @brief {what}{_COLUMNS} */\n#ifndef {guard}\n"
-        f"#define {guard}\n\n{includes}{body}\n#endif\n"
+        f"/** @file koopmpc_{name}.h @brief {what} */\n#ifndef {guard}\n#define {guard}\n\n{includes}{body}\n#endif\n"
     )
 
 
@@ -167,7 +324,7 @@ def _sizes(tables: Tables, *, single: bool) -> str:
     functions = "#define KOOPMPC_FN(name) name##f\n" if single else "#define KOOPMPC_FN(name) name\n"
     dt = f"#define KOOPMPC_DT {tables.model.dt!r}\n"
     body = precision + functions + "#define KOOPMPC_SQRT KOOPMPC_FN(sqrt)\n" + dt + "\n".join(lines) + "\n"
-    return _header("sizes", "Sizes of this controller.", body).replace(_COLUMNS, "")
+    return _header("sizes", "Sizes of this controller.", body)
 
 
 def _solver(tables: Tables, language: Language) -> str:
@@ -179,7 +336,7 @@ def _solver(tables: Tables, language: Language) -> str:
     )
     if settings:
         lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
-    return _header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n").replace(_COLUMNS, "")
+    return _header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n")
 
 
 def _targets(tables: Tables, language: Language) -> str:

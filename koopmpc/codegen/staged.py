@@ -1,13 +1,26 @@
 """A BilinearMPC's tables: its map and derivatives as functions, weights and limits of stages, targets of references."""
 
+from threading import Lock
+
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve
 
-from koopmpc.codegen.linear import daqp_defaults, memory_shares, solver_settings
-from koopmpc.codegen.tables import CFunction, Tables, add_observer, amplified, columns, model_tables
-from koopmpc.codegen.text import traced
+from koopmpc import checks
+from koopmpc.codegen.tables import (
+    CFunction,
+    Tables,
+    add_limits,
+    add_observer,
+    amplified,
+    columns,
+    daqp_defaults,
+    memory_shares,
+    model_tables,
+    solver_settings,
+    traced,
+)
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED, BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
@@ -29,6 +42,7 @@ _TOLERANCES = {
     "TURN": (1e-15, 1e-7),
     "SMALL": (1e-7, 1e-4),
 }
+_ROWS = 100_000  # reference rows whose targets a controller in machine code keeps
 
 
 def bilinear_tables(
@@ -92,10 +106,7 @@ def bilinear_tables(
     sizes |= {"GOAL": goal, "END": goal + nu * problem.with_rates}
     tables = model_tables(given.model, sizes, lambda zeta: zeta, given.embedding, outputs.inputs)
     _add_functions(tables, controller)
-    none = np.zeros(nu)
-    for name, limit in (("rate", outputs.rates), ("hard_rate", outputs.hard_rates), ("change", problem.inputs)):
-        low, high = (none, none) if limit is None else limit
-        tables.limits |= {f"{name}_low": low, f"{name}_high": high}
+    add_limits(tables, rate=outputs.rates, hard_rate=outputs.hard_rates, change=problem.inputs)
     tables.limits["move_of"] = np.arange(N, dtype=np.intc)
     low, high = (
         np.tile(np.concatenate([problem.inputs[i], problem.box[i]]), (N if problem.margin.any() else 1, 1))
@@ -145,7 +156,7 @@ def bilinear_tables(
     _add_finish(tables, controller, low, high)
     add_observer(tables, observer, None, 0)
     tables.observer |= {"C": columns(np.eye(ny, nx)), "E": columns(given.E)}
-    table = np.zeros((0, 1)) if references is None else target_rows(controller, references)
+    table = np.zeros((0, 1)) if references is None else _target_rows(controller, references)
     tables.targets = {"table": table}
     tables.sizes |= {"TARGETS": len(table), "TARGET": _target_size(controller)}
     tables.notes.append(
@@ -186,7 +197,7 @@ def _add_finish(
     }
 
 
-def target_rows(controller: BilinearMPC, rows: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "found size"]:
+def _target_rows(controller: BilinearMPC, rows: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "found size"]:
     """Return the table of targets of these reference rows, each one once; see `koopmpc_stages.h` for its columns."""
     found: list[Float[np.ndarray, " size"]] = []
     for row in dict.fromkeys(map(bytes, np.ascontiguousarray(rows))):
@@ -198,6 +209,29 @@ def target_rows(controller: BilinearMPC, rows: Float[np.ndarray, "rows nr"]) -> 
         parts = (r, x, u, active, target.u, target.slope, target.M[:n], target.L[:n], target.V[:n], target.m[:n])
         found.append(np.concatenate([*(np.ravel(part) for part in parts), [float(known)]]))
     return np.array(found)
+
+
+class TargetTable:
+    """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
+
+    def __init__(self, controller: BilinearMPC) -> None:
+        self._controller, self._lock = controller, Lock()
+        self._known: set[bytes] = set()
+        self._table = np.zeros((0, 1))
+
+    def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "rows size"]:
+        """Return the table with the rows of this reference in it."""
+        with self._lock:
+            rows = np.atleast_2d(reference)
+            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
+            if len(self._known) + len(rows) > _ROWS:
+                self._known, self._table = set(), np.zeros((0, 1))
+            new = [row for row in rows if row.tobytes() not in self._known]
+            if new:
+                found = _target_rows(self._controller, np.array(new))
+                self._table = np.vstack([self._table, found]) if len(self._table) else found
+                self._known |= {row.tobytes() for row in new}
+            return self._table
 
 
 def _target_size(controller: BilinearMPC) -> int:

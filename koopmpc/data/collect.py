@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.dynamics import Plant, reading, require_plant
+from koopmpc.plants.plant import Plant, reading, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value, freeze
 

@@ -238,7 +238,7 @@ class Episodes(Named, Value):
         LogError
             The path cannot be written.
         """
-        from koopmpc.data.files.storage import save_episodes  # storage builds Episodes, so it imports this file
+        from koopmpc.data.storage import save_episodes  # storage builds Episodes, so it imports this file
 
         save_episodes(self, path)
 

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from koopmpc.bench.results import RESULTS
 from koopmpc.data.episodes import Episode, Episodes, joined
-from koopmpc.data.files.sampling import UnevenSamplingError
-from koopmpc.data.files.storage import Files
+from koopmpc.data.sampling import UnevenSamplingError
 from koopmpc.data.source import Changed, Held, Source, Subset
+from koopmpc.data.storage import Files
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
 from koopmpc.synthesis.candidates import jumps
 from koopmpc.synthesis.folds import blocks, sampled, usual_horizon

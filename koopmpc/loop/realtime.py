@@ -24,7 +24,7 @@ from koopmpc.control.move import Controller, Fallback, Move, Status
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
 from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, predictor_of, rows_ahead
-from koopmpc.plants.dynamics import Plant, reading, require_plant
+from koopmpc.plants.plant import Plant, reading, require_plant
 
 Late = Literal["skip", "hold"]
 _SPIN = 3e-4  # the last part of a wait keeps the processor busy, because a sleep ends up to 0.2 ms late [s]

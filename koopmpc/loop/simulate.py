@@ -17,8 +17,8 @@ from koopmpc.control.move import Controller, Fallback, Fallible, Move, Plan, Sta
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.run import Plans, Run, Step
-from koopmpc.plants.dynamics import Plant, reading, require_plant
-from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.plants.plant import Plant, SimulatedPlant, reading, require_plant
+from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import Predictor
 
 Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]

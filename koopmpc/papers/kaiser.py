@@ -34,8 +34,7 @@ from koopmpc.lifting.state import Constant, Expressions, Monomials, State
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.plants import closed_loop, trajectories
 from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, short, show
-from koopmpc.plants.dynamics import Dynamics
-from koopmpc.plants.integrators import RK4
+from koopmpc.plants.dynamics import RK4, Dynamics
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page

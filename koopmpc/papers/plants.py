@@ -18,8 +18,7 @@ from koopmpc import checks
 from koopmpc.control.lqr import lqr
 from koopmpc.control.riccati import Gain
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.plants.dynamics import Dynamics, right_side
-from koopmpc.plants.integrators import RK4
+from koopmpc.plants.dynamics import RK4, Dynamics, right_side
 from koopmpc.plants.step_map import StepMap
 
 SUBSTEPS = 8  # RK4 steps in a sample of 0.01 s, for an error below 1e-12

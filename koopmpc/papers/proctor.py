@@ -21,7 +21,7 @@ from koopmpc.identify.fits.kic import InputPredictor, kic
 from koopmpc.lifting.state import Expressions, State
 from koopmpc.papers.plants import closed_loop
 from koopmpc.papers.registry import Claim, Tell, compared, judged, short, show, written
-from koopmpc.plants.integrators import RK4
+from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import discretize
 from koopmpc.recording.page import Page
 

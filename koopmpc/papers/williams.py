@@ -17,7 +17,7 @@ from koopmpc.identify.fits.kernel import kernel_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.papers.registry import Claim, Tell, judged, percent, short
-from koopmpc.plants.integrators import RK4
+from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page

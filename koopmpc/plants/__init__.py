@@ -6,7 +6,7 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.plants.gym_plant import GymPlant as GymPlant
+    from koopmpc.plants.plant import SimulatedPlant as SimulatedPlant
     from koopmpc.plants.step_map import Affine as Affine
-    from koopmpc.plants.step_map import SimulatedPlant as SimulatedPlant
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

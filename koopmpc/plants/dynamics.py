@@ -1,13 +1,13 @@
-"""Continuous-time models ẋ = f(x, u), y = h(x), written in CasADi operations; the protocol of a plant that runs."""
+"""Continuous-time models ẋ = f(x, u), y = h(x) in CasADi operations, and the integrators that make x⁺ = F(x, u)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Protocol, cast, runtime_checkable
+from dataclasses import dataclass
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
@@ -47,84 +47,6 @@ class Dynamics(Named, ABC):
     def scene(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape] | None:
         """Return the shapes that draw x (nx,) and u (nu,), always with the same names; None: nothing is drawn."""
         return None
-
-
-class Sampled(Protocol):
-    """What has a sample time, and names for its states, inputs and outputs."""
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        ...
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of x, with units."""
-        ...
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of u, with units."""
-        ...
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of y, with units."""
-        ...
-
-
-@runtime_checkable
-class Plant(Sampled, Protocol):
-    """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`.
-
-    Two members more are used where a plant has them: `ended`, a text that is empty until the plant itself ends the
-    episode and then says why, and `scene`, scene(x, u) → shapes for the animation in the logs.
-    """
-
-    @property
-    def state(self) -> np.ndarray | None:
-        """The true x (nx,), where it can be known."""
-        ...
-
-    def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int) -> np.ndarray:
-        """Go to x0 (nx,), or begin where the plant is when it is None, and return y (ny,)."""
-        ...
-
-    def step(self, u: ArrayLike) -> np.ndarray:
-        """Hold u (nu,) for dt and return the new y (ny,)."""
-        ...
-
-
-def require_plant(plant: object) -> None:
-    """Raise a DataError that names the missing member where `plant` is no Plant."""
-    if isinstance(plant, Dynamics):
-        raise DataError(
-            f"the plant is {type(plant).__name__}, ẋ = f(x, u) without a sample time; discretize it first: "
-            "km.discretize(dynamics, dt)"
-        )
-    advice = (
-        "a Plant has dt [s], states, inputs and outputs (names), state (x, or None where it is hidden), "
-        "reset(x0, rng) -> y and step(u) -> y; or pass a StepMap, or km.black_box(f, dt=…, states=…, inputs=…) of "
-        "a function x⁺ = f(x, u)"
-    )
-    needed = ("dt", "states", "inputs", "outputs", "state", "reset", "step")
-    checks.members(plant, "the plant", needed, advice)
-
-
-def reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
-    """Return what a plant measured at step k as an array of its own."""
-    try:
-        y = None if value is None else np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        y = None
-    if y is None:
-        raise DataError(
-            f"the plant returned {type(value).__name__} at step {k}; reset and step return y, a number each"
-        )
-    if y.ndim != 1 or (ny is not None and len(y) != ny):
-        expected = "(ny,)" if ny is None else f"({ny},), as at reset"
-        raise ShapeError(f"the plant returned y of shape {y.shape} at step {k}, expected {expected}")
-    return y
 
 
 def drawn_by(dynamics: Dynamics) -> Scene | None:
@@ -186,3 +108,156 @@ def _check_names(dynamics: Dynamics) -> None:
             raise DataError(f"{type(dynamics).__name__}.{field} is {names!r}; pass a tuple of names: ('theta [rad]',)")
     if not dynamics.states:
         raise DataError(f"{type(dynamics).__name__}.states is empty; name at least one state")
+
+
+class Integrator(ABC):
+    """A one-step method that turns ẋ = f(x, u) into x⁺ = F(x, u), with u held."""
+
+    @abstractmethod
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u) from f of ẋ = f(x, u), dt [s]."""
+
+
+@dataclass(frozen=True)
+class Euler(Integrator):
+    """x⁺ = x + dt f(x, u): order 1."""
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        x, u = _symbols(f)
+        return _explicit(x, u, x + dt * f(x, u))
+
+
+@dataclass(frozen=True)
+class RK4(Integrator):
+    """The classical Runge–Kutta method, explicit, of order 4 (Hairer, Nørsett & Wanner 1993, II.1).
+
+    Parameters
+    ----------
+    substeps
+        Equal steps in one sample, at least 1.
+    """
+
+    substeps: int = 1
+
+    def __post_init__(self) -> None:
+        checks.count(self.substeps, "substeps")
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        x, u = _symbols(f)
+        x_next, h = x, dt / self.substeps
+        for _ in range(self.substeps):
+            k1 = f(x_next, u)
+            k2 = f(x_next + h / 2 * k1, u)
+            k3 = f(x_next + h / 2 * k2, u)
+            k4 = f(x_next + h * k3, u)
+            x_next = x_next + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return _explicit(x, u, x_next)
+
+
+@dataclass(frozen=True)
+class ImplicitMidpoint(Integrator):
+    """x⁺ = x + dt f((x + x⁺)/2, u): order 2, symplectic (Hairer, Lubich & Wanner 2006, VI.4)."""
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        return _gauss(f, dt, 1)
+
+
+@dataclass(frozen=True)
+class Collocation(Integrator):
+    """Collocation at Gauss points: order 2·degree, A-stable (Hairer & Wanner 1996, IV.5).
+
+    Parameters
+    ----------
+    degree
+        Number of Gauss points in one sample, at least 1.
+    """
+
+    degree: int = 3
+
+    def __post_init__(self) -> None:
+        checks.count(self.degree, "degree")
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        return _gauss(f, dt, self.degree)
+
+
+@dataclass(frozen=True)
+class CVODES(Integrator):
+    """Variable order and step to the stated local tolerances, for stiff plants (Hindmarsh et al. 2005).
+
+    Parameters
+    ----------
+    rtol, atol
+        Relative tolerance, and absolute tolerance in the units of the states; both above zero.
+    """
+
+    rtol: float = 1e-9
+    atol: float = 1e-9
+
+    def __post_init__(self) -> None:
+        checks.positive(self.rtol, "rtol")
+        checks.positive(self.atol, "atol")
+
+    def step(self, f: ca.Function, dt: float) -> ca.Function:
+        """Return F of x⁺ = F(x, u)."""
+        if not ca.has_integrator("cvodes"):
+            raise DataError("this CasADi has no CVODES; use Collocation or RK4 with substeps")
+        x, u = _symbols(f)
+        options = {"reltol": self.rtol, "abstol": self.atol, "disable_internal_warnings": True}
+        flow = ca.integrator("flow", "cvodes", {"x": x, "u": u, "ode": f(x, u)}, 0, dt, options)
+        X, U = ca.MX.sym("x", x.size1()), ca.MX.sym("u", u.size1())
+        return _implicit(X, U, flow(x0=X, u=U)["xf"])
+
+
+def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
+    """x⁺ = x + Σ bⱼ kⱼ with kᵢ = dt f(x + Σ aᵢⱼ kⱼ, u), solved by Newton and differentiated implicitly.
+
+    The unknowns are kᵢ / s with s = 1 + |x| + |dt f(x, u)|, so that one tolerance on Newton's step fits all units
+    and stiff plants too, whose residual never falls to the rounding of its terms.
+    """
+    a, b = gauss_legendre(stages)
+    x, u = _symbols(f)
+    nx = x.size1()
+    slope = dt * f(x, u)
+    scale = 1 + ca.fabs(x) + ca.fabs(slope)
+    unknown = ca.SX.sym("k", nx, stages)
+    K = unknown * ca.repmat(scale, 1, stages)
+    rows = [unknown[:, i] - dt * f(x + K @ ca.DM(a[i]), u) / scale for i in range(stages)]
+    residual = ca.Function("residual", [ca.vec(unknown), x, u], [ca.vertcat(*rows)])
+    options = {"max_iter": 50, "abstol": 1e-15, "abstolStep": 1e-11}  # Newton squares its error in the last step
+    newton = ca.rootfinder("newton", "fast_newton", residual, options)
+    start = ca.Function("start", [x, u], [ca.repmat(slope / scale, stages, 1), scale])
+    X, U = ca.MX.sym("x", nx), ca.MX.sym("u", u.size1())
+    guess, unit = start(X, U)
+    K_solved = ca.reshape(newton(guess, X, U), nx, stages)
+    return _implicit(X, U, X + unit * (K_solved @ ca.DM(b)))
+
+
+def gauss_legendre(stages: int) -> tuple[Float[np.ndarray, "s s"], Float[np.ndarray, " s"]]:
+    """Return Butcher's a (s, s) and b (s,) of Gauss–Legendre collocation.
+
+    aᵢⱼ = bⱼ (cᵢ + ½ Σ_{k=1}^{s−1} P_k(σⱼ) (P_{k+1}(σᵢ) − P_{k−1}(σᵢ))) with σ = 2c − 1: the Lagrange
+    basis written in Legendre polynomials, whose integrals are known.
+    """
+    sigma, weight = np.polynomial.legendre.leggauss(stages)
+    P = np.polynomial.legendre.legvander(sigma, stages)
+    k = np.arange(1, stages)
+    b = weight / 2
+    a = b * ((sigma[:, None] + 1) / 2 + 0.5 * (P[:, k + 1] - P[:, k - 1]) @ P[:, k].T)
+    return a, b
+
+
+def _symbols(f: ca.Function) -> tuple[ca.SX, ca.SX]:
+    return ca.SX.sym("x", f.size1_in(0)), ca.SX.sym("u", f.size1_in(1))
+
+
+def _explicit(x: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.Function:
+    return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"], {"cse": True})
+
+
+def _implicit(x: ca.MX, u: ca.MX, x_next: ca.MX) -> ca.Function:
+    return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"])

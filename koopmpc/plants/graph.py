@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
@@ -31,24 +31,8 @@ def _where(condition: Columns, value: Columns, out: np.ndarray) -> None:
     out[...] = np.where(condition, value, 0.0)
 
 
-def _twice(a: Columns, out: np.ndarray) -> None:
-    np.add(a, a, out=out)
-
-
-def _inverse(a: Columns, out: np.ndarray) -> None:
-    np.divide(1.0, a, out=out)
-
-
 def _symbolic_square(a: ca.SX) -> ca.SX:
     return a * a
-
-
-def _symbolic_twice(a: ca.SX) -> ca.SX:
-    return 2 * a
-
-
-def _symbolic_inverse(a: ca.SX) -> ca.SX:
-    return 1 / a
 
 
 def _symbolic_where(condition: ca.SX, value: ca.SX) -> ca.SX:
@@ -64,8 +48,8 @@ OPERATIONS = {
     "div": Operation(2, np.divide, ca.rdivide),
     "neg": Operation(1, np.negative, operator.neg),
     "sq": Operation(1, np.square, _symbolic_square),
-    "twice": Operation(1, _twice, _symbolic_twice),
-    "inv": Operation(1, _inverse, _symbolic_inverse),
+    "twice": Operation(1, partial(np.multiply, 2.0), partial(operator.mul, 2)),
+    "inv": Operation(1, partial(np.divide, 1.0), partial(ca.rdivide, 1)),
     "sqrt": Operation(1, np.sqrt, ca.sqrt),
     "pow": Operation(2, np.power, ca.power),
     "constpow": Operation(2, np.power, ca.power),

@@ -89,17 +89,19 @@ def dense(function: ca.Function) -> ca.Function:
     return result.expand() if function.is_a("SXFunction") else result
 
 
-def source(F: ca.Function) -> str:
+def _rollouts_text(F: ca.Function) -> str:
     """Return C with ``koopmpc_rollouts(E, T, X, U)``: X (E, T+1, nx) from its first rows and U (E, T, nu)."""
     x, u = ca.SX.sym("x", F.size1_in(0)), ca.SX.sym("u", F.size1_in(1))
     step = ca.Function("koopmpc_step", [x, u], [F(x, u)])
-    generator = ca.CodeGenerator("koopmpc", {"with_header": False})
-    generator.add(step)
     sizes = {f"sz_{name}": getattr(step, f"sz_{name}")() + 1 for name in ("arg", "res", "iw", "w")}
-    # Static, because an exported name could clash with the same name elsewhere in the process.
-    return (
-        "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump() + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
-    )
+    return _generated(step) + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
+
+
+def _generated(function: ca.Function) -> str:
+    """Return CasADi's C, static, because an exported name could clash with the same name elsewhere in the process."""
+    generator = ca.CodeGenerator("koopmpc", {"with_header": False})
+    generator.add(function)
+    return "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump()
 
 
 def compiler() -> list[str] | None:
@@ -119,7 +121,27 @@ def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    return _bound(library(source(F), command, cache))
+    rollouts = library(_rollouts_text(F), command, cache).koopmpc_rollouts
+    rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
+    rollouts.restype = None
+
+    def march(X: np.ndarray, U: np.ndarray) -> None:
+        rollouts(U.shape[0], U.shape[1], X.ctypes.data, U.ctypes.data)
+
+    def run(X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
+        if not (X.flags.c_contiguous and U.flags.c_contiguous):
+            raise AssertionError("machine code reads contiguous arrays only")
+        episodes, steps = U.shape[:2]
+        threads = min(os.cpu_count() or 1, episodes, episodes * steps // _STEPS_A_THREAD)
+        if threads > 1:
+            ends = [episodes * i // threads for i in range(threads + 1)]
+            parts = [slice(*pair) for pair in pairwise(ends)]
+            with ThreadPoolExecutor(threads) as pool:  # ctypes releases the interpreter's lock
+                list(pool.map(march, [X[part] for part in parts], [U[part] for part in parts]))
+        else:
+            march(X, U)
+
+    return run
 
 
 def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
@@ -182,30 +204,6 @@ def _compile(text: str, command: list[str], path: Path) -> Path:
     return path
 
 
-def _bound(code: ctypes.CDLL) -> Kernel:
-    rollouts = code.koopmpc_rollouts
-    rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
-    rollouts.restype = None
-
-    def march(X: np.ndarray, U: np.ndarray) -> None:
-        rollouts(U.shape[0], U.shape[1], X.ctypes.data, U.ctypes.data)
-
-    def run(X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
-        if not (X.flags.c_contiguous and U.flags.c_contiguous):
-            raise AssertionError("machine code reads contiguous arrays only")
-        episodes, steps = U.shape[:2]
-        threads = min(os.cpu_count() or 1, episodes, episodes * steps // _STEPS_A_THREAD)
-        if threads > 1:
-            ends = [episodes * i // threads for i in range(threads + 1)]
-            parts = [slice(*pair) for pair in pairwise(ends)]
-            with ThreadPoolExecutor(threads) as pool:  # ctypes releases the interpreter's lock
-                list(pool.map(march, [X[part] for part in parts], [U[part] for part in parts]))
-        else:
-            march(X, U)
-
-    return run
-
-
 _CALL = """
 #ifdef _WIN32
 __declspec(dllexport)
@@ -253,10 +251,7 @@ def _machine(
     if command is None:
         return None
     try:
-        generator = ca.CodeGenerator("koopmpc", {"with_header": False})
-        generator.add(function)
-        text = "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump() + _CALL % function.name()
-        code = library(text, command, private_cache())
+        code = library(_generated(function) + _CALL % function.name(), command, private_cache())
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
     call = code.koopmpc_call

@@ -1,9 +1,11 @@
-"""The discrete-time plant x⁺ = F(x, u), y = h(x): immutable, and as a plant that remembers its state."""
+"""The discrete-time plant x⁺ = F(x, u), y = h(x), immutable: one step, and many episodes at once."""
 
+import subprocess
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,12 +14,17 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.batch import Batch, march, warn_of
-from koopmpc.plants.dynamics import Dynamics, Sampled, drawn_by, output, right_side
-from koopmpc.plants.integrators import RK4, Integrator
+from koopmpc.plants import routines
+from koopmpc.plants.dynamics import RK4, Dynamics, Integrator, drawn_by, output, right_side
+from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered, dense
 from koopmpc.scene import Scene
 from koopmpc.values import Named, Value, freeze
+
+_WORTH_COMPILING = 20_000  # steps that the interpreter makes in 0.2 s, the time of a compiler
+_LONGEST = 5_000  # operations of F; the compiler's time grows faster than its code
+_WIDE = 64  # episodes from which numpy columns beat one call a step
+_CHUNK = 4096  # episodes at a time, so that the columns stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +126,7 @@ class StepMap(Named):
         try:
             step.evaluate()
         except RuntimeError as error:
-            warn_of(error, x, u)
+            _warn_of(error, x, u)
             x_next[:] = np.nan
         else:
             x_next[:] = step.results[0]
@@ -139,7 +146,7 @@ class StepMap(Named):
         moves = checks.array(U, "U", (None, self.nu))
         X = np.empty((len(moves) + 1, self.nx))
         X[0] = start
-        march(self._step, X, moves)
+        _march(self._step, X, moves)
         return X
 
     def rollouts(self, X0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "episodes steps nx"]:
@@ -164,8 +171,8 @@ class StepMap(Named):
         return Buffered(self.F)
 
     @cached_property
-    def _batch(self) -> Batch:
-        return Batch(self._step)
+    def _batch(self) -> "_Batch":
+        return _Batch(self._step)
 
     @cached_property
     def measures_all(self) -> bool:
@@ -187,71 +194,6 @@ class StepMap(Named):
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scene"}
-
-
-@runtime_checkable
-class Transition(Sampled, Protocol):
-    """x⁺ = F(x, u), y = h(x): what a `SimulatedPlant` needs of a step map."""
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        ...
-
-    @property
-    def scene(self) -> Scene | None:
-        """scene(x, u) → shapes, None where there is none."""
-        ...
-
-    def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nx"]:
-        """x⁺ = F(x, u)."""
-        ...
-
-    def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
-        """Return y = h(x)."""
-        ...
-
-
-class SimulatedPlant:
-    """x⁺ = F(x, u) + w, y = h(x): a `StepMap`, or the map of a `black_box`, that remembers its state."""
-
-    def __init__(self, step_map: Transition) -> None:
-        checks.members(
-            step_map, "the step map", ("dt", "nx", "measure"), "discretize dynamics; a Plant is one as it is"
-        )
-        self.step_map, self.dt, self.scene = step_map, step_map.dt, step_map.scene
-        self.states, self.inputs, self.outputs = step_map.states, step_map.inputs, step_map.outputs
-        self._x: Float[np.ndarray, " nx"] | None = None
-
-    @property
-    def state(self) -> Float[np.ndarray, " nx"] | None:
-        """A copy of x (nx,); None before the first `reset`."""
-        return None if self._x is None else self._x.copy()
-
-    def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " ny"]:
-        """Go to x0 (nx,) and return y (ny,); nothing here is random, `rng` is the protocol's."""
-        if x0 is None:
-            raise DataError("a simulated plant has no state of its own to begin in; pass x0")
-        self._x = checks.array(x0, "x0", (self.step_map.nx,))
-        return self.step_map.measure(self._x)
-
-    def step(self, u: ArrayLike, disturbance: ArrayLike | None = None) -> Float[np.ndarray, " ny"]:
-        """Return y (ny,) after x ← F(x, u) + `disturbance` (nx,).
-
-        Raises
-        ------
-        DataError
-            The plant was never reset.
-        ShapeError
-            u or the disturbance has another shape.
-        """
-        if self._x is None:
-            raise DataError("the plant has no state yet; call reset(x0, rng) before step")
-        x_next = self.step_map(self._x, u)
-        if disturbance is not None:
-            x_next += checks.array(disturbance, "disturbance", (self.step_map.nx,))
-        self._x = x_next
-        return self.step_map.measure(x_next)
 
 
 def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008
@@ -310,3 +252,92 @@ def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
     sizes = [function.size2_in(i) for i in range(arguments) if function.size1_in(i)] + [function.size2_out(0)]
     if any(columns != 1 for columns in sizes):
         raise ShapeError(f"{name} is {function}, expected columns: {name}{wanted} with one column each")
+
+
+class _Batch:
+    """Fills X (E, T+1, nx) from X[:, 0] and U (E, T, nu).
+
+    F made of SX operations runs as generated C where there is a compiler and the batch is large enough, else as its
+    expression graph over numpy columns. Any other F (implicit integrators, matrices) is called step by step.
+    """
+
+    def __init__(self, step: Buffered) -> None:
+        self._step = step
+
+    def fill(self, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
+        """Write x_{k+1} = F(x_k, u_k) for every episode."""
+        episodes, steps = U.shape[:2]
+        scalar = self._step.function.is_a("SXFunction")
+        worth = episodes * steps >= _WORTH_COMPILING or "_kernel" in self.__dict__
+        if scalar and worth and self._kernel is not None:
+            self._kernel(X, U)
+        elif scalar and episodes >= _WIDE and self._graph is not None:
+            vectorised(self._graph, X, U)
+        else:
+            for episode, moves in zip(X, U, strict=True):
+                _march(self._step, episode, moves)
+
+    @cached_property
+    def _kernel(self) -> routines.Kernel | None:
+        F, command = self._step.function, routines.compiler()
+        if command is None or F.n_instructions() > _LONGEST:
+            return None
+        try:
+            return routines.kernel(F, command, routines.private_cache())
+        except (OSError, AttributeError, subprocess.SubprocessError) as error:
+            failed = isinstance(error, subprocess.CalledProcessError)
+            said = error.stderr.decode(errors="replace")[-500:] if failed else ""
+            warnings.warn(
+                f"{command[0]} could not compile the step map, batches run slower: {error} {said}",
+                RuntimeWarning,
+                stacklevel=5,
+            )
+            return None
+
+    @cached_property
+    def _graph(self) -> Graph | None:
+        try:
+            return Graph.trace(self._step.function)
+        except DataError:
+            return None
+
+
+def _march(step: Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
+    """Write x_1 … x_T after X[0], call by call; NaN from where an implicit method fails."""
+    (x, u), (x_next,), evaluate = step.arguments, step.results, step.evaluate
+    x[:] = X[0]
+    for k in range(len(U)):
+        u[:] = U[k]
+        try:
+            evaluate()
+        except RuntimeError as error:
+            _warn_of(error, x, u)
+            X[k + 1 :] = np.nan
+            return
+        X[k + 1] = x_next
+        x[:] = x_next
+
+
+def vectorised(graph: Graph, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
+    """Write x_1 … x_T after X[:, 0], all episodes of a chunk in one numpy column."""
+    nx = X.shape[2]
+    for start in range(0, len(X), _CHUNK):
+        states, moves = X[start : start + _CHUNK], U[start : start + _CHUNK]
+        v, x_next = np.empty((graph.n, len(states))), np.empty((nx, len(states)))
+        v[:nx] = states[:, 0].T
+        scratch = graph.scratch(len(states))
+        for k in range(U.shape[1]):
+            v[nx:] = moves[:, k].T
+            graph.run(v, x_next, scratch)
+            states[:, k + 1] = x_next.T
+            v[:nx] = x_next
+
+
+def _warn_of(error: RuntimeError, x: np.ndarray, u: np.ndarray) -> None:
+    """Warn that an implicit step from (x, u) has no solution; a numerical outcome raises nothing."""
+    reason = str(error).strip().splitlines()[-1]
+    warnings.warn(
+        f"the integrator found no x⁺ from x={x}, u={u}; x⁺ is NaN, try a smaller dt ({reason})",
+        RuntimeWarning,
+        stacklevel=4,
+    )

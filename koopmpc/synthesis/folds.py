@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes, joined
-from koopmpc.data.mender import Mender
-from koopmpc.data.smoother import Smoother
+from koopmpc.data.smoother import Mender, Smoother
 from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import spread

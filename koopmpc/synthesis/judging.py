@@ -17,7 +17,8 @@ from koopmpc.lifting.base import short
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
-from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.plants.plant import SimulatedPlant
+from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Designed, Nearness, Recipe

@@ -12,8 +12,8 @@ from koopmpc.control.lqr import dlqr
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, Feedback, Noise
 from koopmpc.errors import DataError, FitWarning, KoopmpcError
-from koopmpc.plants.dynamics import Plant, require_plant
-from koopmpc.plants.step_map import SimulatedPlant, StepMap
+from koopmpc.plants.plant import Plant, SimulatedPlant, require_plant
+from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value
 
 FIRST = 0.05  # share of `reach` from which the first episodes start

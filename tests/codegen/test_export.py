@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.codegen.text import EXPRESSIONS, Language, function
+from koopmpc.codegen.sources import EXPRESSIONS, Language, function
 from koopmpc.plants.graph import OPERATIONS, Graph
 from koopmpc.plants.routines import library
 from tests.faults.damage import room_for

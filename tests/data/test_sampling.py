@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
-from koopmpc.data.files.tables import Told, _numbered, _plausible, label, roles
+from koopmpc.data.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.data.tables import Told, _numbered, _plausible, label, roles
 from koopmpc.errors import ColumnWarning
 
 

@@ -149,7 +149,7 @@ def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
 
 @pytest.mark.usefixtures("quick")
 def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr("koopmpc.data.files.storage._PART", 1)
+    monkeypatch.setattr("koopmpc.data.storage._PART", 1)
     data = cart_pole(24)
     for i in range(12):
         data[2 * i : 2 * i + 2].save(tmp_path / "in" / f"{i:02d}.npz")
@@ -188,7 +188,7 @@ def test_one_long_log_is_cut_into_blocks_and_that_is_said(tmp_path):
 def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_that_is_said(
     tmp_path, monkeypatch, memory
 ):
-    monkeypatch.setattr("koopmpc.data.files.storage._PART", 1)
+    monkeypatch.setattr("koopmpc.data.storage._PART", 1)
     for i, e in enumerate(cart_pole(24)):
         turning = e.X[:, 1] + 0.1 * np.arange(len(e.X))
         wrapped = (turning + np.pi) % (2 * np.pi) - np.pi

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.plants import batch, routines
+from koopmpc.plants import routines, step_map
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
 from tests.example_plants import CartPole, Pendulum
@@ -50,7 +50,7 @@ def test_machine_code_graph_and_interpreter_agree_to_1e12_a_step(kernels, name, 
     X0, U = random_episodes(plant, episodes, steps, seed)
     by_code, by_columns = empty(X0, U), empty(X0, U)
     kernels[name](by_code, U)
-    batch.vectorised(Graph.trace(plant.F), by_columns, U)
+    step_map.vectorised(Graph.trace(plant.F), by_columns, U)
     for X in (by_code, by_columns):
         assert X[:, 0].tolist() == X0.tolist()
         for e, k in np.ndindex(episodes, steps):
@@ -71,10 +71,10 @@ def test_threads_share_the_episodes(kernels, monkeypatch):
 
 def test_columns_beyond_one_chunk():
     plant = MAPS["rk4"]
-    X0, U = random_episodes(plant, batch._CHUNK + 3, 2)
+    X0, U = random_episodes(plant, step_map._CHUNK + 3, 2)
     X = empty(X0, U)
-    batch.vectorised(Graph.trace(plant.F), X, U)
-    for e in (0, batch._CHUNK - 1, batch._CHUNK, batch._CHUNK + 2):
+    step_map.vectorised(Graph.trace(plant.F), X, U)
+    for e in (0, step_map._CHUNK - 1, step_map._CHUNK, step_map._CHUNK + 2):
         np.testing.assert_allclose(X[e], plant.rollout(X0[e], U[e]), rtol=1e-12, atol=1e-12)
 
 

@@ -138,7 +138,7 @@ def test_memory_goes_with_the_windows_and_not_with_the_data(tmp_path, monkeypatc
     lifting = km.State() + km.Gaussian(CENTERS, 0.8)
     one = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-1, 1), episodes=4, steps=1000, rng=0)
     peaks = []
-    monkeypatch.setattr("koopmpc.data.files.storage._PART", 100_000)  # bytes that are read at once
+    monkeypatch.setattr("koopmpc.data.storage._PART", 100_000)  # bytes that are read at once
     for count in (4, 24):
         folder = tmp_path / str(count)
         folder.mkdir()

@@ -29,7 +29,7 @@ from koopmpc.loop.simulate import simulate
 from koopmpc.papers.registry import percent
 from koopmpc.papers.snyder.reconstruction import Prediction, Setting, centred, prediction
 from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Shaking, gains
-from koopmpc.plants.integrators import RK4
+from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.page import Page

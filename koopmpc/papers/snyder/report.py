@@ -14,7 +14,7 @@ from koopmpc.papers.registry import Claim, percent, relative, summary
 from koopmpc.papers.snyder.claims import Fits
 from koopmpc.papers.snyder.reconstruction import Reconstruction, Setting
 from koopmpc.papers.snyder.settings import FIGURES, VARIANTS, gains
-from koopmpc.plants.integrators import RK4
+from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import discretize
 from koopmpc.recording.page import Page
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.files.sampling import Signals, episodes_from
+from koopmpc.data.sampling import Signals, episodes_from
 from koopmpc.disk import path_of
 from koopmpc.errors import LogError
 from koopmpc.loop.run import About, Plans, Run

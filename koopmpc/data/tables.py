@@ -4,6 +4,8 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,8 @@ from jaxtyping import Float
 
 from koopmpc import checks, disk
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.files.csv import numbers
-from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.data.formats import is_a_number
+from koopmpc.data.sampling import Signals, episodes_from, resampled, restarts, sample_time
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError
 
 _TIME = re.compile(r"t|time|timestamp|sim_time|elapsed|seconds")
@@ -69,10 +71,10 @@ def roles(names: Sequence[str], numeric: Sequence[str], told: "Told", where: str
         A given column is missing or stands twice, or no column is left for a state.
     """
     states, inputs, disturbances = told.states, told.inputs, told.disturbances
-    for what, given in (("states", states), ("inputs", inputs), ("disturbances", disturbances)):
+    for what, given in told.given.items():
         if isinstance(given, str):
             raise DataError(f"{what} is {given!r}; pass a tuple of names")
-        for name in given or ():
+        for name in given:
             if names.count(name) != 1:
                 has = "has two columns" if name in names else "has no column"
                 raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
@@ -152,20 +154,19 @@ class Told:
             once = name not in names and stems.count(name.strip().lower()) == 1
             return names[stems.index(name.strip().lower())] if once else name
 
-        given = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
-        return replace(
-            self,
-            **{
-                what: tuple(map(own, some))
-                for what, some in given.items()
-                if some is not None and not isinstance(some, str)
-            },
-        )
+        own_names = {what: tuple(map(own, some)) for what, some in self.given.items() if not isinstance(some, str)}
+        return replace(self, **own_names)
+
+    @property
+    def given(self) -> dict[str, Sequence[str]]:
+        """The names that the caller gives, by their role."""
+        every = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
+        return {what: some for what, some in every.items() if some is not None}
 
     @property
     def columns(self) -> set[str]:
         """The columns that the caller names."""
-        return {name for given in (self.states, self.inputs, self.disturbances) for name in given or ()}
+        return {name for some in self.given.values() for name in some}
 
 
 def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], told: Told) -> Episodes:
@@ -195,7 +196,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
     sought = told.columns
     every = told.states is None or told.inputs is None
     columns = {
-        name: numbers(column, name, where) if name in sought or (every and not label(name)) else column
+        name: _numbers(column, name, where) if name in sought or (every and not label(name)) else column
         for name, column in columns.items()
     }
     numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
@@ -205,8 +206,7 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         _plausible(column, name, where)
     if told.states is None:
         found = _without_counters(found, table, where)
-    kinds = {name: columns[name].dtype.kind for name in names if name in columns}
-    text = [name for name, kind in kinds.items() if every and kind == "O" and not label(name)]
+    text = [name for name, column in columns.items() if every and column.dtype.kind == "O" and not label(name)]
     if text:
         warnings.warn(
             f"{where}: {', '.join(map(repr, text))} hold{'s' * (len(text) == 1)} text, and no part of it is a state or "
@@ -257,6 +257,45 @@ def read_table(file: Path, names: list[str], columns: Mapping[str, np.ndarray], 
         if str(error).startswith(where):
             raise
         raise DataError(f"{where}: {error}") from error
+
+
+def _numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
+    """Return a column of objects as floats, None as NaN; return a column of text unchanged.
+
+    Parameters
+    ----------
+    column
+        (rows,) of any kind.
+    name, where
+        The column and its file, for messages.
+
+    Raises
+    ------
+    DataError
+        At least half of the cells look like numbers, but one is no real number: a decimal comma, a complex number or
+        a word. The whole column would be lost for that cell.
+    """
+    if column.dtype.kind != "O":
+        return column
+    present = [cell for cell in column if cell is not None]
+    if present and all(isinstance(cell, Real | Decimal) for cell in present):
+        return np.array([np.nan if cell is None else float(cell) for cell in column])
+    like = sum(map(_like_a_number, present))
+    if like == 0 or 2 * like < len(present):
+        return column
+    row, cell = next((i, cell) for i, cell in enumerate(column) if cell is not None and not is_a_number(cell))
+    raise DataError(
+        f"{where}: {name!r} holds {str(cell)!r} in row {row + 1}, which is no real number; repair the cell, leave it "
+        "empty where the value is missing, or name the columns to use: pass states= and inputs="
+    )
+
+
+def _like_a_number(cell: object) -> bool:
+    try:
+        complex(str(cell).strip().replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 _USUAL, _ABSURD = 0.99, 1e6  # share of usual cells, and how many times larger none can be

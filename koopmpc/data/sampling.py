@@ -32,11 +32,10 @@ class Signals:
     W: Float[np.ndarray, "M nw"]
     rows: Int[np.ndarray, " M"]
 
-    def cut(self, first: int, last: int) -> "Signals":
-        """Return rows first … last − 1."""
-        part = slice(first, last)
-        time = None if self.time is None else self.time[part]
-        return Signals(time, self.X[part], self.U[part], self.W[part], self.rows[part])
+    def at(self, which: slice | Bool[np.ndarray, " M"]) -> "Signals":
+        """Return these rows."""
+        time = None if self.time is None else self.time[which]
+        return Signals(time, self.X[which], self.U[which], self.W[which], self.rows[which])
 
 
 def sample_time(times: list[np.ndarray], where: str) -> float:
@@ -72,7 +71,7 @@ def restarts(signals: Signals, where: str) -> list[Signals]:
             FitWarning,
             stacklevel=2,
         )
-    return [signals.cut(a, b) for a, b in pairwise(at)]
+    return [signals.at(slice(a, b)) for a, b in pairwise(at)]
 
 
 def resampled(signals: Signals, dt: float) -> list[Signals]:
@@ -82,33 +81,30 @@ def resampled(signals: Signals, dt: float) -> list[Signals]:
     where the signals are cut.
     """
     assert signals.time is not None, "only a table with a time column is resampled"
-    whole = np.isfinite(signals.X).all(axis=1) & np.isfinite(signals.time)
-    X, U, W = signals.X[whole], signals.U[whole], signals.W[whole]
-    kept = Signals(signals.time[whole], X, U, W, signals.rows[whole])
+    kept = signals.at(np.isfinite(signals.X).all(axis=1) & np.isfinite(signals.time))
     assert kept.time is not None
     ahead = np.diff(kept.time)
     if not len(ahead):
         return []
     longest = _GAP * max(dt, float(np.median(ahead)))
     at = _edges(ahead > longest)
-    parts = [kept.cut(a, b) for a, b in pairwise(at)]
+    parts = [kept.at(slice(a, b)) for a, b in pairwise(at)]
     return [_on_grid(part, dt) for part in parts if len(part.X) > 1]
 
 
 def _on_grid(part: Signals, dt: float) -> Signals:
-    time = part.time
-    assert time is not None
-    distinct = np.concatenate([[True], np.diff(time) > 0])
-    t = time[distinct]
-    X, U, W, rows = part.X[distinct], part.U[distinct], part.W[distinct], part.rows[distinct]
+    assert part.time is not None
+    part = part.at(np.concatenate([[True], np.diff(part.time) > 0]))
+    t = part.time
+    assert t is not None
     count = int(np.floor((t[-1] - t[0]) / dt * (1 + 1e-9))) + 1
     grid = t[0] + dt * np.arange(count)
     before = np.asarray(np.searchsorted(t, grid + 1e-9 * dt, side="right"), dtype=np.intp)
     held = np.clip(before - 1, 0, len(t) - 1)
-    states = np.empty((count, X.shape[1]))
-    for i in range(X.shape[1]):
-        states[:, i] = np.interp(grid, t, X[:, i])
-    return Signals(grid, states, U[held], W[held], rows[held])
+    states = np.empty((count, part.X.shape[1]))
+    for i in range(part.X.shape[1]):
+        states[:, i] = np.interp(grid, t, part.X[:, i])
+    return Signals(grid, states, part.U[held], part.W[held], part.rows[held])
 
 
 def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:

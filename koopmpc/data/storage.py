@@ -8,39 +8,40 @@ from functools import partial
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from koopmpc import disk
+from koopmpc.data import formats
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature, joined
-from koopmpc.data.files import csv, parquet
-from koopmpc.data.files.parquet import row_groups
-from koopmpc.data.files.tables import Told, read_table
 from koopmpc.data.source import Part, Source
+from koopmpc.data.tables import Told, read_table
 from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
-_WRITERS = {".parquet": parquet.write, ".csv": csv.write}
-_READERS = {".rrd": ("koopmpc.recording.format.reader", "run_episodes")}  # imported when such a file is opened
+_WRITERS = {".parquet": formats.write_parquet, ".csv": formats.write_csv}
+SUFFIXES = (".npz", *_WRITERS, ".rrd")
 
 
 def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
     """Write the episodes to a .npz, .parquet or .csv file; `Episodes.save` is this."""
     file = disk.path_of(path)
-    suffix = _suffix(file, (".npz", *_WRITERS))
+    suffix = _suffix(file, SUFFIXES[:-1])
     X = np.concatenate([episode.X for episode in episodes])
     driven = episodes.driven()  # U with W behind it
     U = np.concatenate([episode.U for episode in driven])
     steps = np.array([len(episode) for episode in episodes])
     # Python writes a float so that it reads back to the bit.
-    names = {"states": episodes.states, "inputs": episodes.inputs, "disturbances": episodes.disturbances}
-    about = json.dumps({"dt": episodes.dt, **names})
-    if suffix in _WRITERS:
-        parquet.check_names(driven.states + driven.inputs, suffix)
+    named = {"states": episodes.states, "inputs": episodes.inputs, "disturbances": episodes.disturbances}
+    about = json.dumps({"dt": episodes.dt, **named})
+    names = driven.states + driven.inputs
+    for own in ("episode", "step"):
+        if suffix in _WRITERS and own in names:
+            raise DataError(f"a {suffix} file has a column {own!r} of its own; rename the state, or save as .npz")
     with disk.writing(file) as stream:
         if suffix in _WRITERS:
-            _WRITERS[suffix](stream, X, U, steps, driven.states + driven.inputs, about)
+            _WRITERS[suffix](stream, X, U, steps, names, about)
         else:
             np.savez(stream, X=X, U=U, steps=steps, about=np.array(about))
 
@@ -98,21 +99,20 @@ def load_episodes(
 
 
 def _read(file: Path, told: Told) -> Episodes:
-    suffix = _suffix(file, (".npz", *_WRITERS, *_READERS))
+    suffix = _suffix(file, SUFFIXES)
     disk.existing(file, ADVICE)
-    about = csv.described(file) if suffix == ".csv" else None
+    about = formats.csv_about(file) if suffix == ".csv" else None
     if suffix == ".csv" and about is None:
-        names, held = csv.columns(file)
+        names, held = formats.csv_columns(file)
         return read_table(file, names, held, told)
-    if suffix == ".parquet" and not parquet.described(file):
-        names = parquet.names(file)
+    if suffix == ".parquet" and not formats.own_parquet(file):
+        names = formats.parquet_names(file)
         distinct = [name for name in names if names.count(name) == 1]
-        return read_table(file, names, parquet.columns(file, distinct), told)
+        return read_table(file, names, formats.parquet_columns(file, distinct), told)
     if not told.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
-    if suffix in _READERS:
-        module, reader = _READERS[suffix]
-        return cast("Episodes", getattr(import_module(module), reader)(file))
+    if suffix == ".rrd":
+        return import_module("koopmpc.recording.format.reader").run_episodes(file)  # of a room below this one
     try:
         X, U, steps, text = _own(file, suffix, about)
         named = json.loads(text)
@@ -130,9 +130,9 @@ def _read(file: Path, told: Told) -> Episodes:
 def _own(file: Path, suffix: str, about: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     """Return X, U, steps and the text beside them, of a file that `save_episodes` wrote."""
     if about is not None:
-        return csv.read(file, about)
+        return formats.read_csv(file, about)
     if suffix == ".parquet":
-        return parquet.read(file)
+        return formats.read_parquet(file)
     with disk.Members(file) as held:
         held.require("X", "U", "steps", "about")
         return held["X"], held["U"], held["steps"], str(held["about"])
@@ -145,7 +145,6 @@ def _suffix(file: Path, known: Sequence[str]) -> str:
 
 
 Reader = Callable[[Path], Episodes]
-SUFFIXES = (".npz", ".parquet", ".csv", ".rrd")
 _PART = 8_000_000  # bytes of a part of several files
 _LARGE = 32_000_000  # bytes from which a file is read in groups of rows
 
@@ -216,7 +215,7 @@ class Files(Source):
         """Return the parts of a large file that can be read in groups of rows."""
         if not self._plain or file.suffix != ".parquet" or file.stat().st_size < _LARGE:
             return None
-        return row_groups(file, history, plant)
+        return formats.row_groups(file, history, plant)
 
 
 def _together(files: tuple[Path, ...], reader: Reader, plant: PlantSignature) -> Part:

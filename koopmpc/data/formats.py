@@ -1,12 +1,14 @@
 # pyright: basic
-"""The door to Parquet: episodes as one table, a row a time step, a column a state or an input, in groups of rows.
+"""The door to .csv and .parquet: tables by column, and episodes as one table, a row a time step, exact to the bit.
 
-A group of rows is read without the rest of the file, so that a fit never holds a large file.
+A group of rows of a .parquet file is read without the rest of the file, so that a fit never holds a large file.
 """
 
 import json
+import re
 import zlib
 from functools import partial
+from io import BytesIO
 from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,32 +18,150 @@ import numpy as np
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature
 from koopmpc.data.source import Part
 from koopmpc.disk import affordable
-from koopmpc.errors import DataError, LogError
+from koopmpc.errors import LogError
 
-_KEY, _CHECK = b"koopmpc.episodes", b"koopmpc.check"
+_MARK = "# koopmpc.episodes "
+_OWN = ('"dt": ', '"states": ')  # in the first line of a .csv too: a damaged mark is found
+_LINE = re.compile(r"rows=(\d+) crc32=([0-9a-f]{8}) (.*)")
+_EARLIER = re.compile(r"(\b)([0-9a-f]{8}) (.*)")  # which has no count, and whose checksum is of the rows alone
+_TEXT = ("utf-8-sig", "latin-1")
+_KEY, _CHECK = b"koopmpc.episodes", b"koopmpc.check"  # of the metadata of a .parquet
 _GROUP = 8_000_000  # bytes of a group of rows, about
-ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
+_ADVICE = "pass a file that Episodes.save wrote, or a table as .parquet"
 
 
-def check_names(names: tuple[str, ...], suffix: str) -> None:
-    """Check that no state or input has the name of one of the table's own columns.
+def write_csv(
+    file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str
+) -> None:
+    """Write the stacked rows below a line with their number, a checksum and metadata.
+
+    The inputs of an episode's last row stay empty. The checksum is of the metadata and the rows.
+    """
+    episode, step = _positions(steps)
+    last = step == steps[episode]
+    lines = [",".join(_quoted(name) for name in ("episode", "step", *names))]
+    inputs = iter(U)
+    for e, k, x, end in zip(episode, step, X, last, strict=True):
+        u = [""] * U.shape[1] if end else [repr(float(v)) for v in next(inputs)]
+        lines.append(",".join([str(e), str(k), *(repr(float(v)) for v in x), *u]))
+    body = ("\n".join(lines) + "\n").encode()
+    file.write(f"{_MARK}rows={len(X)} crc32={zlib.crc32(body, zlib.crc32(about.encode())):08x} {about}\n".encode())
+    file.write(body)
+
+
+def csv_about(path: Path) -> str | None:
+    """Return the metadata in the first line of a table that `write_csv` wrote; None for any other table."""
+    with path.open("rb") as file:
+        line = file.readline(1_000_000)
+    text = line.decode(_TEXT[0], errors="replace")
+    if text.startswith(_MARK):
+        return text[len(_MARK) :].strip()
+    return text if text.startswith("#") and any(sign in text for sign in _OWN) else None
+
+
+def csv_columns(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Return the names of all columns, and the columns: numbers, NaN where a cell is empty; others as objects.
+
+    Comma, semicolon or tab is found from the header; with semicolons a decimal comma is understood. Lines above the
+    header that begin with # are skipped.
 
     Raises
     ------
-    DataError
-        One is named "episode" or "step".
+    LogError
+        The file is empty, has no header, or a row has another number of cells.
     """
-    for name in ("episode", "step"):
-        if name in names:
-            raise DataError(f"a {suffix} file has a column {name!r} of its own; rename the state, or save as .npz")
+    import pyarrow as pa
+    from pyarrow import csv
+
+    raw = path.read_bytes()
+    try:
+        raw.decode(_TEXT[0])
+        encoding = "utf8"
+    except UnicodeDecodeError:
+        encoding = _TEXT[1]
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    while raw.startswith(b"#"):
+        raw = raw.partition(b"\n")[2]
+    head, _, rest = raw.partition(b"\n")
+    if not head.strip():
+        raise LogError(
+            f"{path} holds no episodes that can be read: it is no .csv file, or was cut; pass a file that "
+            "Episodes.save wrote, or a table: a line of names, then a row a time step"
+        )
+    separator = max((b",", b";", b"\t"), key=head.count)
+    comma = separator == b";" and b"," in rest.partition(b"\n")[0]
+    try:
+        table = csv.read_csv(
+            BytesIO(raw),
+            read_options=csv.ReadOptions(encoding=encoding),
+            parse_options=csv.ParseOptions(delimiter=separator.decode()),
+            convert_options=csv.ConvertOptions(
+                decimal_point="," if comma else ".",
+                null_values=["", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "#N/A"],
+                strings_can_be_null=True,
+            ),
+        )
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise LogError(f"{path} holds no episodes that can be read: {str(error).splitlines()[0]}") from error
+    names = [name.strip() for name in table.column_names]
+    if any(map(is_a_number, names)):
+        raise LogError(f"{path} has no line of names: its first row is {', '.join(names[:4])}; write one above it")
+    return names, {name: _values(table.column(i)) for i, name in enumerate(names)}
 
 
-def write(file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str) -> None:
+def _values(column) -> np.ndarray:
+    """Return an Arrow column as an array: time stamps in seconds, an empty column as NaN."""
+    import pyarrow as pa
+
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        return column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy() * 1e-9
+    if pa.types.is_null(kind):
+        return np.full(len(column), np.nan)
+    return column.to_numpy()
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"\n') else name
+
+
+def is_a_number(cell: object) -> bool:
+    """Return whether a cell of a table is a real number, or the text of one."""
+    try:
+        float(str(cell))
+    except ValueError:
+        return False
+    return True
+
+
+def read_csv(path: Path, about: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Return X, U, the steps of each episode, and the text beside them, of a table that `write_csv` wrote.
+
+    Raises
+    ------
+    LogError, ValueError
+        It is damaged, or its rows were changed.
+    """
+    line = _LINE.fullmatch(about) or _EARLIER.fullmatch(about)
+    if line is None:
+        raise ValueError("its first line is damaged; take another copy, or remove the line to read a plain table")
+    count, check, about = line.groups()
+    body = path.read_bytes().partition(b"\n")[2].replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n"
+    if f"{zlib.crc32(body, zlib.crc32(about.encode()) if count else 0):08x}" != check:
+        held = body.count(b"\n") - 1
+        what = f"it has {held} rows of {count}, and they" if count and held != int(count) else "its rows"
+        raise ValueError(f"{what} are not those that were written; without its first line it is a plain table")
+    return *_unpacked(csv_columns(path)[1], json.loads(about)), about
+
+
+def write_parquet(
+    file: BinaryIO, X: np.ndarray, U: np.ndarray, steps: np.ndarray, names: tuple[str, ...], about: str
+) -> None:
     """Write the stacked rows; the inputs of an episode's last row are null, for none was applied there."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    episode, step = positions(steps)
+    episode, step = _positions(steps)
     last = step == steps[episode]
     full = np.zeros((len(X), U.shape[1]))
     full[~last] = U
@@ -77,7 +197,7 @@ def _verify(table: Any, named: dict[str, Any], first: int = 0, rows: int | None 
     check = json.loads(metadata[_CHECK])
     size, rows = int(check["rows"]), len(table) if rows is None else rows
     places = np.stack([table[name].to_numpy() for name in ("episode", "step")], axis=1)
-    U = _stacked(table, named["inputs"] + named.get("disturbances", []))
+    U = _stacked(table, _driving(named))
     found = _checksums(metadata[_KEY].decode(), size, first, places, _stacked(table, named["states"]), np.nan_to_num(U))
     if (first + len(table)) % size and first + len(table) < rows:  # the last block is not whole
         found.pop()
@@ -87,8 +207,8 @@ def _verify(table: Any, named: dict[str, Any], first: int = 0, rows: int | None 
         raise ValueError("its numbers are not those that were written; take another copy")
 
 
-def described(path: Path) -> bool:
-    """Return True where `write` wrote the table, so that it holds its own metadata.
+def own_parquet(path: Path) -> bool:
+    """Return True where `write_parquet` wrote the table, so that it holds its own metadata.
 
     Raises
     ------
@@ -107,12 +227,12 @@ def described(path: Path) -> bool:
     return False
 
 
-def names(path: Path) -> list[str]:
+def parquet_names(path: Path) -> list[str]:
     """Return the names of the columns."""
     return _schema(path).names
 
 
-def columns(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
+def parquet_columns(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
     """Return the columns of these names; null is NaN among numbers and None among others.
 
     Raises
@@ -124,8 +244,8 @@ def columns(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy() for name in wanted}
 
 
-def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
-    """Return X, U, the steps of each episode, and the text beside them, of a table that `write` wrote.
+def read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Return X, U, the steps of each episode, and the text beside them, of a table that `write_parquet` wrote.
 
     Raises
     ------
@@ -135,15 +255,9 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     table = _table(path)
     about = table.schema.metadata[_KEY].decode()
     named = json.loads(about)
-    episode, step = (table[name].to_numpy() for name in ("episode", "step"))
-    steps = np.bincount(episode) - 1
-    expected = positions(steps)
-    if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
-        raise ValueError("rows are missing or out of order")
+    X, U, steps = _unpacked(table, named)
     _verify(table, named)
-    last = step == steps[episode]
-    X = _stacked(table, named["states"])
-    return X, _stacked(table, named["inputs"] + named.get("disturbances", []))[~last], steps, about
+    return X, U, steps, about
 
 
 def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignature | None, place: str) -> Episodes:
@@ -227,13 +341,29 @@ def row_groups(file: Path, history: int, plant: PlantSignature | None) -> list[P
     return parts
 
 
-def _stacked(table: Any, names: list[str]) -> np.ndarray:
-    """Return the columns of these names side by side, (rows, columns); null is NaN."""
-    columns = [table[name].to_numpy() for name in names]
-    return np.stack(columns, axis=1) if columns else np.empty((len(table), 0))
+def _unpacked(columns: Any, named: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return X, U and the steps of each episode, of a table of all rows; ValueError where some are out of order."""
+    episode, step = (np.asarray(columns[name], dtype=np.intp) for name in ("episode", "step"))
+    steps = np.bincount(episode) - 1
+    expected = _positions(steps)
+    if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
+        raise ValueError("rows are missing or out of order")
+    last = step == steps[episode]
+    return _stacked(columns, named["states"]), _stacked(columns, _driving(named))[~last], steps
 
 
-def positions(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _driving(named: dict[str, Any]) -> list[str]:
+    """Return the names of the columns of U: the inputs, and behind them the measured disturbances."""
+    return named["inputs"] + named.get("disturbances", [])
+
+
+def _stacked(columns: Any, names: list[str]) -> np.ndarray:
+    """Return the columns of these names side by side, (rows, columns), as numbers; null is NaN."""
+    found = [np.asarray(columns[name], dtype=np.float64) for name in names]
+    return np.stack(found, axis=1) if found else np.empty((len(columns["episode"]), 0))
+
+
+def _positions(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the episode and the step of every row."""
     rows = steps + 1
     first = np.cumsum(rows) - rows
@@ -248,7 +378,7 @@ def _schema(path: Path) -> Any:
         return pq.read_schema(path)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise LogError(
-            f"{path} holds no episodes that can be read: it is no .parquet file, or was cut; {ADVICE}"
+            f"{path} holds no episodes that can be read: it is no .parquet file, or was cut; {_ADVICE}"
         ) from error
 
 
@@ -262,4 +392,4 @@ def _table(path: Path, wanted: list[str] | None = None) -> Any:
             affordable(8 * size, f"{path}: {size} cells")
             return held.read(columns=wanted)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise LogError(f"{path} holds no episodes that can be read: its columns are damaged; {ADVICE}") from error
+        raise LogError(f"{path} holds no episodes that can be read: its columns are damaged; {_ADVICE}") from error

@@ -1,0 +1,73 @@
+#ifdef _WIN32
+#define DOOR __declspec(dllexport)
+#else
+#define DOOR
+#endif
+typedef struct {
+  koopmpc_state *state;
+  koopmpc_real *y;
+  koopmpc_rows reference;
+  koopmpc_real *applied;
+  koopmpc_rows w;
+  koopmpc_real *u;
+  koopmpc_report report;
+} koopmpc_frame;
+DOOR void koopmpc_call(koopmpc_frame *f) {
+  koopmpc_step(f->state, f->y, &f->reference, f->applied, f->w.count ? &f->w : 0, f->u, &f->report);
+}
+DOOR long koopmpc_state_size(void) { return (long)sizeof(koopmpc_state); }
+
+/* A whole run: the controller and the plant step by step, with a clock around the controller. */
+typedef struct {
+  long steps;
+  int nx, ny, preview, measured;
+  void (*step)(const double *x, const double *u, double *next);
+  void (*measure)(const double *x, double *y);
+  const koopmpc_real *rows, *W;
+  double *X, *Y, *U, *slack, *times;
+  int *reports;
+} koopmpc_whole;
+#ifndef KOOPMPC_FLOAT
+static double koopmpc_now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
+  for (long k = 0; k < run->steps; k++) {
+    const koopmpc_rows reference = {run->rows + k * KOOPMPC_NR, run->preview ? KOOPMPC_HORIZON + 1 : 1};
+    const koopmpc_rows w = {run->measured ? run->W + k * KOOPMPC_NW : 0,
+                            run->preview && KOOPMPC_HORIZON > 0 ? KOOPMPC_HORIZON : 1};
+    double *x = run->X + k * run->nx, *u = run->U + k * KOOPMPC_NU;
+    const double start = run->times ? koopmpc_now() : 0;
+    koopmpc_step(f->state, run->Y + k * run->ny, &reference, k ? u - KOOPMPC_NU : 0, run->measured ? &w : 0, u,
+                 &f->report);
+    if (run->times) run->times[k] = koopmpc_now() - start;
+    run->reports[3 * k] = (int)f->report.status;
+    run->reports[3 * k + 1] = (int)f->report.fallback;
+    run->reports[3 * k + 2] = f->report.iterations;
+    run->slack[k] = f->report.slack;
+    run->step(x, u, x + run->nx);
+    run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
+  }
+}
+/* ManyRuns from many states, one after the other, each from the beginning; Y holds one run. */
+DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
+#if KOOPMPC_IS_STAGED
+  const koopmpc_real *targets = f->state->targets;
+  const int count = f->state->target_count;
+#endif
+  for (long e = 0; e < runs; e++) {
+    koopmpc_init(f->state, KOOPMPC_NX == run->nx ? run->X : 0, 0);
+#if KOOPMPC_IS_STAGED
+    koopmpc_use_targets(f->state, targets, count);
+#endif
+    run->measure(run->X, run->Y);
+    koopmpc_run(f, run);
+    run->X += (run->steps + 1) * run->nx;
+    run->U += run->steps * KOOPMPC_NU;
+    run->slack += run->steps;
+    run->reports += 3 * run->steps;
+  }
+}
+#endif

@@ -1,1 +1,0 @@
-"""Episodes on disk: tables, .csv, .parquet, .npz, folders."""
