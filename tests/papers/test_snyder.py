@@ -10,11 +10,10 @@ from scipy.integrate import quad
 import koopmpc as km
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict, verdicts
-from koopmpc.papers.snyder import held_change, rebuilt, report, theory
-from koopmpc.papers.snyder.claims import of_figures, of_text
-from koopmpc.papers.snyder.control import ORACLE
-from koopmpc.papers.snyder.reconstruction import Prediction
-from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains
+from koopmpc.papers.snyder import held_change, report, theory
+from koopmpc.papers.snyder.control import ORACLE, Prediction
+from koopmpc.papers.snyder.report import of_figures, of_text
+from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains, rebuilt
 from koopmpc.recording import page as pages
 from koopmpc.recording.page import Page
 

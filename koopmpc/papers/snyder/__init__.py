@@ -4,9 +4,7 @@ from dataclasses import replace
 
 from koopmpc.papers.registry import Claim, Paper, Tell, verdicts
 from koopmpc.papers.snyder import control, report, theory
-from koopmpc.papers.snyder.claims import Fits, of_figures, of_text
-from koopmpc.papers.snyder.reconstruction import Reconstruction, Setting
-from koopmpc.papers.snyder.settings import OBSERVABLES, SHAKINGS, TASKS, all_settings
+from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Fits, Setting, all_settings, rebuilt
 from koopmpc.recording.page import Page
 
 RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine
@@ -30,8 +28,8 @@ def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
     tasks = {title: control.contest(title, **length) for title in TASKS}
     runs = {title: task.runs() for title, task in tasks.items()}
     progress("figures")
-    said = of_text(fits, causes["DMD on x − x_ref"].error, predicted, control.ratios(runs))
-    shown = of_figures(fits)
+    said = report.of_text(fits, causes["DMD on x − x_ref"].error, predicted, control.ratios(runs))
+    shown = report.of_figures(fits)
     aside = Page(page.folder, page.beside)  # its claim counts in the opening, and its part comes later
     warned = theory.caution(aside, settings, fits)
     report.opening(page, [*said, *shown, *warned], change, others)
@@ -49,11 +47,6 @@ def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
     control.inputs(page, predicted, exciting)
     control.loops(page, tasks, runs, length["episodes"])
     return [*said, *shown, *warned]
-
-
-def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
-    """Return the reconstruction with each set of observables, at full rank and at the rank of the state."""
-    return setting.rebuilt(OBSERVABLES, setting.dynamics.nx)
 
 
 def held_change(settings: dict[str, Setting], fits: Fits) -> float:

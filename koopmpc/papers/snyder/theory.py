@@ -16,9 +16,17 @@ from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Claim, judged, percent, relative
-from koopmpc.papers.snyder.claims import Fits
-from koopmpc.papers.snyder.reconstruction import LINEAR, Reconstruction, Setting, centred, predicted, rebuilt
-from koopmpc.papers.snyder.settings import OBSERVABLES, TARGET
+from koopmpc.papers.snyder.settings import (
+    LINEAR,
+    OBSERVABLES,
+    TARGET,
+    Fits,
+    Reconstruction,
+    Setting,
+    centred,
+    predicted,
+    reconstructed,
+)
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
 from koopmpc.recording.page import Page
 
@@ -190,7 +198,7 @@ def causes(setting: Setting) -> dict[str, Reconstruction]:
     found: dict[str, Reconstruction] = {}
     for name, (lifting, moved, rank) in cases.items():
         data = [centred(each, TARGET) if moved else each for each in (setting.trajectory, setting.held_out)]
-        found[name] = rebuilt(data[0], lifting, data[1], rank)
+        found[name] = reconstructed(data[0], lifting, data[1], rank)
     return found
 
 
