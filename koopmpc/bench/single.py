@@ -12,9 +12,8 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.bench.controllers import LEARNED, Prepared
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.problem import Case
-from koopmpc.bench.results import RunRow, failures, reached
+from koopmpc.bench.problem import Case, load_problem
+from koopmpc.bench.store import RunRow, failures, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
 from koopmpc.control.move import Controller

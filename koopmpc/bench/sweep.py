@@ -17,11 +17,9 @@ import numpy as np
 
 from koopmpc import checks, disk
 from koopmpc.bench.controllers import LEARNED, Prepared, controller_names
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.problem import Problem
-from koopmpc.bench.results import RESULTS, RunRow, write_results
+from koopmpc.bench.problem import Problem, load_problem
 from koopmpc.bench.single import FAULTS, row_of_run
-from koopmpc.bench.store import ROWS, Journal, load_rows, next_batch, opened
+from koopmpc.bench.store import RESULTS, ROWS, Journal, RunRow, load_rows, next_batch, opened, write_results
 from koopmpc.control.limits import Limits
 from koopmpc.errors import ProblemError
 from koopmpc.parallel import map_tasks

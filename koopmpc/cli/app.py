@@ -40,8 +40,8 @@ def main(
 @app.command("list")
 def list_() -> None:
     """Show all problems with their cases, and how the best learned controller did on those that come with koopmpc."""
-    from koopmpc.bench.library import list_problems, load_problem, shipped
     from koopmpc.bench.measured import in_words
+    from koopmpc.bench.problem import list_problems, load_problem, shipped
 
     out, own = console(), shipped()
     for entry in list_problems():
@@ -57,7 +57,7 @@ def list_() -> None:
 @app.command()
 def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file <name>.py is written here.")]) -> None:
     """Write a commented problem file that runs, to be changed into your own."""
-    from koopmpc.bench.library import new_problem
+    from koopmpc.bench.problem import new_problem
 
     with friendly():
         path = new_problem(name)
@@ -108,8 +108,11 @@ def fit(
         say(f"written: {path}; say in it what you want")
         say(f"then: {called('fit', *data, '--goal', path)}")
         return
-    how: dict[str, Any] = {"bilinear": not linear, "workers": workers, "scheduler": scheduler, **reading}
-    how["say"] = lambda text: say(f"{text}\n")
+
+    def told(text: str) -> None:
+        say(f"{text}\n")
+
+    how: dict[str, Any] = {"bilinear": not linear, "workers": workers, "scheduler": scheduler, "say": told, **reading}
     if goal is not None:
         with friendly():
             if horizon is not None:
@@ -162,7 +165,7 @@ def export(
     import numpy as np
 
     from koopmpc.bench.controllers import Prepared
-    from koopmpc.bench.library import load_problem
+    from koopmpc.bench.problem import load_problem
     from koopmpc.codegen.export import export as write
     from koopmpc.synthesis.designed import SavedDesign, made, saved_controller
 

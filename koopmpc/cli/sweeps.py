@@ -45,7 +45,7 @@ def run(
     logs: Logs = Path("logs"),
 ) -> None:
     """Run controllers in closed loop on one problem; one log a run, and a table."""
-    from koopmpc.bench.library import load_problem
+    from koopmpc.bench.problem import load_problem
 
     with friendly(), _page(live):
         loaded = load_problem(problem)
@@ -73,7 +73,7 @@ def bench(
     resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the sweep in this folder.")] = None,
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, from one start or many."""
-    from koopmpc.bench.library import DEFAULT, load_problem, shipped
+    from koopmpc.bench.problem import DEFAULT, load_problem, shipped
     from koopmpc.bench.store import manifest_of
 
     with friendly(), _page(live):
@@ -107,7 +107,7 @@ def compare(
     times: Annotated[bool, typer.Option("--times", help="Step times count too, not only costs.")] = False,
 ) -> None:
     """Compare two sweeps, or two logs, run by run; exit 1 where B is worse than A by more than the threshold."""
-    from koopmpc.bench.compare import compared
+    from koopmpc.bench.inspect import compared
 
     with friendly():
         found = compared(a, b, threshold=threshold, times=times)
@@ -184,8 +184,7 @@ def _sweep(
 ) -> None:
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.report import summary_table, write_report
-    from koopmpc.bench.results import results_table, row_to_view
+    from koopmpc.bench.report import results_table, row_to_view, summary_table, write_report
     from koopmpc.bench.sweep import sweep
 
     controller_names(controllers)

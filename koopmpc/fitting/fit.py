@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.bench.results import RESULTS
+from koopmpc.bench.store import RESULTS
 from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError

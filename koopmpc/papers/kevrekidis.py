@@ -6,7 +6,7 @@ from time import perf_counter
 import casadi as ca
 import numpy as np
 
-from koopmpc.bench.library import load_problem
+from koopmpc.bench.problem import load_problem
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise

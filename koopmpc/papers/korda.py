@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import expm
 
-from koopmpc.bench.library import load_problem
+from koopmpc.bench.problem import load_problem
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC

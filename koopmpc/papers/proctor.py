@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import logm
 
-from koopmpc.bench.library import load_problem
+from koopmpc.bench.problem import load_problem
 from koopmpc.control.lqr import lqr
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
