@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from koopmpc.bench.report import row_to_view as row_to_view
     from koopmpc.bench.report import write_report as write_report
     from koopmpc.bench.single import FAULTS as FAULTS
+    from koopmpc.bench.single import failures as failures
     from koopmpc.bench.single import replayed as replayed
     from koopmpc.bench.store import RunRow as RunRow
-    from koopmpc.bench.store import failures as failures
     from koopmpc.bench.store import load_rows as load_rows
     from koopmpc.bench.store import reached as reached
 else:

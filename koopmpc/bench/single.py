@@ -13,7 +13,7 @@ import numpy as np
 from koopmpc import disk
 from koopmpc.bench.controllers import LEARNED, Prepared
 from koopmpc.bench.problem import Case, load_problem
-from koopmpc.bench.store import RunRow, failures, reached
+from koopmpc.bench.store import RunRow, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
 from koopmpc.control.move import Controller
@@ -44,6 +44,8 @@ FAULTS: dict[str, Fault] = {
     "solver-failure": SolverFailure(0.2),
 }
 _COLD_STEPS, _SLEEP = 25, 0.004  # steps that are timed with cold caches, and the sleep before each [s]
+
+_TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
 
 
 def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **how: bool) -> RunRow:
@@ -84,6 +86,26 @@ def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **ho
         cold_p50=cold[0],
         cold_p99=cold[1],
     )
+
+
+def failures(run: Run, steps: int) -> list[str]:
+    """Return why a run did not end as it should: steps missing, u not finite or beyond a limit, no status."""
+    found: list[str] = []
+    if run.steps != steps:
+        found.append(f"it took {run.steps} of {steps} steps")
+    if not np.isfinite(run.U).all():
+        k = int(np.argwhere(~np.isfinite(run.U))[0][0])
+        found.append(f"u is {run.U[k]} at step {k}")
+    elif run.limits is not None:
+        low, high = run.limits.inputs(run.U.shape[1])
+        beyond = np.maximum(low - run.U, run.U - high)
+        room = _TOLERANCE * (1.0 + np.abs(run.U))
+        if (beyond > room).any():
+            k = int(np.argmax((beyond - room).max(axis=1)))
+            found.append(f"u = {run.U[k]} at step {k} is {beyond[k].max():.3g} beyond a hard limit")
+    if len(run.status) != run.steps:
+        found.append(f"{len(run.status)} of {run.steps} steps have a status")
+    return found
 
 
 def _described(error: Exception, log: Path) -> str:

@@ -37,8 +37,6 @@ _OUTLIVES = 2.0  # time that a worker gets to end after the sweep that it works 
 RESULTS = "results.parquet"  # beside the logs of the runs
 ORACLE = "nonlinear-mpc"
 REACHED = 0.05  # the band around the reference, as a share of the first weighted error
-_TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
-
 KEY = ("problem", "case", "controller", "fault", "noise", "wrong", "seed", "start")
 
 
@@ -107,26 +105,6 @@ class RunRow:
         parts = [self.problem, self.case, self.controller, self.fault]
         parts += [f"{sign}{value:g}" for sign, value in zip("nwsx", self.key[4:], strict=True) if value]
         return "-".join(part for part in parts if part is not None)
-
-
-def failures(run: Run, steps: int) -> list[str]:
-    """Return why a run did not end as it should: steps missing, u not finite or beyond a limit, no status."""
-    found: list[str] = []
-    if run.steps != steps:
-        found.append(f"it took {run.steps} of {steps} steps")
-    if not np.isfinite(run.U).all():
-        k = int(np.argwhere(~np.isfinite(run.U))[0][0])
-        found.append(f"u is {run.U[k]} at step {k}")
-    elif run.limits is not None:
-        low, high = run.limits.inputs(run.U.shape[1])
-        beyond = np.maximum(low - run.U, run.U - high)
-        room = _TOLERANCE * (1.0 + np.abs(run.U))
-        if (beyond > room).any():
-            k = int(np.argmax((beyond - room).max(axis=1)))
-            found.append(f"u = {run.U[k]} at step {k} is {beyond[k].max():.3g} beyond a hard limit")
-    if len(run.status) != run.steps:
-        found.append(f"{len(run.status)} of {run.steps} steps have a status")
-    return found
 
 
 @np.errstate(invalid="ignore", over="ignore")  # a state that diverged does not reach the reference
