@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from koopmpc.bench.problem import shipped as shipped
     from koopmpc.bench.report import median_interval as median_interval
     from koopmpc.bench.report import results_table as results_table
-    from koopmpc.bench.report import row_to_view as row_to_view
     from koopmpc.bench.report import write_report as write_report
     from koopmpc.bench.single import FAULTS as FAULTS
     from koopmpc.bench.single import failures as failures
@@ -24,5 +23,6 @@ if TYPE_CHECKING:
     from koopmpc.bench.store import RunRow as RunRow
     from koopmpc.bench.store import load_rows as load_rows
     from koopmpc.bench.store import reached as reached
+    from koopmpc.bench.store import row_to_view as row_to_view
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

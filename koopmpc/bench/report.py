@@ -32,22 +32,6 @@ _STARTS = 10  # from which a map of starts is drawn
 _LOGS = 12  # runs over one another, at most
 
 
-def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
-    """Return the run to look at first: the koopman-mpc that reaches and costs most compared with nonlinear-mpc.
-
-    Without such a comparison it is the first run of koopman-mpc, else the first run that has a log.
-    """
-    logged = [row for row in rows if row.log is not None and not any(row.key[3:])]
-    koopman = [row for row in logged if row.controller == "koopman-mpc"]
-    oracle = {(row.problem, row.case): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics}
-
-    def ratio(row: RunRow) -> float:
-        best = oracle.get((row.problem, row.case), 0.0)
-        return row.metrics.cost / best if row.reached and row.metrics is not None and best > 0 else 0.0
-
-    return max(koopman, key=ratio) if koopman else next(iter(logged), None)
-
-
 LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
 TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."
 UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell back). See `koopmpc explain WORD`."

@@ -121,6 +121,22 @@ def reached(run: Run) -> bool:
     return bool((last <= REACHED * scale).all() and np.isfinite(last).all())
 
 
+def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
+    """Return the run to look at first: the koopman-mpc that reaches and costs most compared with nonlinear-mpc.
+
+    Without such a comparison it is the first run of koopman-mpc, else the first run that has a log.
+    """
+    logged = [row for row in rows if row.log is not None and not any(row.key[3:])]
+    koopman = [row for row in logged if row.controller == "koopman-mpc"]
+    oracle = {(row.problem, row.case): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics}
+
+    def ratio(row: RunRow) -> float:
+        best = oracle.get((row.problem, row.case), 0.0)
+        return row.metrics.cost / best if row.reached and row.metrics is not None and best > 0 else 0.0
+
+    return max(koopman, key=ratio) if koopman else next(iter(logged), None)
+
+
 _FIGURES: dict[str, type] = {
     "cost": float, "tracking_rmse": np.ndarray, "final_error": np.ndarray, "violation": float, "violation_share": float,
     "input_violation": float, "effort": float, "settling_time": float, "solve_time_p50": float, "solve_time_p99": float,

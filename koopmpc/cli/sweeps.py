@@ -184,7 +184,8 @@ def _sweep(
 ) -> None:
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.report import results_table, row_to_view, summary_table, write_report
+    from koopmpc.bench.report import results_table, summary_table, write_report
+    from koopmpc.bench.store import row_to_view
     from koopmpc.bench.sweep import sweep
 
     controller_names(controllers)

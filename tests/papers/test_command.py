@@ -12,8 +12,8 @@ import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.papers import korda, registry
 from koopmpc.papers.registry import PAPERS, Claim, Verdict, compared, find_paper, judged, percent, short, show
-from koopmpc.papers.snyder.control import ORACLE, contest, costs, predictions
-from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, all_settings
+from koopmpc.papers.snyder_control import ORACLE, contest, costs, predictions
+from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, all_settings
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
 QUICK = (

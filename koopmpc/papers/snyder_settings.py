@@ -23,6 +23,7 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
 from koopmpc.values import Value
 
+RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine
 CUT = 1e-10  # "full rank" keeps the singular values above this share of the largest
 LINEAR = 0.05  # relative error over a whole run below which an eigenfunction counts as one
 _STEADY = 1e-4  # an eigenfunction with |λ − 1| below it is a constant
@@ -199,6 +200,15 @@ def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
 
 
 Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by setting, then as `rebuilt` returns them
+
+
+def held_change(settings: Mapping[str, Setting], fits: Fits) -> float:
+    """Return the largest relative change of an error above `RESOLVED` where the feedback is held over a sample."""
+    changes: list[float] = []
+    for name in ("pendulum-lqr", "cart-pole-lqr"):
+        held = rebuilt(replace(settings[name], held=True, others=1))
+        changes += [abs(held[key].error / fit.error - 1) for key, fit in fits[name].items() if fit.error > RESOLVED]
+    return max(changes)
 
 
 def centred(episodes: Episodes, x_ref: ArrayLike) -> Episodes:

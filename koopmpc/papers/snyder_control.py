@@ -27,7 +27,7 @@ from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
 from koopmpc.papers.registry import percent, relative
-from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Setting, Shaking, centred, gains
+from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, Setting, Shaking, centred, gains
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor

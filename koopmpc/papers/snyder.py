@@ -1,4 +1,4 @@
-"""The report on Snyder & Song (2021): the verdicts on its claims, what it left open, its figures and their numbers."""
+"""Snyder & Song 2021, done again: the verdicts on its claims, what it left open, its figures and their numbers."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -9,10 +9,24 @@ from koopmpc.data.excitation import Noise
 from koopmpc.errors import unwarned
 from koopmpc.figures.comparisons import reconstruction
 from koopmpc.identify.fits.dmd import dmd, dmdc
+from koopmpc.papers import snyder_control as control
+from koopmpc.papers import snyder_theory as theory
 from koopmpc.papers.plants import Pendulum, inputs_of, trajectories
-from koopmpc.papers.registry import Claim, judged, percent, relative, summary
-from koopmpc.papers.snyder.control import Prediction
-from koopmpc.papers.snyder.settings import FIGURES, VARIANTS, Fits, Reconstruction, Setting, Shown, gains
+from koopmpc.papers.registry import Claim, Paper, Tell, judged, percent, relative, summary, verdicts
+from koopmpc.papers.snyder_settings import (
+    FIGURES,
+    SHAKINGS,
+    TASKS,
+    VARIANTS,
+    Fits,
+    Reconstruction,
+    Setting,
+    Shown,
+    all_settings,
+    gains,
+    held_change,
+    rebuilt,
+)
 from koopmpc.plants.integrators import RK4
 from koopmpc.plants.step_map import discretize
 from koopmpc.recording.page import Page
@@ -71,6 +85,45 @@ GAINS = "u = −K (x − x_ref), continuous-time LQR on the exact Jacobian unles
 HEAD = ("data", "observables", "rank", "σ₁/σ_r", "error [%]", "held out [%]", "leading φ [%]", "φ within 5 %")
 
 
+def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
+    """Fill the page and return all claims; `quick` shortens what takes long."""
+    progress("trajectories and their reconstructions")
+    others = 3 if quick else 10
+    settings = all_settings(others)
+    fits = {name: rebuilt(setting) for name, setting in settings.items()}
+    change = held_change(settings, fits)
+    causes = theory.causes(settings["cart-pole-lqr"])
+    progress("models of exciting data")
+    exciting = 10 if quick else 40
+    predicted = {
+        name: control.predictions(settings[f"{name}-lqr"], shaking, exciting) for name, shaking in SHAKINGS.items()
+    }
+    progress("control on lifted models")
+    length = {"steps": 20, "horizon": 8, "episodes": 30} if quick else {"steps": 200, "horizon": 60, "episodes": 100}
+    tasks = {title: control.contest(title, **length) for title in TASKS}
+    runs = {title: task.runs() for title, task in tasks.items()}
+    progress("figures")
+    said = of_text(fits, causes["DMD on x − x_ref"].error, predicted, control.ratios(runs))
+    shown = of_figures(fits)
+    aside = Page(page.folder, page.beside)  # its claim counts in the opening, and its part comes later
+    warned = theory.caution(aside, settings, fits)
+    opening(page, [*said, *shown, *warned], change, others)
+    page.text("## What the paper says in words")
+    verdicts(page, said)
+    numbers(page, settings, fits, shown)
+    pictures(page, settings, fits)
+    appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
+    variants(page, settings, fits)
+    feedbacks(page)
+    theory.frequencies(page, fits)
+    theory.formulas(page, settings["pendulum"], fits)
+    page.parts += aside.parts
+    theory.failure(page, settings["cart-pole-lqr"], causes)
+    control.inputs(page, predicted, exciting)
+    control.loops(page, tasks, runs, length["episodes"])
+    return [*said, *shown, *warned]
+
+
 def of_figure(shown: Shown, setting: str, says: str, fits: Fits) -> Claim:
     """Return the claim of one picture of the paper."""
     own, base = fits[setting][shown.method, True], fits[setting]["DMD", True]
@@ -115,7 +168,7 @@ def of_figures(fits: Fits) -> list[Claim]:
 def of_text(
     fits: Fits,
     centred: float,
-    predictions: Mapping[str, Mapping[str, Prediction]],
+    predictions: Mapping[str, Mapping[str, control.Prediction]],
     ratios: Mapping[str, Mapping[str, float]],
 ) -> list[Claim]:
     """Return the claims of abstract, results and discussion, in our words.
@@ -229,7 +282,7 @@ def _listed(errors: Iterable[float]) -> str:
     return " and ".join(percent(error) for error in errors)
 
 
-def _shares(found: list[Prediction]) -> str:
+def _shares(found: list[control.Prediction]) -> str:
     return " and ".join(f"{p.b:.3f}" for p in found)
 
 
@@ -408,3 +461,6 @@ def _curves(method: str, found: Mapping[tuple[str, bool], Reconstruction]) -> di
     """Return the reconstructions of one method, named after their rank."""
     fits = [found[method, full] for full in (True, False) if (method, full) in found]
     return {"full rank" if i == 0 else f"rank {fit.rank}": fit.X for i, fit in enumerate(fits)}
+
+
+paper = Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", work)
