@@ -59,7 +59,8 @@ def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **ho
     row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
     try:
         run = closed_loop(parts, row, plans=logged, **how)
-        judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[row.case].steps)
+        figures, arrived = metrics(run), reached(run)
+        found = failures(run, parts.problem.cases[row.case].steps)
     except FullDiskError:
         raise
     except Exception as error:  # the other runs go on; the exit code says that one failed
@@ -74,17 +75,17 @@ def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **ho
         except Exception as error:  # the figures of the run are kept without its log
             found.append(_described(error, log))
     usual = logged and row.fault is None and not row.noise and not row.wrong
-    cold = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
+    p50, p99 = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
     return replace(
         row,
-        metrics=judged[0],
-        reached=judged[1],
+        metrics=figures,
+        reached=arrived,
         training_time=parts.training_time if row.controller in LEARNED else 0.0,
         log=log if log.exists() else None,
         failure="; ".join(found) or None,
         elapsed=time.perf_counter() - begin,
-        cold_p50=cold[0],
-        cold_p99=cold[1],
+        cold_p50=p50,
+        cold_p99=p99,
     )
 
 
