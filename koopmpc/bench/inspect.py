@@ -1,4 +1,4 @@
-"""What finished runs say: inspected, the figures of logs and their worst moments; compared, two sweeps, or two logs."""
+"""What finished runs say: `inspected`, a log and its worst moments; `compared`, what got worse from A to B."""
 
 import ast
 import warnings

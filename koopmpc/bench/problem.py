@@ -1,4 +1,4 @@
-"""Problem: a plant, how to learn it, how to control it, the cases that controllers are compared in, and its file."""
+"""Problem: a plant, how to learn it, how to control it, and the cases to compare in; and the files that hold one."""
 
 import ast
 import hashlib

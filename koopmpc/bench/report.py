@@ -1,4 +1,4 @@
-"""What a sweep found: tables for a terminal, and write_report, one HTML file, the same as Markdown and CSV."""
+"""What a sweep found, in tables for a terminal, and by `write_report` as one HTML file, as Markdown and as CSV."""
 
 import csv
 import html
@@ -30,7 +30,6 @@ from koopmpc.validate.text import markdown_table, plain_table
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
 _LOGS = 12  # runs over one another, at most
-
 
 LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
 TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."

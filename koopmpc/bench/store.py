@@ -1,4 +1,4 @@
-"""The store of a sweep: what was asked for, a line for each finished run, a RunRow, and the table that is made of them.
+"""The store of a sweep: what was asked for, a line for each finished run, its `RunRow`, and the table of all rows.
 
 A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
 It holds its file locked meanwhile: a sweep that goes on waits for workers which outlive the sweep that was killed.

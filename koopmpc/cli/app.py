@@ -1,4 +1,4 @@
-"""The command line: each command parses, calls one function, and prints."""
+"""The command line: each command parses, calls one function, and prints; and the words that `explain` knows."""
 
 from contextlib import suppress
 from pathlib import Path

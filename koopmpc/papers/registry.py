@@ -1,7 +1,7 @@
 """The papers that can be reproduced: what each says, how its claims are judged, and the page that is written.
 
-A paper is a `Paper` in the module, or the folder, of its name. docs/papers/ holds the pages and pictures that
-`koopmpc reproduce` writes: copy both after a change.
+A paper is a `Paper` in the module of its name, or in that of its authors. docs/papers/ holds the pages and pictures
+that `koopmpc reproduce` writes: copy both after a change.
 """
 
 from collections import Counter

@@ -188,7 +188,8 @@ class Setting:
 def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
     """Return the reconstruction with each of `OBSERVABLES`, by its name and by whether all singular values were kept.
 
-    The others keep as many as there are states; with no more observables than states there is the full rank alone.
+    Where not all are kept, as many are as there are states; no more observables than states are fitted at full rank
+    alone.
     """
     found: dict[tuple[str, bool], Reconstruction] = {}
     for name, lifting in OBSERVABLES.items():
