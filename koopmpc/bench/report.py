@@ -393,10 +393,11 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
         + ", ".join(f"{name} {number}" for name, number in machine["versions"].items())
         + ".",
     ]
-    doubt = (
-        [f"the load was {machine['load']} on {machine['cores']} cores"] if machine["load"] > machine["cores"] else []
-    )
-    doubt += [] if machine["blas_threads"] == "1" else ["BLAS was not limited to one thread"]
+    doubt: list[str] = []
+    if machine["load"] > machine["cores"]:
+        doubt.append(f"the load was {machine['load']} on {machine['cores']} cores")
+    if machine["blas_threads"] != "1":
+        doubt.append("BLAS was not limited to one thread")
     if doubt:
         lines.append(f"Step times are not to be trusted: {', and '.join(doubt)}.")
     lines += [f"{row.name} failed: {row.failure}" for row in failed[:20]]
