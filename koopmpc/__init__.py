@@ -24,10 +24,10 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc import scene as scene
     from koopmpc import synthesis as synthesis
     from koopmpc import validate as validate
-    from koopmpc.bench.library import load_problem as load_problem
     from koopmpc.bench.problem import Case as Case
     from koopmpc.bench.problem import Problem as Problem
     from koopmpc.bench.problem import Training as Training
+    from koopmpc.bench.problem import load_problem as load_problem
     from koopmpc.bench.sweep import sweep as sweep
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export
@@ -114,7 +114,7 @@ else:
             "spectrum": "predict.spectrum",
         },
         core=(
-            "bench.library",
+            "bench.problem",
             "control.linear.koopman_mpc",
             "control.lqr",
             "control.nonlinear.bilinear_mpc",

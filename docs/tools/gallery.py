@@ -16,10 +16,10 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.bench.controllers import LEARNED, Prepared
-from koopmpc.bench.library import shipped
 from koopmpc.bench.measured import baseline_of, best_learned, goals, markdown, measured
-from koopmpc.bench.results import RunRow
+from koopmpc.bench.problem import shipped
 from koopmpc.bench.single import closed_loop
+from koopmpc.bench.store import RunRow
 from koopmpc.recording.page import Page
 from koopmpc.recording.video import export_video
 

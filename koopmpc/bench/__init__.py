@@ -5,24 +5,24 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.bench.compare import compared as compared
     from koopmpc.bench.controllers import CONTROLLERS as CONTROLLERS
     from koopmpc.bench.controllers import Prepared as Prepared
     from koopmpc.bench.inspect import Where as Where
+    from koopmpc.bench.inspect import compared as compared
     from koopmpc.bench.inspect import inspected as inspected
     from koopmpc.bench.inspect import worst_moments as worst_moments
-    from koopmpc.bench.library import list_problems as list_problems
-    from koopmpc.bench.library import new_problem as new_problem
-    from koopmpc.bench.library import shipped as shipped
+    from koopmpc.bench.problem import list_problems as list_problems
+    from koopmpc.bench.problem import new_problem as new_problem
+    from koopmpc.bench.problem import shipped as shipped
     from koopmpc.bench.report import median_interval as median_interval
+    from koopmpc.bench.report import results_table as results_table
     from koopmpc.bench.report import write_report as write_report
-    from koopmpc.bench.results import RunRow as RunRow
-    from koopmpc.bench.results import failures as failures
-    from koopmpc.bench.results import reached as reached
-    from koopmpc.bench.results import results_table as results_table
-    from koopmpc.bench.results import row_to_view as row_to_view
     from koopmpc.bench.single import FAULTS as FAULTS
+    from koopmpc.bench.single import failures as failures
     from koopmpc.bench.single import replayed as replayed
+    from koopmpc.bench.store import RunRow as RunRow
     from koopmpc.bench.store import load_rows as load_rows
+    from koopmpc.bench.store import reached as reached
+    from koopmpc.bench.store import row_to_view as row_to_view
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -40,8 +40,6 @@ from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor, load_model
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import AnyMPC, Design, load_controller, made
-
-Found = TypeVar("Found")
 
 
 class Prepared:
@@ -81,20 +79,28 @@ class Prepared:
         numbers = {"training_time": 0.0, "spread": self.spread.tolist()}
         with suppress(DataError):
             if names & {"koopman-lqr", "koopman-mpc", "offset-free", "adaptive"}:
-                self.model.save(kept.with_name(f"{kept.name}-linear.npz"))
+                self.model.save(f"{kept}-linear.npz")
                 numbers["training_time"] = self.training_time
             if names & {"bilinear-mpc", "bilinear-offset"}:
-                self.bilinear.save(kept.with_name(f"{kept.name}-bilinear.npz"))
+                self.bilinear.save(f"{kept}-bilinear.npz")
             if "designed" in names:
                 for case in self.problem.cases:
-                    self.design(self.problem.limits_of(case)).save(kept.with_name(f"{kept.name}-{case}.npz"))
-        with disk.writing(kept.with_name(f"{kept.name}.json")) as stream:
+                    self.design(self.problem.limits_of(case)).save(f"{kept}-{case}.npz")
+        with disk.writing(f"{kept}.json") as stream:
             stream.write(json.dumps(numbers).encode())
+
+    def _file(self, ending: str) -> Path | None:
+        """Return the file of this ending that `keep` wrote; None where it did not."""
+        if self._kept is None:
+            return None
+        path = Path(f"{self._kept}{ending}")
+        return path if path.is_file() else None
 
     @cached_property
     def _numbers(self) -> dict[str, Any]:
         """What `keep` wrote beside the models."""
-        return {} if self._kept is None else _read(self._kept.with_name(f"{self._kept.name}.json"), _json) or {}
+        file = self._file(".json")
+        return {} if file is None else json.loads(file.read_bytes())
 
     @cached_property
     def spread(self) -> Float[np.ndarray, " ny"]:
@@ -217,9 +223,9 @@ class Prepared:
     @cached_property
     def model(self) -> LinearPredictor:
         """z⁺ = A z + B u fitted to the data; `training_time` [s] is how long data and fit took."""
-        if (kept := self._learned("linear")) is not None:
+        if (file := self._file("-linear.npz")) is not None:
             self.training_time = self._numbers.get("training_time", 0.0)
-            return cast("LinearPredictor", kept)
+            return cast("LinearPredictor", load_model(file))
         start = time.perf_counter()
         model = edmd(self.data, self.problem.lifting, ridge=self.problem.ridge)
         self.training_time = time.perf_counter() - start
@@ -253,28 +259,15 @@ class Prepared:
     @cached_property
     def bilinear(self) -> BilinearPredictor:
         """z⁺ = A z + B u + Σ uᵢ Nᵢ z fitted to the same data with the same lifting."""
-        if (kept := self._learned("bilinear")) is not None:
-            return cast("BilinearPredictor", kept)
+        if (file := self._file("-bilinear.npz")) is not None:
+            return cast("BilinearPredictor", load_model(file))
         return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True)
 
     def kept_design(self, limits: Limits) -> AnyMPC | None:
         """Return the designed controller for these limits that `keep` wrote; None where it did not."""
         case = next((case for case in self.problem.cases if self.problem.limits_of(case) == limits), None)
-        if self._kept is None or case is None:
-            return None
-        return _read(self._kept.with_name(f"{self._kept.name}-{case}.npz"), load_controller)
-
-    def _learned(self, kind: str) -> LinearPredictor | BilinearPredictor | None:
-        """Return the model that `keep` wrote; None where it did not."""
-        return None if self._kept is None else _read(self._kept.with_name(f"{self._kept.name}-{kind}.npz"), load_model)
-
-
-def _read(path: Path, read: Callable[[Path], Found]) -> Found | None:
-    return read(path) if path.is_file() else None
-
-
-def _json(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_bytes())
+        file = None if case is None else self._file(f"-{case}.npz")
+        return None if file is None else load_controller(file)
 
 
 Build = Callable[[Prepared, Limits], Controller]
@@ -297,36 +290,32 @@ def _linear_mpc(parts: Prepared, limits: Limits) -> Controller:
     return LinearMPC(parts.step_map, *problem.equilibrium, problem.cost, limits, problem.horizon)
 
 
-def _koopman_mpc(parts: Prepared, limits: Limits) -> Controller:
+def _koopman_mpc(parts: Prepared, limits: Limits, estimator: LiftedDisturbance | None = None) -> KoopmanMPC:
     """MPC on the lifted predictor, learned from data."""
-    return KoopmanMPC(parts.model, parts.problem.cost, limits, parts.problem.horizon, monitor=parts.watched)
+    cost, horizon = parts.problem.cost, parts.problem.horizon
+    return KoopmanMPC(parts.model, cost, limits, horizon, estimator=estimator, monitor=parts.watched)
 
 
 def _offset_free(parts: Prepared, limits: Limits) -> Controller:
     """MPC on the lifted predictor, with an estimated disturbance of every lifted coordinate."""
-    problem = parts.problem
-    return KoopmanMPC(
-        parts.model, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance(), monitor=parts.watched
-    )
+    return _koopman_mpc(parts, limits, LiftedDisturbance())
 
 
-def _bilinear_mpc(parts: Prepared, limits: Limits) -> Controller:
+def _bilinear_mpc(parts: Prepared, limits: Limits, estimator: LiftedDisturbance | None = None) -> BilinearMPC:
     """Real-time iteration on the bilinear predictor, which is lifted anew at every step of the plan."""
-    return BilinearMPC(parts.bilinear, parts.problem.cost, limits, parts.problem.horizon, monitor=parts.watched)
+    cost, horizon = parts.problem.cost, parts.problem.horizon
+    return BilinearMPC(parts.bilinear, cost, limits, horizon, estimator=estimator, monitor=parts.watched)
 
 
 def _bilinear_offset(parts: Prepared, limits: Limits) -> Controller:
     """The same on the bilinear predictor, with an estimated disturbance of every state."""
-    problem = parts.problem
-    return BilinearMPC(
-        parts.bilinear, problem.cost, limits, problem.horizon, estimator=LiftedDisturbance(), monitor=parts.watched
-    )
+    return _bilinear_mpc(parts, limits, LiftedDisturbance())
 
 
 def _adaptive(parts: Prepared, limits: Limits) -> Controller:
     """The same as koopman-mpc, with a model that goes on learning from each step that its monitor knows."""
     problem = parts.problem
-    mpc = KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, monitor=parts.watched)
+    mpc = _koopman_mpc(parts, limits)
     online = OnlineEDMD.start(parts.data, problem.lifting, forgetting=_FORGETTING, ridge=problem.ridge)
     return Adaptive(mpc, online)
 

@@ -14,9 +14,8 @@ from jaxtyping import Float
 
 from koopmpc import disk
 from koopmpc.bench.controllers import LEARNED
-from koopmpc.bench.library import load_problem, shipped
-from koopmpc.bench.problem import Problem
-from koopmpc.bench.results import ORACLE, RunRow
+from koopmpc.bench.problem import Problem, load_problem, shipped
+from koopmpc.bench.store import ORACLE, RunRow
 from koopmpc.bench.sweep import sweep
 from koopmpc.scene import Shape
 

@@ -1,9 +1,10 @@
-"""write_report: a sweep as one HTML file without a network, and the same as Markdown and CSV."""
+"""What a sweep found, in tables for a terminal, and by `write_report` as one HTML file, as Markdown and as CSV."""
 
 import csv
 import html
 import io
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import groupby
 from pathlib import Path
@@ -12,15 +13,15 @@ from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from koopmpc import disk
-from koopmpc.bench.results import ORACLE, RunRow
-from koopmpc.bench.store import load_rows, manifest_of
+from koopmpc.bench.store import ORACLE, RunRow, load_rows, manifest_of
 from koopmpc.control.move import Fallback, Status
 from koopmpc.figures.sweeps import attraction, profiles, svg, times, trajectories
-from koopmpc.loop.metrics import duration
+from koopmpc.loop.metrics import Metrics, duration
 from koopmpc.loop.run import Run
 from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.format.reader import load_run
@@ -29,6 +30,101 @@ from koopmpc.validate.text import markdown_table, plain_table
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
 _LOGS = 12  # runs over one another, at most
+
+LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
+TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."
+UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell back). See `koopmpc explain WORD`."
+
+
+def results_table(rows: Sequence[RunRow]) -> RenderableType:
+    """Return one table for each case, each failure in full and once, and what the columns mean, within 100 columns."""
+    parts: list[RenderableType] = []
+    for (problem, case), group in groupby(rows, key=lambda row: (row.problem, row.case)):
+        ran = list(group)
+        parts.append(_case(f"{problem}:{case}", [row for row in ran if row.fault is None]))
+        if any(row.fault is not None for row in ran):
+            parts.append(_under_faults(f"{problem}:{case} under faults", ran))
+    failed: dict[str, list[str]] = {}
+    for row in rows:
+        if row.failure is not None:
+            what = " ".join(filter(None, (f"{row.problem}:{row.case}", row.controller, row.fault)))
+            failed.setdefault(row.failure, []).append(what)
+    parts += [Text(f"{', '.join(which)}: {failure}", style="red") for failure, which in failed.items()]
+    broken = any(row.fault is not None for row in rows)
+    parts.append(Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
+    return Group(*parts)
+
+
+def _case(title: str, rows: list[RunRow]) -> Table:
+    lines = plain_table(title, (), padding=(0, 0, 0, 1))
+    lines.add_column("controller", no_wrap=True)
+    measured = [row.metrics for row in rows if row.metrics is not None]
+    violated = any(figures.violation > 0 for figures in measured)
+    for heading in ("cost", "ratio", "settles", "off", *["over"] * violated, "p50", "p99"):
+        lines.add_column(heading, justify="right", no_wrap=True)
+    lines.add_column("steps")
+    oracle = next((row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics), np.nan)
+    for row in rows:
+        if row.metrics is None:
+            lines.add_row(row.controller, "raised", style="red")
+        else:
+            cells = _line(row, row.metrics, oracle, violated)
+            lines.add_row(row.controller, *cells, style="red" if row.failure else None)
+    learned = max((row.training_time for row in rows), default=0.0)
+    if learned:
+        lines.caption = f"Koopman model learned from data in {duration(learned)}"
+        lines.caption_justify = "left"
+    return lines
+
+
+def _line(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
+    """Yield the cells of a run after the controller's name."""
+    yield f"{figures.cost:.1f}" if figures.cost < 1e5 else f"{figures.cost:.2g}"
+    ratio = figures.cost / oracle if oracle > 0 else np.nan
+    yield "–" if np.isnan(ratio) else f"{ratio:.3f}" if ratio < 100 else f"{ratio:.1g}"
+    if not row.reached:
+        yield "does not reach"
+    else:
+        yield f"{figures.settling_time:.2f} s" if np.isfinite(figures.settling_time) else "within 5 %"
+    yield f"{np.abs(figures.final_error).max():.1g}"
+    if violated:
+        yield f"{figures.violation:.2g}"
+    yield duration(figures.solve_time_p50)
+    yield duration(figures.solve_time_p99)
+    counts = ", ".join(f"{count} {STATUS_WORDS[Status[name]]}" for name, count in figures.status.items())
+    yield counts + ("" if figures.unknown is None else f"; {figures.unknown} unknown")
+
+
+def _under_faults(title: str, rows: Sequence[RunRow]) -> Table:
+    """Return a table of the runs of one case with a line for each controller, relative to its run without faults."""
+    whole = {row.controller: row for row in rows if row.fault is None}
+    found = {(row.fault, row.controller): row for row in rows if row.fault is not None}
+    # Without padding the box still has a blank between columns.
+    lines = plain_table(title, (), min_width=len(title), padding=0, show_edge=False)
+    faults = list(dict.fromkeys(fault for fault, _ in found))
+    lines.add_column("controller", no_wrap=True)
+    for fault in faults:
+        lines.add_column(str(fault).replace("-", "\n"), justify="right", no_wrap=True)
+    for name, own in whole.items():
+        cells = [_cell(found[fault, name], own) for fault in faults]
+        failed = any(found[fault, name].failure for fault in faults)
+        lines.add_row(name, *cells, style="red" if failed else None)
+    return lines
+
+
+def _cell(row: RunRow, whole: RunRow) -> str:
+    """Return the cell of a run under a fault: its cost over that of the run without the fault, or a word."""
+    if row.metrics is None:
+        return "raised"
+    if not row.reached:
+        word = "lost" if whole.reached else "–"
+    elif whole.metrics is not None and whole.metrics.cost > 0:
+        ratio = row.metrics.cost / whole.metrics.cost
+        word = f"{ratio:.3f}" if ratio < 100 else f"{ratio:.1g}"
+    else:
+        word = "reaches"
+    fell_back = sum(count for name, count in row.metrics.fallback.items() if name != "NONE")
+    return f"{word} ({fell_back})" if fell_back else word
 
 
 @dataclass(frozen=True)
@@ -89,17 +185,13 @@ def summaries(rows: Sequence[RunRow]) -> list[Summary]:
     for row in rows:
         groups.setdefault((f"{row.problem}:{row.case}", condition_of(row), row.controller), []).append(row)
     for key, own in groups.items():
-        measured = [(row, row.metrics) for row in own if row.metrics is not None]
-        costs = np.array([figures.cost for _, figures in measured])
-        oracle = np.array([best.get(_pair(row), np.nan) for row, _ in measured])
+        figures = [row.metrics for row in own if row.metrics is not None]
+        costs = np.array([each.cost for each in figures])
+        oracle = np.array([best.get(_pair(row), np.nan) for row in own if row.metrics is not None])
         with np.errstate(all="ignore"):
             ratios = np.where(oracle > 0, costs / oracle, np.nan)
-        over = np.array([figures.violation for _, figures in measured])
-        steps = sum(sum(figures.status.values()) for _, figures in measured)
-        kept = sum(figures.fallback.get(Fallback.NONE.name, 0) for _, figures in measured)
-        hot = np.array([(f.solve_time_p50, f.solve_time_p99) for _, f in measured]).reshape(-1, 2)
-        cold = np.array([row.cold_p50 for row, _ in measured])
-        cold = cold[np.isfinite(cold)]
+        steps = sum(sum(each.status.values()) for each in figures)
+        kept = sum(each.fallback.get(Fallback.NONE.name, 0) for each in figures)
         found.append(
             Summary(
                 *key,
@@ -108,15 +200,20 @@ def summaries(rows: Sequence[RunRow]) -> list[Summary]:
                 reached=sum(row.reached for row in own) / len(own),
                 **dict(zip(("cost", "cost_low", "cost_high"), median_interval(costs), strict=True)),
                 **dict(zip(("ratio", "ratio_low", "ratio_high"), median_interval(ratios), strict=True)),
-                violation=float(np.median(over)) if len(over) else float("nan"),
-                worst_violation=float(over.max(initial=0.0)),
+                violation=_median([each.violation for each in figures]),
+                worst_violation=float(np.max([each.violation for each in figures], initial=0.0)),
                 fell_back=1.0 - kept / steps if steps else float("nan"),
-                p50=float(np.median(hot[:, 0])) if len(hot) else float("nan"),
-                p99=float(np.median(hot[:, 1])) if len(hot) else float("nan"),
-                cold_p50=float(np.median(cold)) if len(cold) else float("nan"),
+                p50=_median([each.solve_time_p50 for each in figures]),
+                p99=_median([each.solve_time_p99 for each in figures]),
+                cold_p50=_median([row.cold_p50 for row in own if np.isfinite(row.cold_p50)]),
             )
         )
     return found
+
+
+def _median(values: Sequence[float]) -> float:
+    """Return the median, NaN of no values."""
+    return float(np.median(values)) if values else float("nan")
 
 
 def _pair(row: RunRow) -> tuple[Any, ...]:
@@ -212,9 +309,8 @@ def _sections(rows: Sequence[RunRow], found: Sequence[Summary], folder: Path) ->
         lines = [_cells(summary) for summary in group]
         logs = [row.log.name for row in own if row.log is not None and row.log.is_file()]
         yield _Section(title, _HEADINGS, lines, list(_pictures(own, usual, folder)), logs)
-    lines = [(case, name, *counts) for case, name, counts in _statuses(rows)]
     whole = list(_profile(rows)) if len({each.case for each in found}) > 1 else []
-    yield _Section("All cases", ("case", "controller", "steps", "how steps ended"), lines, whole, [])
+    yield _Section("All cases", ("case", "controller", "steps", "how steps ended"), list(_statuses(rows)), whole, [])
 
 
 def _pictures(own: Sequence[RunRow], usual: Sequence[RunRow], folder: Path) -> Iterable[tuple[str, str]]:
@@ -265,17 +361,17 @@ def _logged(usual: Sequence[RunRow], folder: Path) -> dict[str, Run]:
     return {row.controller: load_run(folder / row.log.name) for row in own[:_LOGS] if row.log is not None}
 
 
-def _statuses(rows: Sequence[RunRow]) -> Iterable[tuple[str, str, tuple[str, str]]]:
-    groups: dict[tuple[str, str], dict[str, int]] = {}
+def _statuses(rows: Sequence[RunRow]) -> Iterable[tuple[str, ...]]:
+    """Yield how the steps of each case and controller ended, over all runs."""
+    groups: dict[tuple[str, str], Counter[str]] = {}
     for row in rows:
-        counts = groups.setdefault((f"{row.problem}:{row.case}", row.controller), {})
+        counts = groups.setdefault((f"{row.problem}:{row.case}", row.controller), Counter())
         if row.metrics is not None:
-            for name, count in row.metrics.status.items():
-                counts[name] = counts.get(name, 0) + count
-    for (case, controller), counts in groups.items():
-        total = sum(counts.values())
+            counts.update(row.metrics.status)
+    for key, counts in groups.items():
+        total = counts.total()
         parts = [f"{100 * n / total:.3g} % {STATUS_WORDS[Status[name]]}" for name, n in counts.items() if n]
-        yield case, controller, (str(total), ", ".join(parts))
+        yield *key, str(total), ", ".join(parts)
 
 
 def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
@@ -297,10 +393,11 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
         + ", ".join(f"{name} {number}" for name, number in machine["versions"].items())
         + ".",
     ]
-    doubt = (
-        [f"the load was {machine['load']} on {machine['cores']} cores"] if machine["load"] > machine["cores"] else []
-    )
-    doubt += [] if machine["blas_threads"] == "1" else ["BLAS was not limited to one thread"]
+    doubt: list[str] = []
+    if machine["load"] > machine["cores"]:
+        doubt.append(f"the load was {machine['load']} on {machine['cores']} cores")
+    if machine["blas_threads"] != "1":
+        doubt.append("BLAS was not limited to one thread")
     if doubt:
         lines.append(f"Step times are not to be trusted: {', and '.join(doubt)}.")
     lines += [f"{row.name} failed: {row.failure}" for row in failed[:20]]

@@ -12,9 +12,8 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.bench.controllers import LEARNED, Prepared
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.problem import Case
-from koopmpc.bench.results import RunRow, failures, reached
+from koopmpc.bench.problem import Case, load_problem
+from koopmpc.bench.store import RunRow, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
 from koopmpc.control.move import Controller
@@ -46,6 +45,8 @@ FAULTS: dict[str, Fault] = {
 }
 _COLD_STEPS, _SLEEP = 25, 0.004  # steps that are timed with cold caches, and the sleep before each [s]
 
+_TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
+
 
 def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **how: bool) -> RunRow:
     """Run what `row` names, and return it with its figures; an exception becomes the row's failure.
@@ -58,7 +59,8 @@ def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **ho
     row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
     try:
         run = closed_loop(parts, row, plans=logged, **how)
-        judged, found = (metrics(run), reached(run)), failures(run, parts.problem.cases[row.case].steps)
+        figures, arrived = metrics(run), reached(run)
+        found = failures(run, parts.problem.cases[row.case].steps)
     except FullDiskError:
         raise
     except Exception as error:  # the other runs go on; the exit code says that one failed
@@ -73,18 +75,38 @@ def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **ho
         except Exception as error:  # the figures of the run are kept without its log
             found.append(_described(error, log))
     usual = logged and row.fault is None and not row.noise and not row.wrong
-    cold = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
+    p50, p99 = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
     return replace(
         row,
-        metrics=judged[0],
-        reached=judged[1],
+        metrics=figures,
+        reached=arrived,
         training_time=parts.training_time if row.controller in LEARNED else 0.0,
         log=log if log.exists() else None,
         failure="; ".join(found) or None,
         elapsed=time.perf_counter() - begin,
-        cold_p50=cold[0],
-        cold_p99=cold[1],
+        cold_p50=p50,
+        cold_p99=p99,
     )
+
+
+def failures(run: Run, steps: int) -> list[str]:
+    """Return why a run did not end as it should: steps missing, u not finite or beyond a limit, no status."""
+    found: list[str] = []
+    if run.steps != steps:
+        found.append(f"it took {run.steps} of {steps} steps")
+    if not np.isfinite(run.U).all():
+        k = int(np.argwhere(~np.isfinite(run.U))[0][0])
+        found.append(f"u is {run.U[k]} at step {k}")
+    elif run.limits is not None:
+        low, high = run.limits.inputs(run.U.shape[1])
+        beyond = np.maximum(low - run.U, run.U - high)
+        room = _TOLERANCE * (1.0 + np.abs(run.U))
+        if (beyond > room).any():
+            k = int(np.argmax((beyond - room).max(axis=1)))
+            found.append(f"u = {run.U[k]} at step {k} is {beyond[k].max():.3g} beyond a hard limit")
+    if len(run.status) != run.steps:
+        found.append(f"{len(run.status)} of {run.steps} steps have a status")
+    return found
 
 
 def _described(error: Exception, log: Path) -> str:

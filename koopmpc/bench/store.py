@@ -1,4 +1,4 @@
-"""The store of a sweep: what was asked for, a line for each finished run, and the table that is made of them.
+"""The store of a sweep: what was asked for, a line for each finished run, its `RunRow`, and the table of all rows.
 
 A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
 It holds its file locked meanwhile: a sweep that goes on waits for workers which outlive the sweep that was killed.
@@ -12,23 +12,189 @@ import os
 import platform
 import time
 import warnings
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from io import FileIO
 from pathlib import Path
 from typing import Any, cast
 from zlib import crc32
 
+import numpy as np
+
 from koopmpc import disk
-from koopmpc.bench.results import RunRow, record_of, row_of
+from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError, ProblemError
+from koopmpc.loop.metrics import Metrics, tracking_error
+from koopmpc.loop.run import Run
 from koopmpc.parallel import is_orphan
 
 MANIFEST, ROWS = "sweep.json", "rows"
 FORMAT = "koopmpc-sweep-1"
 _LINE, _SEAL = json.JSONEncoder(), "crc32"
 _OUTLIVES = 2.0  # time that a worker gets to end after the sweep that it works for [s]
+RESULTS = "results.parquet"  # beside the logs of the runs
+ORACLE = "nonlinear-mpc"
+REACHED = 0.05  # the band around the reference, as a share of the first weighted error
+KEY = ("problem", "case", "controller", "fault", "noise", "wrong", "seed", "start")
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """One run of the bench.
+
+    Attributes
+    ----------
+    problem, case, controller
+        Names that identify the run.
+    metrics
+        Figures of the run; None where it raised.
+    reached
+        Whether the weighted tracking error stays below 5 % of its first value over the last tenth of the run.
+    training_time
+        Time to collect the data and fit the model [s]; 0 for controllers that learn nothing.
+    log
+        Path of the log; None where there is none.
+    failure
+        Why the run did not end as it should; None where it did. Poor control is no failure.
+    fault
+        Name of the injected fault; None where there was none.
+    start
+        0 for the case's own initial state, else the number of the drawn one.
+    seed
+        What was added to the seed of the training data.
+    noise
+        Standard deviation of the measurement noise, as a share of that of each output in the training data.
+    wrong
+        Largest share by which the parameters of the driven plant differ from those that controllers know.
+    x0
+        The initial state.
+    elapsed
+        Time of the whole run: controller, loop, figures and log [s].
+    cold_p50, cold_p99
+        Median and 99 % quantile of a step after 4 ms of sleep [s], NaN where they were not measured.
+    """
+
+    problem: str
+    case: str
+    controller: str
+    metrics: Metrics | None = None
+    reached: bool = False
+    training_time: float = 0.0
+    log: Path | None = None
+    failure: str | None = None
+    fault: str | None = None
+    start: int = 0
+    seed: int = 0
+    noise: float = 0.0
+    wrong: float = 0.0
+    x0: tuple[float, ...] = ()
+    elapsed: float = 0.0
+    cold_p50: float = float("nan")
+    cold_p99: float = float("nan")
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What makes this run another than all others of its sweep."""
+        return tuple(getattr(self, name) for name in KEY)
+
+    @property
+    def name(self) -> str:
+        """The name of its log, without the suffix; what is as usual is left out."""
+        parts = [self.problem, self.case, self.controller, self.fault]
+        parts += [f"{sign}{value:g}" for sign, value in zip("nwsx", self.key[4:], strict=True) if value]
+        return "-".join(part for part in parts if part is not None)
+
+
+@np.errstate(invalid="ignore", over="ignore")  # a state that diverged does not reach the reference
+def reached(run: Run) -> bool:
+    """Return True where √(eᵀQe) stays below 5 % of its first value over the last tenth of the run.
+
+    A run that starts on its reference is measured against its largest error.
+    """
+    error = tracking_error(run)
+    Q = np.eye(error.shape[1]) if run.cost is None else run.cost.matrices(error.shape[1], run.U.shape[1])[0]
+    weighted = np.sqrt(np.einsum("ki,ij,kj->k", error, Q, error))
+    scale = weighted[0] if weighted[0] > 0 else weighted.max()
+    last = weighted[-max(1, len(weighted) // 10) :]
+    return bool((last <= REACHED * scale).all() and np.isfinite(last).all())
+
+
+def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
+    """Return the run to look at first: the koopman-mpc that reaches and costs most compared with nonlinear-mpc.
+
+    Without such a comparison it is the first run of koopman-mpc, else the first run that has a log.
+    """
+    logged = [row for row in rows if row.log is not None and not any(row.key[3:])]
+    koopman = [row for row in logged if row.controller == "koopman-mpc"]
+    oracle = {(row.problem, row.case): row.metrics.cost for row in rows if row.controller == ORACLE and row.metrics}
+
+    def ratio(row: RunRow) -> float:
+        best = oracle.get((row.problem, row.case), 0.0)
+        return row.metrics.cost / best if row.reached and row.metrics is not None and best > 0 else 0.0
+
+    return max(koopman, key=ratio) if koopman else next(iter(logged), None)
+
+
+_FIGURES: dict[str, type] = {
+    "cost": float, "tracking_rmse": np.ndarray, "final_error": np.ndarray, "violation": float, "violation_share": float,
+    "input_violation": float, "effort": float, "settling_time": float, "solve_time_p50": float, "solve_time_p99": float,
+    "solve_time_max": float, "late": int, "unknown": int,
+}  # fmt: skip
+_KINDS: dict[str, type] = {
+    "problem": str, "case": str, "controller": str, "fault": str, "noise": float, "wrong": float, "seed": int,
+    "start": int, "x0": np.ndarray, **_FIGURES, "status": Status, "fallback": Fallback, "reached": bool,
+    "training_time": float, "elapsed": float, "cold_p50": float, "cold_p99": float, "log": str, "failure": str,
+}  # fmt: skip
+_ROWS = 5000  # in a group of the table
+
+
+def write_results(rows: Sequence[RunRow], path: Path) -> None:
+    """Write the rows as .parquet: vectors are lists, `status` and `fallback` have a field for every name."""
+    import pyarrow
+    from pyarrow import parquet
+
+    pa, pq = cast("Any", pyarrow), cast("Any", parquet)  # they have no types
+    vector = pa.list_(pa.float64())
+    plain = {str: pa.string(), float: pa.float64(), int: pa.int64(), bool: pa.bool_(), np.ndarray: vector}
+    counts = {kind: pa.struct([(each.name, pa.int64()) for each in kind]) for kind in (Status, Fallback)}
+    schema = pa.schema([(name, (plain | counts)[kind]) for name, kind in _KINDS.items()])
+    with disk.writing(path) as stream, pq.ParquetWriter(stream, schema, write_page_checksum=True) as writer:
+        for first in range(0, max(len(rows), 1), _ROWS):
+            records = [record_of(row) for row in rows[first : first + _ROWS]]
+            for record in records:
+                for kind, name in ((Status, "status"), (Fallback, "fallback")):
+                    if record[name] is not None:
+                        record[name] = {each.name: record[name].get(each.name, 0) for each in kind}
+            writer.write_table(pa.Table.from_pylist(records, schema=schema))
+
+
+def record_of(row: RunRow) -> dict[str, Any]:
+    """Return the row as numbers, names and lists; the figures of a run that raised are None."""
+    record: dict[str, Any] = {name: getattr(row, name, None) for name in _KINDS}
+    record |= {"log": row.log and row.log.name, "x0": list(row.x0)}
+    if row.metrics is not None:
+        record |= {name: getattr(row.metrics, name) for name in (*_FIGURES, "status", "fallback")}
+        record |= {name: record[name].tolist() for name, kind in _FIGURES.items() if kind is np.ndarray}
+        record |= {name: dict(record[name]) for name in ("status", "fallback")}
+        record["solver"] = dict(row.metrics.solver)
+    return record
+
+
+def row_of(record: Mapping[str, Any], folder: Path) -> RunRow:
+    """Return the row that `record_of` made this record of; its log lies in `folder`."""
+    figures = None
+    if record["status"] is not None:
+        values: dict[str, Any] = {name: record[name] for name in (*_FIGURES, "status", "fallback", "solver")}
+        values |= {name: np.array(values[name]) for name, kind in _FIGURES.items() if kind is np.ndarray}
+        figures = Metrics(**values)
+    own = {name: value for name, value in record.items() if name in _OWN}
+    log = None if record["log"] is None else folder / record["log"]
+    return RunRow(**own, metrics=figures, log=log, x0=tuple(record["x0"]))
+
+
+_OWN = tuple(field.name for field in fields(RunRow) if field.name not in ("metrics", "log", "x0"))
 
 
 class Journal:

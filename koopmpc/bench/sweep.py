@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,11 +17,9 @@ import numpy as np
 
 from koopmpc import checks, disk
 from koopmpc.bench.controllers import LEARNED, Prepared, controller_names
-from koopmpc.bench.library import load_problem
-from koopmpc.bench.problem import Problem
-from koopmpc.bench.results import RESULTS, RunRow, write_results
+from koopmpc.bench.problem import Problem, load_problem
 from koopmpc.bench.single import FAULTS, row_of_run
-from koopmpc.bench.store import ROWS, Journal, load_rows, next_batch, opened
+from koopmpc.bench.store import RESULTS, ROWS, Journal, RunRow, load_rows, next_batch, opened, write_results
 from koopmpc.control.limits import Limits
 from koopmpc.errors import ProblemError
 from koopmpc.parallel import map_tasks
@@ -46,23 +44,6 @@ class _Grid(NamedTuple):
     paced: bool
     monitor: bool
     compiled: bool
-
-
-class _Lesson(NamedTuple):
-    """The models that these controllers need, of one problem, one of whose cases is named, and one seed."""
-
-    grid: _Grid
-    case: str
-    seed: int
-    controllers: tuple[str, ...]
-
-
-class _Batch(NamedTuple):
-    """Runs that a worker does one after the other; their lines go to the file of this number."""
-
-    grid: _Grid
-    number: int
-    rows: list[RunRow]
 
 
 def sweep(
@@ -168,20 +149,23 @@ def sweep(
         left = [row for row in rows if row.key not in done]
         grid = _Grid(uuid4().hex, dict(sent), folder.resolve(), log_starts, live, paced, monitor, compiled)
         where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
-        told = _Told(progress, len(done), len(rows))
-        told.say(left[0].name if left else "done", 0)
+
+        def say(what: str) -> None:
+            if progress is not None:
+                progress(what.replace("-", ":", 1), len(done), len(rows))
+
+        say(left[0].name if left else "done")
         due = time.monotonic() + _FIRST
         try:
             wanted = [row for row in left if row.controller in LEARNED or row.noise]
-            models = {
-                (row.problem, row.seed): (grid, f"{row.problem}:{row.case}", row.seed) for row in reversed(wanted)
-            }
-            names = tuple(asked["controllers"])
-            for _ in map_tasks(_learn, [_Lesson(*model, names) for model in reversed(models.values())], **where):
+            models = {(row.problem, row.seed): (f"{row.problem}:{row.case}", row.seed) for row in reversed(wanted)}
+            learn = partial(_learn, grid, asked["controllers"])
+            for _ in map_tasks(learn, list(reversed(models.values())), **where):
                 pass
-            for finished in map_tasks(_do, _batches(grid, left, workers or 1, next_batch(folder)), **where):
+            batches = _batches(left, workers or 1, next_batch(folder))
+            for finished in map_tasks(partial(_do, grid), batches, **where):
                 done |= {row.key: replace(row, log=row.log and folder / row.log.name) for row in finished}
-                told.say(finished[-1].name if len(done) < len(rows) else "done", len(finished))
+                say(finished[-1].name if len(done) < len(rows) else "done")
                 if (begin := time.monotonic()) >= due:
                     write_results(_in_order(rows, done), folder / RESULTS)
                     due = begin + _SHARE * (time.monotonic() - begin)
@@ -191,18 +175,6 @@ def sweep(
         finally:
             write_results(_in_order(rows, done), folder / RESULTS)
     return _in_order(rows, done)
-
-
-class _Told:
-    """Runs done so far, and who is told."""
-
-    def __init__(self, progress: Callable[[str, int, int], None] | None, done: int, total: int) -> None:
-        self.progress, self.done, self.total = progress, done, total
-
-    def say(self, what: str, more: int) -> None:
-        self.done += more
-        if self.progress is not None:
-            self.progress(what.replace("-", ":", 1), self.done, self.total)
 
 
 def _rows(
@@ -281,29 +253,36 @@ def _prepared(grid_name: str, sent: "Problem | bytes | str", seed: int, folder: 
     return Prepared(problem, seed, folder / MODELS, monitored=monitored)
 
 
-def _learn(lesson: _Lesson) -> None:
-    """Learn the models of one problem and seed for all workers; where that raises, its runs say so."""
-    grid = lesson.grid
-    parts = _prepared(grid.name, grid.problems[lesson.case], lesson.seed, grid.folder, grid.monitor)
+def _learn(grid: _Grid, controllers: Sequence[str], model: tuple[str, int]) -> None:
+    """Learn for all workers what the controllers need of a problem, one of whose cases is named, and a seed.
+
+    Where that raises, the runs say so.
+    """
+    case, seed = model
+    parts = _prepared(grid.name, grid.problems[case], seed, grid.folder, grid.monitor)
     with suppress(Exception):  # whatever the data or a plant of the user raise
-        parts.keep(lesson.controllers)
+        parts.keep(controllers)
 
 
-def _batches(grid: _Grid, rows: Sequence[RunRow], workers: int, first: int) -> "list[_Batch]":
-    """Return the runs in batches: sending one takes a tenth of a millisecond, about as long as a short run."""
+def _batches(rows: Sequence[RunRow], workers: int, first: int) -> list[tuple[int, list[RunRow]]]:
+    """Return the runs in batches, each with the number of its file, the least of which is `first`.
+
+    Sending one takes a tenth of a millisecond, about as long as a short run.
+    """
     size = 1 if len(rows) <= _EACH else min(max(1, len(rows) // (_BATCHES * workers)), _LARGEST)
     taken = iter(rows)
-    parts = iter(lambda: list(islice(taken, size)), [])
-    return [_Batch(grid, first + i, part) for i, part in enumerate(parts)]
+    return list(enumerate(iter(lambda: list(islice(taken, size)), []), first))
 
 
-def _do(batch: _Batch) -> list[RunRow]:
-    """Do the runs of a batch; those that a worker which died had finished are not run again."""
-    grid = batch.grid
-    finished: list[RunRow] = []
-    with Journal(grid.folder / ROWS / f"{batch.number:06d}.jsonl") as journal:
-        finished += [journal.rows[row.key] for row in batch.rows if row.key in journal.rows]
-        left, done = [row for row in batch.rows if row.key not in journal.rows], None
+def _do(grid: _Grid, batch: tuple[int, list[RunRow]]) -> list[RunRow]:
+    """Do the runs of a batch one after the other; those that a worker which died had finished are not run again.
+
+    Their lines go to the file of the batch's number.
+    """
+    number, rows = batch
+    with Journal(grid.folder / ROWS / f"{number:06d}.jsonl") as journal:
+        finished = [journal.rows[row.key] for row in rows if row.key in journal.rows]
+        left, done = [row for row in rows if row.key not in journal.rows], None
         for row in left:
             died = journal.turn(done, row)
             if died + 1 >= _DEATHS:

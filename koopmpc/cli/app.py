@@ -1,6 +1,5 @@
-"""The command line: each command parses, calls one function, and prints."""
+"""The command line: each command parses, calls one function, and prints; and the words that `explain` knows."""
 
-import shlex
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from koopmpc.cli import sweeps
-from koopmpc.cli.console import bar, console, folder_of, friendly, new_file, new_folder, program, say_page, split
+from koopmpc.cli.console import bar, called, console, folder_of, friendly, new_file, new_folder, say, say_page, split
 from koopmpc.cli.sweeps import Logs
 from koopmpc.errors import DataError, KoopmpcError, ProblemError
 
@@ -41,8 +40,8 @@ def main(
 @app.command("list")
 def list_() -> None:
     """Show all problems with their cases, and how the best learned controller did on those that come with koopmpc."""
-    from koopmpc.bench.library import list_problems, load_problem, shipped
     from koopmpc.bench.measured import in_words
+    from koopmpc.bench.problem import list_problems, load_problem, shipped
 
     out, own = console(), shipped()
     for entry in list_problems():
@@ -58,13 +57,12 @@ def list_() -> None:
 @app.command()
 def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file <name>.py is written here.")]) -> None:
     """Write a commented problem file that runs, to be changed into your own."""
-    from koopmpc.bench.library import new_problem
+    from koopmpc.bench.problem import new_problem
 
-    out = console()
     with friendly():
         path = new_problem(name)
-    out.print(Text(f"written: {path}; it holds a mass on a spring, put your plant in its place"), soft_wrap=True)
-    out.print(Text(f"run it: {shlex.join([*program(), 'run', str(path)])}"), soft_wrap=True)
+    say(f"written: {path}; it holds a mass on a spring, put your plant in its place")
+    say(f"run it: {called('run', path)}")
 
 
 @app.command()
@@ -97,7 +95,6 @@ def fit(
     from koopmpc.fitting.fit import fit_data
     from koopmpc.fitting.goal import design_data, template_of
 
-    out, err = console(), Console(stderr=True)
     source: Any = data[0] if len(data) == 1 else data
     reading: dict[str, Any] = {
         "dt": dt,
@@ -108,33 +105,31 @@ def fit(
     if goal_template:
         with friendly():
             path = new_file(Path("goal.toml"), template_of(source, **reading))
-        out.print(Text(f"written: {path}; say in it what you want"), soft_wrap=True)
-        again = [*program(), "fit", *map(str, data), "--goal", str(path)]
-        out.print(Text(f"then: {shlex.join(again)}"), soft_wrap=True)
+        say(f"written: {path}; say in it what you want")
+        say(f"then: {called('fit', *data, '--goal', path)}")
         return
 
-    def say(text: str) -> None:
-        out.print(Text(text + "\n"), soft_wrap=True)
+    def told(text: str) -> None:
+        say(f"{text}\n")
 
-    how: dict[str, Any] = {"bilinear": not linear, "workers": workers, "scheduler": scheduler, "say": say, **reading}
+    how: dict[str, Any] = {"bilinear": not linear, "workers": workers, "scheduler": scheduler, "say": told, **reading}
     if goal is not None:
         with friendly():
             if horizon is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
             designed = design_data(source, goal, folder, progress=progress, **how)
-        out.print(Text(f"controller: {designed.controller}, report: {designed.page}"), soft_wrap=True)
-        checked = shlex.join([*program(), "check", str(designed.controller)])
-        out.print(Text(f"check it: {checked}\nuse it:\n{designed.usage}"), soft_wrap=True)
+        say(f"controller: {designed.controller}, report: {designed.page}")
+        say(f"check it: {called('check', designed.controller)}\nuse it:\n{designed.usage}")
         return
     with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
         done = fit_data(source, folder, horizon=horizon, progress=progress, **how)
     for failure in done.failures:
-        err.print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
-    out.print(Text(f"model, report and pictures: {folder}"), soft_wrap=True)
+        Console(stderr=True).print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
+    say(f"model, report and pictures: {folder}")
     if done.recording is not None:
-        out.print(Text(f"look at it: {shlex.join([*program(), 'view', str(done.recording)])}"), soft_wrap=True)
-    out.print(Text(f"use it:\n{done.usage}"), soft_wrap=True)
+        say(f"look at it: {called('view', done.recording)}")
+    say(f"use it:\n{done.usage}")
 
 
 @app.command()
@@ -149,10 +144,9 @@ def check(
     """Test a designed controller from random starts, with noise, inputs 20 % off and faults; exit 1 where it fails."""
     from koopmpc.fitting.check import check_controller
 
-    out = console()
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
         done = check_controller(controller, folder, runs=runs, faults=faults, progress=progress)
-    out.print(Text(f"{done}\n\nreport: {done.page}"), soft_wrap=True)
+    say(f"{done}\n\nreport: {done.page}")
     if not done.kept:
         raise typer.Exit(1)
 
@@ -171,7 +165,7 @@ def export(
     import numpy as np
 
     from koopmpc.bench.controllers import Prepared
-    from koopmpc.bench.library import load_problem
+    from koopmpc.bench.problem import load_problem
     from koopmpc.codegen.export import export as write
     from koopmpc.synthesis.designed import SavedDesign, made, saved_controller
 
@@ -188,7 +182,7 @@ def export(
             row = np.atleast_2d(np.asarray(case.reference))
             example = {"plant": Prepared(given).truth_of(name), "x0": case.x0, "reference": row, "steps": case.steps}
         folder = write(loaded, out, name=name, precision=cast("Any", precision), **example)
-    console().print(Text(f"{folder}: make run builds it and prints its closed loop"), soft_wrap=True)
+    say(f"{folder}: make run builds it and prints its closed loop")
 
 
 @app.command()
@@ -205,7 +199,6 @@ def view(
     from koopmpc.recording.viewer import view as open_viewer
     from koopmpc.recording.views.comparison import record_comparison
 
-    out = console()
     with friendly():
         shown = list(logs)
         if compare and not web:
@@ -221,7 +214,9 @@ def view(
             return
         open_viewer(shown)
         if len(shown) > 1:
-            out.print(Text("the first panel button at the top right lists the logs; --compare draws all in one set"))
+            console().print(
+                Text("the first panel button at the top right lists the logs; --compare draws all in one set")
+            )
 
 
 @app.command("export-video")
@@ -238,7 +233,93 @@ def export_video(
 
     with friendly():
         export(log, video, fps=fps, width=width, speed=speed, until=until)
-    console().print(Text(f"{video}, {video.stat().st_size / 1000:.0f} kB"), soft_wrap=True)
+    say(f"{video}, {video.stat().st_size / 1000:.0f} kB")
+
+
+TERMS: dict[str, str] = {
+    "cost": (
+        "What the run cost: Σ‖x − r‖²_Q + ‖u − u_r‖²_R over all steps. Q and R are the weights of the problem, r "
+        "is the reference, and u_r is the input that holds it. A plant at rest on its reference costs nothing."
+    ),
+    "ratio": (
+        "The cost of a run over that of nonlinear-mpc on the same case. That controller plans with the equations "
+        "of the problem. Where the plant carries a load that the equations do not have, a ratio can be below 1."
+    ),
+    "settles": "The time until the weighted error stays below 2 % of its first value.",
+    "within 5 %": (
+        "The error over the last tenth of the run is below 5 % of its first value, but it does not stay below the "
+        "2 % that settling asks for."
+    ),
+    "does not reach": (
+        "Over the last tenth of the run the error is above 5 % of its first value: the controller did not bring "
+        "the plant to its reference. This is a result, not a failure of the program."
+    ),
+    "off": "The largest entry of x − r at the end of the run, in the unit of that state.",
+    "over": "How far a limit of a state or an output was broken, at most, as a share of that limit's size.",
+    "p50": "The median time of a step, from the measurement to the input, in Python.",
+    "p99": "The time that 99 of 100 steps stay below, from the measurement to the input, in Python.",
+    "free": (
+        "The best plan without limits meets all limits. It is the answer, and no optimisation was needed "
+        "(Status.UNCONSTRAINED)."
+    ),
+    "optimal": "A limit is active, and an optimisation problem was solved to its tolerance (Status.OPTIMAL).",
+    "softened": "The problem was solved, and a soft limit had to give way (Status.SOFTENED).",
+    "clipped": "A feedback law asked for more than the input limits allow, and was cut to them (Status.SATURATED).",
+    "unfinished": "The solver ended before its tolerance, and a fallback took over (Status.MAX_ITERATIONS).",
+    "out of time": "The step took longer than it may (Status.TIME_LIMIT).",
+    "infeasible": "No plan meets the hard limits, and a fallback took over (Status.INFEASIBLE).",
+    "bad y": (
+        "The measurement or the reference held NaN or infinity, and a fallback took over (Status.BAD_MEASUREMENT)."
+    ),
+    "failed": "The solver gave no usable answer, and a fallback took over (Status.FAILED).",
+    "fallback": (
+        "What replaces the answer of a failed step, always inside the input limits: the last plan moved on by a "
+        "step, else a clipped feedback, else the last input."
+    ),
+    "unknown": (
+        "Steps at which a learned model was beyond its data: state and input lay where the data were not, or what came "
+        "was not what the model had predicted. About 2 of 100 steps are so by chance. Asked for by --monitor."
+    ),
+    "lost": "Only because of the fault the run did not reach its reference.",
+    "–": (
+        "No number: without the fault the run does not reach its reference either, or there is no run to compare with."
+    ),
+    "lqr": "Linear feedback on your equations, linearised at the equilibrium, cut to the input limits.",
+    "koopman-lqr": "Linear feedback on the linear lifted model that was learned from data, cut to the input limits.",
+    "linear-mpc": "Predictive control on your equations, linearised at the equilibrium.",
+    "koopman-mpc": "Predictive control on the linear lifted model that was learned from data.",
+    "offset-free": "koopman-mpc with an estimate of what the model misses, so that no error remains at rest.",
+    "bilinear-mpc": (
+        "Predictive control on the bilinear lifted model that was learned from data. It linearises the model "
+        "along its plan once a step."
+    ),
+    "bilinear-offset": "bilinear-mpc with an estimate of what the model misses, so that no error remains at rest.",
+    "adaptive": "koopman-mpc whose model goes on learning from every step of the run.",
+    "designed": "The controller that km.design chooses, by closed loops on models learned from the same data.",
+    "nonlinear-mpc": (
+        "Predictive control on your equations as they are, solved to the end: slow, and the measure for all."
+    ),
+    "lifting": (
+        "The observables z = ψ(x): functions of the state, such as sines or powers, in which the model is linear."
+    ),
+    "dictionary": (
+        "All observables of a lifting. It is invariant where the next value of each is a combination of them."
+    ),
+    "rmse": "Root-mean-square error: the square root of the mean of the squared errors.",
+    "band": (
+        "An interval around a forecast that holds the given share of all held-out forecasts, at all of their steps."
+    ),
+    "spurious": (
+        "An eigenvalue of the model that the data do not support: its residual is above 5 % a step. Read no "
+        "frequency from it; forecasts may still be good."
+    ),
+    "residual": "How much a pair of eigenvalue and eigenfunction is off after one step, as a share of its size.",
+    "spectral radius": "The largest |λ| of the model. Above 1 a forecast without feedback grows.",
+    "coverage": "Where in the space of states and inputs the data have been, and where they never were.",
+    "persistently exciting": "Inputs that vary enough to tell the effects of the last n inputs apart; n is the order.",
+    "horizon": "How many steps a controller plans ahead, or how many steps a forecast is judged by.",
+}
+"""Term → what it means, in whole sentences."""
 
 
 @app.command()
@@ -248,16 +329,19 @@ def explain(
     ] = None,
 ) -> None:
     """Explain a word that stands in a table, a report or a picture."""
-    from koopmpc.cli.terms import TERMS
-    from koopmpc.cli.terms import explain as explained
+    from koopmpc.checks import nearest
 
     out = console()
+    if not term:
+        for name, text in TERMS.items():
+            out.print(Text.assemble((name, "bold"), f": {text}"))
+        return
+    known, asked = {name.lower(): text for name, text in TERMS.items()}, " ".join(term)
+    key = " ".join(asked.lower().split())
     with friendly():
-        if term:
-            out.print(Text(explained(" ".join(term))))
-            return
-    for name, text in TERMS.items():
-        out.print(Text.assemble((name, "bold"), f": {text}"))
+        if key not in known:
+            raise ProblemError(f"there is no term {asked!r}{nearest(key, known)}; there are {', '.join(TERMS)}")
+    out.print(Text(known[key]))
 
 
 @app.command()
@@ -290,7 +374,7 @@ def reproduce(
             out.print(verdict_table(one.title, outcome.claims))
             paths, failed = [outcome.report, outcome.recording], bool(outcome.failed)
         for path in paths:
-            out.print(Text(str(path)), soft_wrap=True)
+            say(str(path))
         out.print(Text(f"done in {perf_counter() - start:.0f} s"))
     if failed:
         raise typer.Exit(1)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import sys
 import warnings
@@ -31,6 +32,11 @@ def program() -> list[str]:
         return [near(sys.executable), "-m", "koopmpc"]
     known = shutil.which("koopmpc")
     return ["koopmpc" if known is not None and Path(known).samefile(beside) else near(beside)]
+
+
+def called(*words: object) -> str:
+    """Return the line of a shell that calls this program with these words."""
+    return shlex.join([*program(), *map(str, words)])
 
 
 def near(path: str) -> str:
@@ -64,6 +70,11 @@ def console() -> Console:
     """Return the console of stdout, 100 columns wide where it is no terminal."""
     out = Console()
     return out if out.is_terminal else Console(width=100)
+
+
+def say(text: str, style: str = "") -> None:
+    """Print text to stdout whose lines are not broken, so that a path in it can be copied."""
+    console().print(Text(text, style=style), soft_wrap=True)
 
 
 def new_folder(logs: Path, what: str) -> Path:
@@ -129,10 +140,9 @@ def as_options(message: str) -> str:
 
 def say_page(address: str, port: int, data: int) -> None:
     """Print where a browser finds the viewer that is served here, and how to reach it from another machine."""
-    out = console()
-    out.print(Text(f"open {address}", style="bold"), soft_wrap=True)
+    say(f"open {address}", "bold")
     tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data}:127.0.0.1:{data} HOST"
-    out.print(Text(f"from another machine first: {tunnel}\nCtrl-C ends it"), soft_wrap=True)
+    say(f"from another machine first: {tunnel}\nCtrl-C ends it")
 
 
 @contextmanager

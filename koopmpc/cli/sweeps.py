@@ -1,6 +1,5 @@
 """Commands that run, compare and look back: run, bench, report, compare, inspect, replay."""
 
-import shlex
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from koopmpc.cli.console import bar, console, friendly, new_folder, program, say_page
+from koopmpc.cli.console import bar, called, console, friendly, new_folder, say, say_page
 from koopmpc.cli.ending import ENDING
 from koopmpc.errors import DataError, LogError
 
@@ -46,7 +45,7 @@ def run(
     logs: Logs = Path("logs"),
 ) -> None:
     """Run controllers in closed loop on one problem; one log a run, and a table."""
-    from koopmpc.bench.library import load_problem
+    from koopmpc.bench.problem import load_problem
 
     with friendly(), _page(live):
         loaded = load_problem(problem)
@@ -74,7 +73,7 @@ def bench(
     resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the sweep in this folder.")] = None,
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, from one start or many."""
-    from koopmpc.bench.library import DEFAULT, load_problem, shipped
+    from koopmpc.bench.problem import DEFAULT, load_problem, shipped
     from koopmpc.bench.store import manifest_of
 
     with friendly(), _page(live):
@@ -98,7 +97,7 @@ def report(folder: Annotated[Path, typer.Argument(help="The folder of a sweep.")
     from koopmpc.bench.report import write_report
 
     with friendly():
-        console().print(Text(str(write_report(folder))), soft_wrap=True)
+        say(str(write_report(folder)))
 
 
 def compare(
@@ -108,7 +107,7 @@ def compare(
     times: Annotated[bool, typer.Option("--times", help="Step times count too, not only costs.")] = False,
 ) -> None:
     """Compare two sweeps, or two logs, run by run; exit 1 where B is worse than A by more than the threshold."""
-    from koopmpc.bench.compare import compared
+    from koopmpc.bench.inspect import compared
 
     with friendly():
         found = compared(a, b, threshold=threshold, times=times)
@@ -126,21 +125,20 @@ def inspect(
     """Say what ran, recompute its metrics from the log alone, and name its worst moments with their times."""
     from koopmpc.bench.inspect import inspected, inspection_table
 
-    out = console()
     with friendly():
         found = list(inspected(logs, where, repair=repair))
         if len(found) == 1 and found[0].refused is not None:
             raise LogError(found[0].refused)
     shown = [each for each in found if each.refused is None]
     if len(found) > 1:
-        out.print(inspection_table(found))
+        console().print(inspection_table(found))
     for each in shown if len(shown) == 1 or len(logs) == len(shown) <= 3 else ():
-        out.print(Text.assemble((each.title, "bold"), f"\n{each}"), soft_wrap=True)
+        console().print(Text.assemble((each.title, "bold"), f"\n{each}"), soft_wrap=True)
     for each in found:
         if each.refused is not None:
-            out.print(Text(f"{each.path}: {each.refused}", style="red"), soft_wrap=True)
+            say(f"{each.path}: {each.refused}", "red")
         elif each.repaired is not None:
-            out.print(Text(f"repaired: {each.repaired}"), soft_wrap=True)
+            say(f"repaired: {each.repaired}")
     if not shown and len(found) and where is None:
         raise typer.Exit(2)
 
@@ -151,7 +149,7 @@ def replay(log: Annotated[Path, typer.Argument(help="A log of `koopmpc run` or `
 
     with friendly():
         found = replayed(log)
-    console().print(Text(str(found)), soft_wrap=True)
+    say(str(found))
     if found.differences:
         raise typer.Exit(1)
 
@@ -186,8 +184,8 @@ def _sweep(
 ) -> None:
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.report import summary_table, write_report
-    from koopmpc.bench.results import results_table, row_to_view
+    from koopmpc.bench.report import results_table, summary_table, write_report
+    from koopmpc.bench.store import row_to_view
     from koopmpc.bench.sweep import sweep
 
     controller_names(controllers)
@@ -195,15 +193,14 @@ def _sweep(
     ENDING.folder = folder
     with bar("", rate=True) as progress:
         rows = sweep(problems, controllers, folder=folder, progress=progress, **asked)
-    out = console()
     single = all(row.start == row.seed == row.noise == row.wrong == 0 for row in rows)
-    out.print(results_table(rows) if single else summary_table(rows))
+    console().print(results_table(rows) if single else summary_table(rows))
     if not single:
-        out.print(Text(f"\nreport: {write_report(folder)}"), soft_wrap=True)
-    out.print(Text(f"\nlogs and results.parquet: {folder}"), soft_wrap=True)
+        say(f"\nreport: {write_report(folder)}")
+    say(f"\nlogs and results.parquet: {folder}")
     shown = row_to_view(rows)
     if shown is not None:
-        out.print(Text(f"look at a run: {shlex.join([*program(), 'view', str(shown.log)])}"), soft_wrap=True)
+        say(f"look at a run: {called('view', shown.log)}")
     if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
 

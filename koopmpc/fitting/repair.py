@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.bench.results import RESULTS
+from koopmpc.bench.store import RESULTS
 from koopmpc.data.episodes import Episode, Episodes, joined
 from koopmpc.data.sampling import UnevenSamplingError
 from koopmpc.data.source import Changed, Held, Source, Subset

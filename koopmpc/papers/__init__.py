@@ -1,1 +1,1 @@
-"""Papers whose published results `koopmpc reproduce` computes anew, one folder each."""
+"""Papers whose published results `koopmpc reproduce` computes anew."""

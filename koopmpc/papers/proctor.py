@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import logm
 
-from koopmpc.bench.library import load_problem
+from koopmpc.bench.problem import load_problem
 from koopmpc.control.lqr import lqr
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
@@ -126,7 +126,7 @@ def of_dmdc(page: Page, quick: bool, tell: Tell) -> list[Claim]:
         "DMDc, B unknown, noise on u": dmdc(_shaken()),
     }
     steps = 6
-    truth = _rollout(A, steps)
+    truth = np.array([np.linalg.matrix_power(A, k) @ FREE for k in range(steps + 1)])
     page.text(
         "## What the models are",
         f"A step from [x; u] on, rounded to five digits. The fit with B unknown says: “{said[0] if said else '–'}”.",
@@ -168,10 +168,6 @@ def _shaken() -> Episodes:
     return Episodes([Episode(X=states, U=inputs)], 1.0)
 
 
-def _rollout(matrix: np.ndarray, steps: int) -> np.ndarray:
-    return np.array([np.linalg.matrix_power(matrix, k) @ FREE for k in range(steps + 1)])
-
-
 dmdc_paper = short("proctor", of_dmdc.__doc__, of_dmdc)
 
 
@@ -179,9 +175,8 @@ LAM, MU, DELTA, FEEDBACK = 0.9, 0.5, 1.0, -0.3
 LIFTING = State() + Expressions(lambda x: [x[0] ** 2], ["x₁²"])  # x₁, x₂, u, x₁²
 STATES = [[LAM, 0.0, 0.0, 0.0], [0.0, MU, DELTA, LAM**2 - MU]]  # rows of K
 ROWS = {"exogenous": [0.0] * 4, "constant": [0.0, 0.0, 1.0, 0.0], "state": [0.0, 0.0, 0.0, FEEDBACK * LAM**2]}
-InputRule = Callable[
-    [np.ndarray, float, np.random.Generator], float
-]  # of x, the signal of the episode, and the generator
+# An input of x, the signal of the episode, and the generator.
+InputRule = Callable[[np.ndarray, float, np.random.Generator], float]
 LAWS: dict[str, InputRule] = {
     "exogenous": lambda x, held, rng: float(rng.uniform(-1, 1)),
     "constant": lambda x, held, rng: held,
@@ -209,11 +204,7 @@ def of_kic(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     claims: list[Claim] = []
     data = {kind: _episodes(law) for kind, law in LAWS.items()}
     with unwarned():
-        found = {
-            "exogenous": kic(data["exogenous"], LIFTING),
-            "constant": kic(data["constant"], LIFTING, inputs="constant"),
-            "state": kic(data["state"], LIFTING, inputs="state"),
-        }
+        found = {kind: kic(each, LIFTING, inputs=cast("Any", kind)) for kind, each in data.items()}
     page.text(
         "## K",
         """Rows and columns are x₁, x₂, u, x₁². Under feedback u and x₁² are dependent, and of all K that fit the one of

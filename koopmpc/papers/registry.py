@@ -1,7 +1,7 @@
 """The papers that can be reproduced: what each says, how its claims are judged, and the page that is written.
 
-A paper is a `Paper` in the module, or the folder, of its name. docs/papers/ holds the pages and pictures that
-`koopmpc reproduce` writes: copy both after a change.
+A paper is a `Paper` in the module of its name, or in that of its authors. docs/papers/ holds the pages and pictures
+that `koopmpc reproduce` writes: copy both after a change.
 """
 
 from collections import Counter
@@ -28,7 +28,10 @@ from koopmpc.recording.page import Page, record_curves
 from koopmpc.validate.text import plain_table
 
 PAPERS = ("snyder", "brunton", "proctor", "williams", "korda", "dictionary", "kaiser", "kic", "kernel")
-_HOME = {"brunton": "proctor", "kic": "proctor", "kernel": "williams"}  # papers in a file with others of their authors
+_HOME = {  # papers in a file with others of their authors
+    **dict.fromkeys(("brunton", "kic"), "proctor"),
+    **dict.fromkeys(("williams", "kernel", "dictionary"), "kevrekidis"),
+}
 
 _VERDICTS = ("where", "the paper", "verdict", "ours, or why")
 _ROUNDING = 1e-10

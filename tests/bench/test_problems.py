@@ -12,7 +12,7 @@ import pytest
 import koopmpc as km
 from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
 from koopmpc.bench.measured import BASELINE, best_learned, frugal, goals, in_words, markdown, measured, standings
-from koopmpc.bench.results import ORACLE, RunRow
+from koopmpc.bench.store import ORACLE, RunRow
 from koopmpc.loop.metrics import Metrics
 
 FILES = {path.stem: path for path in km.bench.shipped()}

@@ -11,8 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.results import RunRow, record_of, write_results
-from koopmpc.bench.store import Journal
+from koopmpc.bench.store import Journal, RunRow, record_of, write_results
 from koopmpc.recording.page import Curves, Page, record_curves
 from koopmpc.synthesis.designed import SavedDesign, saved_controller
 from tests.recording.runs import make_run

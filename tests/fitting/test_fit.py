@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 import koopmpc.fitting.fit
-from koopmpc.bench.results import RESULTS
+from koopmpc.bench.store import RESULTS
 from koopmpc.cli.app import app
 from koopmpc.fitting.fit import fit_data
 from koopmpc.fitting.repair import divided, guessed, needed, shortened

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.papers import korda, korda_motor, registry
+from koopmpc.papers import korda, registry
 from koopmpc.papers.registry import PAPERS, Claim, Verdict, compared, find_paper, judged, percent, short, show
-from koopmpc.papers.snyder.control import ORACLE, contest, costs, predictions
-from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, all_settings
+from koopmpc.papers.snyder_control import ORACLE, contest, costs, predictions
+from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, all_settings
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
 QUICK = (
@@ -170,11 +170,11 @@ def test_the_waves_of_the_data_are_those_of_the_plant():
 
 @pytest.mark.slow
 def test_the_local_mpc_of_the_motor_costs_what_the_paper_says():
-    plant = km.discretize(km.load_problem("bilinear_motor").dynamics, korda_motor.DT)
+    plant = km.discretize(km.load_problem("bilinear_motor").dynamics, korda.DT)
     cost = km.Cost(Q=1.0, R=0.01, tail=0, of=km.State("speed"), u_target="zero")
-    local = korda_motor.linearised(plant, [0.0, 0.6], cost, km.Limits(u_min=-1, u_max=1))
-    run = korda_motor.loop(plant, local, [0.0, 0.6], korda_motor.STEP)
-    assert run.solved == korda_motor.STEPS
+    local = korda.linearised(plant, [0.0, 0.6], cost, km.Limits(u_min=-1, u_max=1))
+    run = korda.loop(plant, local, [0.0, 0.6], korda.STEP)
+    assert run.solved == korda.STEPS
     assert abs(run.cost - 3.318) < 0.005
 
 

@@ -8,13 +8,13 @@ import pytest
 from scipy.integrate import quad
 
 import koopmpc as km
+from koopmpc.papers import snyder as report
+from koopmpc.papers import snyder_theory as theory
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Verdict, verdicts
-from koopmpc.papers.snyder import held_change, rebuilt, report, theory
-from koopmpc.papers.snyder.claims import of_figures, of_text
-from koopmpc.papers.snyder.control import ORACLE
-from koopmpc.papers.snyder.reconstruction import Prediction
-from koopmpc.papers.snyder.settings import FIGURES, OBSERVABLES, all_settings, gains
+from koopmpc.papers.snyder import of_figures, of_text
+from koopmpc.papers.snyder_control import ORACLE, Prediction
+from koopmpc.papers.snyder_settings import FIGURES, OBSERVABLES, all_settings, gains, held_change, rebuilt
 from koopmpc.recording import page as pages
 from koopmpc.recording.page import Page
 

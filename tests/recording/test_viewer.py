@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.bench.library import shipped
+from koopmpc.bench.problem import shipped
 from koopmpc.cli.app import app
 from koopmpc.recording import viewer
 from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer

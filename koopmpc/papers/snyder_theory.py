@@ -16,9 +16,17 @@ from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.papers.plants import Pendulum, frequency
 from koopmpc.papers.registry import Claim, judged, percent, relative
-from koopmpc.papers.snyder.claims import Fits
-from koopmpc.papers.snyder.reconstruction import LINEAR, Reconstruction, Setting, centred, predicted, rebuilt
-from koopmpc.papers.snyder.settings import OBSERVABLES, TARGET
+from koopmpc.papers.snyder_settings import (
+    LINEAR,
+    OBSERVABLES,
+    TARGET,
+    Fits,
+    Reconstruction,
+    Setting,
+    centred,
+    predicted,
+    reconstructed,
+)
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
 from koopmpc.recording.page import Page
 
@@ -98,9 +106,8 @@ def equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[Equatio
     xi = whole.left_eigenvectors.T  # ξ_j in column j, φ_j = Θ ξ_j
     K = np.linalg.pinv(Theta) @ Theta_next
     worst = linearity_error(whole, trajectory)
-    by_hand = np.linalg.norm(whole.eigenfunctions(snapshots.X_next) - phi * whole.eigenvalues, axis=0) / np.linalg.norm(
-        phi, axis=0
-    )
+    missed = whole.eigenfunctions(snapshots.X_next) - phi * whole.eigenvalues
+    by_hand = np.linalg.norm(missed, axis=0) / np.linalg.norm(phi, axis=0)
     return [
         Equation("10–12", "X = [x₁ … x_m], X′ = [x₂ … x_{m+1}]", "Episodes.snapshots",
                  _gap(snapshots.X_next[:-1], snapshots.X[1:])),
@@ -190,7 +197,7 @@ def causes(setting: Setting) -> dict[str, Reconstruction]:
     found: dict[str, Reconstruction] = {}
     for name, (lifting, moved, rank) in cases.items():
         data = [centred(each, TARGET) if moved else each for each in (setting.trajectory, setting.held_out)]
-        found[name] = rebuilt(data[0], lifting, data[1], rank)
+        found[name] = reconstructed(data[0], lifting, data[1], rank)
     return found
 
 

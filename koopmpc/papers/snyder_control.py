@@ -26,9 +26,8 @@ from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
-from koopmpc.papers.registry import percent
-from koopmpc.papers.snyder.reconstruction import Prediction, Setting, centred, prediction
-from koopmpc.papers.snyder.settings import SHAKINGS, TASKS, Shaking, gains
+from koopmpc.papers.registry import percent, relative
+from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, Setting, Shaking, centred, gains
 from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
@@ -76,6 +75,31 @@ In the shift of the cart-pole, which stays within 0.04 rad of upright, all model
 )
 
 
+@dataclass(frozen=True)
+class Prediction:
+    """Errors of one model on two kinds of held-out data: medians of ‖x̂ − x‖ / ‖x‖ over the episodes.
+
+    Attributes
+    ----------
+    name
+        The model and its data.
+    feedback
+        Error under the feedback of the paper, from other starts.
+    excited
+        Error under that feedback with noise on top.
+    b
+        The entry of B whose true value is largest, divided by that value; NaN for a model without B.
+    warned
+        The warning of the fit, in short.
+    """
+
+    name: str
+    feedback: float
+    excited: float
+    b: float
+    warned: str
+
+
 def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, Prediction]:
     """Return the prediction errors of models fitted to one trajectory under feedback, or to exciting data.
 
@@ -109,7 +133,33 @@ def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, 
             "DMDc, exciting data": dmdc(rich),
             "EDMDc, exciting data": edmd(rich, State() + Fourier(1)),
         }
-    return {name: prediction(name, model, feedback, excited, B) for name, model in models.items()}
+    return {name: _prediction(name, model, feedback, excited, B) for name, model in models.items()}
+
+
+def _prediction(
+    name: str, model: LinearPredictor, feedback: Episodes, excited: Episodes, B: Float[np.ndarray, "nx nu"]
+) -> Prediction:
+    """Return the errors of `model` over whole episodes; a model without inputs predicts without them.
+
+    Parameters
+    ----------
+    name, model
+        The model and how the table calls it.
+    feedback, excited
+        Held-out episodes with inputs.
+    B
+        (nx, nu), ∂x⁺/∂u of the plant at the equilibrium.
+    """
+    i, j = np.unravel_index(int(np.abs(B).argmax()), B.shape)
+    share = float((model.C @ model.B)[i, j] / B[i, j]) if model.nu else np.nan
+    said = () if model.report is None else model.report.warnings
+    short = "A and B inseparable" if any("inseparable" in sentence for sentence in said) else "–"
+    return Prediction(name, _error(model, feedback), _error(model, excited), share, short)
+
+
+def _error(model: LinearPredictor, episodes: Episodes) -> float:
+    errors = [relative(model.rollout(e.X[0], e.U[:, : model.nu]), e.X) for e in episodes]
+    return float(np.median(errors))
 
 
 def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
