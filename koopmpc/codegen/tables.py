@@ -16,7 +16,7 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import DisturbanceObserver
-from koopmpc.estimate.kalman_filter import KalmanFilter
+from koopmpc.estimate.kalman import KalmanFilter
 from koopmpc.estimate.observer import Measured
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

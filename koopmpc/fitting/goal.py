@@ -17,7 +17,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, LogError
 from koopmpc.lifting.state import State
-from koopmpc.synthesis.folds import usual_horizon
+from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.validate.text import quantity
 
 _TOP = {"horizon", "states", "inputs"}

@@ -15,7 +15,7 @@ from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
 from koopmpc.fitting.audited import audited
 from koopmpc.synthesis.candidates import jumps
-from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
+from koopmpc.synthesis.cross_validation import blocks, sampled, usual_horizon
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,20 @@ from koopmpc.parallel import Progress, StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
 from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
-from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
+from koopmpc.synthesis.cross_validation import (
+    LEAST,
+    Folds,
+    Trial,
+    Tried,
+    folded,
+    mended,
+    only,
+    sampled,
+    smoothed,
+    tried,
+    without,
+)
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
-from koopmpc.synthesis.folds import Folds, folded, mended, only, sampled, smoothed, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
 from koopmpc.synthesis.select import RIDGES
 from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
@@ -151,7 +162,7 @@ def design(
             notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
     noise = np.zeros(held.nx)
     if smooth:
-        (source, held, freed), noise = smoothed(source, held)
+        source, held, freed, noise = smoothed(source, held)
         notes = (*notes, *freed)
     checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
     past = sorted({checks.count(d, "delays", 0) for d in delays})
@@ -374,9 +385,9 @@ def _rounds(
     with the estimator that was best. This takes longest, and so it begins as soon as that estimator is known; the
     second linear model fills the other workers meanwhile.
     """
-    run, every = partial(judged, test), tuple(range(len(test.conditions)))
+    run, every = partial(judged, test), range(len(test.conditions))
     first = pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops"), size=Job.size)
-    score = scores(ratios(first), test.weights[list(test.nominal)])
+    score = scores(ratios(first), test.weights[test.nominal])
     ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
@@ -407,7 +418,7 @@ def _stage(progress: StageProgress | None, name: str) -> Progress | None:
 
 
 def _jobs(
-    chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: tuple[int, ...]
+    chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: Sequence[int]
 ) -> list[Job]:
     """Return the jobs of a later round; models and runs of earlier rounds are not made again."""
     jobs: list[Job] = []
@@ -422,7 +433,7 @@ def _jobs(
 def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
     """Return the rows and the outcome of each: the last round before the others, and the best first in each."""
     both: list[tuple[DesignRow, Outcome]] = []
-    nominal = test.weights[list(test.nominal)]
+    nominal = test.weights[test.nominal]
     for off, (recipes, outcomes), weights in ((True, last, test.weights), (False, screened, nominal)):
         part: list[tuple[DesignRow, Outcome]] = []
         each = ratios(outcomes)
@@ -443,14 +454,15 @@ def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[
 
 
 def _expected(test: LoopTest, outcome: Outcome) -> Expected:
-    as_learned = np.array([one.gain == 1.0 for one in test.conditions])
-    near = [one for one in test.conditions if one.gain == 1.0]
+    nominal = test.nominal
+    off = [j for j in range(len(test.conditions)) if j not in nominal]
+    near = [test.conditions[j] for j in nominal]
     known = outcome.broken[np.isfinite(outcome.cost)]
     return Expected(
-        cost=outcome.cost[as_learned],
-        cost_off=outcome.cost[~as_learned],
-        violation=outcome.violation[as_learned],
-        violation_off=outcome.violation[~as_learned],
+        cost=outcome.cost[nominal],
+        cost_off=outcome.cost[off],
+        violation=outcome.violation[nominal],
+        violation_off=outcome.violation[off],
         broken=float(known.mean()) if known.size else 1.0,
         starts=np.array([one.x0 for one in near]),
         surrogate=tuple(one.surrogate for one in near),
