@@ -108,7 +108,7 @@ def asked_of(
     Raises
     ------
     DataError, ShapeError
-        A size does not fit, NaN, an angle that is no state, no horizon.
+        A size does not fit, NaN, an angle that is no state.
     """
     cost, limits = checked(cost, limits)
     nx, states = data.nx, data.states
@@ -127,7 +127,6 @@ def asked_of(
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    horizon = checks.count(horizon, "horizon")
     steps = RUN * horizon
     if len(rows) == 1:
         rows = np.repeat(rows, steps + 1, axis=0)

@@ -20,7 +20,7 @@ from koopmpc.errors import DataError, FitWarning
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
-from koopmpc.parallel import Progress, StageProgress, Workers
+from koopmpc.parallel import StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
 from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
@@ -39,7 +39,7 @@ from koopmpc.synthesis.cross_validation import (
 )
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
-from koopmpc.synthesis.select import RIDGES
+from koopmpc.synthesis.select import RIDGES, stage
 from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
 from koopmpc.validate.text import percent
 
@@ -181,7 +181,7 @@ def design(
         )
     trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
     with Workers(workers, scheduler) as pool:
-        results = pool.map(tried, trials, _stage(progress, "models"), size=lambda trial: trial.candidate.size)
+        results = pool.map(tried, trials, stage(progress, "models"), size=lambda trial: trial.candidate.size)
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
         test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, noise, pool)
         doubts = [*left.values(), *doubts]
@@ -262,16 +262,11 @@ def _models(
 ) -> list[Candidate]:
     """Return the models to try; each lifting also has the observables that cost and limits are of."""
     models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
-    needed = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
+    asking = (of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State))
+    needed = [of.bind(held.states) for of in asking]
     if not needed:
         return models
-    added: list[Candidate] = []
-    for one in models:
-        lifting = one.lifting
-        for of in needed:
-            lifting = lifting + of.bind(held.states)
-        added.append(replace(one, lifting=lifting).bind(held.states, held.inputs))
-    return added
+    return [replace(one, lifting=sum(needed, one.lifting)).bind(held.states, held.inputs) for one in models]
 
 
 def _test(
@@ -355,17 +350,12 @@ def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
     worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
     ranked = sorted(range(len(results)), key=lambda i: (worst[i], i))
     found: list[Recipe] = []
-
-    def add(i: int, indices: set[int], tail: int | None = None) -> None:
-        candidate, ridges = results[i].candidate, results[i].ridges
-        found.extend(Recipe(candidate, ridges[place], tail=tail) for place in sorted(indices))
-
     for bilinear in (False, True):
-        for i in [i for i in ranked if results[i].candidate.bilinear == bilinear][:_SCREENED]:
-            add(i, {places[i]})
-    for i, one in enumerate(results):
+        best = [i for i in ranked if results[i].candidate.bilinear == bilinear][:_SCREENED]
+        found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in best]
+    for one, place in zip(results, places, strict=True):
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
-            add(i, {0, places[i]}, tail=0)
+            found += [Recipe(one.candidate, one.ridges[i], tail=0) for i in sorted({0, place})]
     return found
 
 
@@ -383,7 +373,7 @@ def _rounds(
     second linear model fills the other workers meanwhile.
     """
     run, every = partial(judged, test), range(len(test.conditions))
-    first = pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops"), size=Job.size)
+    first = pool.map(run, [Job(one, test.nominal) for one in screened], stage(progress, "closed loops"), size=Job.size)
     score = scores(ratios(first), test.weights[test.nominal])
     ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
@@ -394,24 +384,17 @@ def _rounds(
     for place, one in enumerate(linear):
         ends = (None, 0) if one.tail is None else (0,)
         some = [replace(one, estimator=each, tail=tail) for tail in ends for each in estimators]
-        if place == 0:
-            second += some
-        else:
-            third += some
+        (second if place == 0 else third).extend(some)
     jobs = _jobs(second, screened, first, every)
-    outcomes = pool.map(run, jobs, _stage(progress, "closed loops of the best"), size=Job.size)
+    outcomes = pool.map(run, jobs, stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
         tried_ones = scores(ratios(outcomes[: len(estimators)]), test.weights)
         best = estimators[int(np.argmin(tried_ones))]
         third.append(replace(bilinear[0], estimator=best, weighted=True))
         third += [replace(one, estimator=best) for one in bilinear[1:]]
     jobs = _jobs(third, screened, first, every)
-    outcomes += pool.map(run, jobs, _stage(progress, "closed loops of the last"), size=Job.size)
+    outcomes += pool.map(run, jobs, stage(progress, "closed loops of the last"), size=Job.size)
     return _leaderboard(test, (screened, first), ([*second, *third], outcomes))
-
-
-def _stage(progress: StageProgress | None, name: str) -> Progress | None:
-    return None if progress is None else partial(progress, name)
 
 
 def _jobs(

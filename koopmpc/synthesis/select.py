@@ -19,7 +19,7 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.lifting.base import Lifting
-from koopmpc.parallel import StageProgress, map_tasks
+from koopmpc.parallel import Progress, StageProgress, map_tasks
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate, expanded, jumps, model_of, still, usual
@@ -317,7 +317,7 @@ def select(
     ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
     data = folded(held, ahead + first, folds, draw)
     trials = [Trial(one, data.episodes, data.fold, ahead, first, weights, relift=relift) for one in given]
-    told = None if progress is None else partial(progress, "candidates")
+    told = stage(progress, "candidates")
     results = list(map_tasks(tried, trials, workers=workers, scheduler=scheduler, progress=told))
     # on a grid of decades the one nearest to ε² is the first
     floor = LEAST if ridges is not None else min(result.misfit for result in results) / np.sqrt(10)
@@ -336,8 +336,7 @@ def select(
             break
 
     def refit(row: LeaderboardRow) -> AnyPredictor:
-        told = None if progress is None else partial(progress, f"fit of {row.title}")
-        read = ReadOptions(workers=workers, scheduler=scheduler, progress=told)
+        read = ReadOptions(workers=workers, scheduler=scheduler, progress=stage(progress, f"fit of {row.title}"))
         return model_of(Candidate(row.name, row.lifting, row.embedding, row.bilinear), source, row.ridge, read)
 
     predictor = refit(rows[chosen])
@@ -356,6 +355,11 @@ def select(
         notes=(*notes, *short, *data.notes),
         bilinear=best_bilinear if isinstance(best_bilinear, BilinearPredictor) else None,
     )
+
+
+def stage(progress: StageProgress | None, name: str) -> Progress | None:
+    """Return what is called with the progress of one stage."""
+    return None if progress is None else partial(progress, name)
 
 
 def row_of(trial: Tried, floor: float) -> LeaderboardRow:
