@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -252,7 +253,7 @@ def simulate(
         if looked is not None:
             known[k] = looked
         for observer in observers:
-            ask = look_ahead if plan is None else lambda plan=plan: plan
+            ask = look_ahead if plan is None else partial(_same, plan)
             step = Step(k, Y[k], U[k], rows[k], move, X[k], X[k + 1], Y[k + 1], rows[k + 1], held[k], ask)
             observer(step)
             if ask is not None and plan is None:
@@ -300,6 +301,11 @@ def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
         if not isfinite(value):
             raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
     return u
+
+
+def _same(plan: Plan) -> Plan:
+    """Return the plan that is kept."""
+    return plan
 
 
 def _gone() -> Plan | None:

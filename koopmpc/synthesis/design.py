@@ -1,7 +1,7 @@
 """design: a controller with a learned model, chosen by closed loop from data, a cost and limits alone."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -291,15 +291,18 @@ def _test(
                 row = asked.late * (j % _STRETCHES) // (_STRETCHES - 1)
                 start = asked.starts[j % len(asked.starts)]
                 wanted.append(Condition(k, number, gain, start, row, np.zeros((0, data.nu))))
+    mine = [[j for j, one in enumerate(wanted) if one.surrogate == number] for number in range(FOLDS * len(pair))]
     tasks = [
-        _StandIn(recipe, k, {j: one for j, one in enumerate(wanted) if one.surrogate == 2 * k + family})
-        for k in range(FOLDS)
+        _StandIn(recipe, i, tuple((wanted[j].gain, wanted[j].first) for j in mine[i * len(pair) + family]))
+        for i in range(FOLDS)
         for family, recipe in enumerate(pair)
     ]
-    made = pool.map(partial(_stood_in, folds, asked, noise), tasks)
-    surrogates = tuple(one for one, _ in made)
-    inputs = {j: rows for _, each in made for j, rows in each.items()}
-    conditions = tuple(replace(one, u_reference=inputs[j]) for j, one in enumerate(wanted))
+    surrogates: list[Surrogate] = []
+    conditions = list(wanted)
+    for places, (one, inputs) in zip(mine, pool.map(partial(_stood_in, folds, asked, noise), tasks), strict=True):
+        surrogates.append(one)
+        for j, rows in zip(places, inputs, strict=True):
+            conditions[j] = replace(wanted[j], u_reference=rows)
     X = np.concatenate([episode.X for episode in data])
     turning = [i for i in angular(data.states, X) if asked.high[i] - asked.low[i] > _TURNS]
     free = sorted({*asked.angles, *turning, *unfelt(surrogates[0], X)})
@@ -307,37 +310,37 @@ def _test(
     tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
     low, high = asked.hull(free, tracked)
     room = margin_room(asked, data) if tighten else None
-    test = LoopTest(asked, data, folds.fold, surrogates, conditions, low, high, room, noise)
+    test = LoopTest(asked, data, folds.fold, tuple(surrogates), tuple(conditions), low, high, room, noise)
     unreachable = unheld(surrogates[0], asked)
     holds = not asked.moves and not unreachable
     return test, [*unreachable, *outside_limits(asked, data), *outside_data(asked, data, tracked, free)], holds
 
 
 class _StandIn(NamedTuple):
-    """A task: the surrogate of a recipe that does not know a fold, and the runs on it by their number."""
+    """A task: the surrogate of a recipe that does not know a fold, and (gain, first row) of each run on it."""
 
     recipe: Recipe
     out: int
-    runs: Mapping[int, Condition]
+    runs: tuple[tuple[float, int], ...]
 
 
 def _stood_in(
     folds: Folds, asked: Asked, noise: Float[np.ndarray, " nx"], task: _StandIn
-) -> tuple[Surrogate, dict[int, Float[np.ndarray, "T nu"]]]:
+) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
     """Return the surrogate, and for each run the inputs that cost nothing: those of `Condition.u_reference`."""
     data, fold = folds.episodes, folds.fold
     one = surrogate(task.recipe, without(data, fold, task.out), only(data, fold, task.out), noise)
     steps, nu, cost = asked.steps, data.nu, asked.cost
     given = cost.given_inputs(nu)
-    inputs: dict[int, Float[np.ndarray, "T nu"]] = {}
-    for j, run in task.runs.items():
+    inputs: list[Float[np.ndarray, "T nu"]] = []
+    for gain, row in task.runs:
         if given is not None:
-            inputs[j] = given[np.minimum(np.arange(steps), len(given) - 1)]
+            inputs.append(given[np.minimum(np.arange(steps), len(given) - 1)])
         elif cost.u_target != "equilibrium":
-            inputs[j] = np.zeros((steps, nu))
+            inputs.append(np.zeros((steps, nu)))
         else:
-            held = one.holding(cost, asked.limits, run.gain)
-            inputs[j] = np.array([held(each).u for each in asked.reference[run.first : run.first + steps]])
+            held = one.holding(cost, asked.limits, gain)
+            inputs.append(np.array([held(each).u for each in asked.reference[row : row + steps]]))
     return one, inputs
 
 
