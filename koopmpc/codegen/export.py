@@ -30,7 +30,7 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError
-from koopmpc.estimate.kalman_filter import KalmanFilter
+from koopmpc.estimate.kalman import KalmanFilter
 from koopmpc.plants.routines import compiler
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

@@ -20,7 +20,7 @@ from koopmpc.control.target import ROUNDING, Targets
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import DisturbanceObserver
-from koopmpc.estimate.kalman_filter import KalmanFilter
+from koopmpc.estimate.kalman import KalmanFilter
 from koopmpc.estimate.observer import Measured
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap

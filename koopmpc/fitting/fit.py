@@ -23,8 +23,7 @@ from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
 from koopmpc.recording.page import Page
-from koopmpc.synthesis.select import select
-from koopmpc.synthesis.selection import Selection
+from koopmpc.synthesis.select import Selection, select
 from koopmpc.validate.report import TrustReport, trust
 from koopmpc.validate.scoring import Score, score
 from koopmpc.validate.text import labelled, written

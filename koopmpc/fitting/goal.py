@@ -21,9 +21,9 @@ from koopmpc.fitting.repair import IN_MEMORY, Data, noted, read
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress
 from koopmpc.recording.page import Page
+from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import Design
-from koopmpc.synthesis.folds import usual_horizon
 
 _SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
 _TOP = {"horizon", "states", "inputs"}

@@ -18,7 +18,7 @@ from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.data.storage import Files
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
 from koopmpc.synthesis.candidates import jumps
-from koopmpc.synthesis.folds import blocks, sampled, usual_horizon
+from koopmpc.synthesis.cross_validation import blocks, sampled, usual_horizon
 from koopmpc.validate.logs.audit import audit
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]

@@ -185,31 +185,35 @@ class DroppedSamples(_Windowed):
         return Injection(measured=measured)
 
 
-def _delayed(
-    steps: int, before: list[Float[np.ndarray, " n"]]
-) -> Callable[[int, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
-    """Return a delay line that holds the signals `before`; until one is `steps` old it gives the oldest that it has."""
-    line: deque[Float[np.ndarray, " n"]] = deque(before, maxlen=steps + 1)
-
-    def late(k: int, signal: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        line.append(signal.copy())
-        return line[0].copy()
-
-    return late
-
-
 @dataclass(frozen=True)
-class SensorDelay(Fault):
-    """The controller gets y_{k−steps}; until that exists, y_0."""
+class _Delaying(Fault):
+    """A signal comes `steps` late."""
 
     steps: int
 
     def __post_init__(self) -> None:
         checks.count(self.steps, "steps", 0)
 
+    def _line(
+        self, before: list[Float[np.ndarray, " n"]]
+    ) -> Callable[[int, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
+        """Return a delay line that holds signals `before`; until one is `steps` old it gives the oldest that it has."""
+        line: deque[Float[np.ndarray, " n"]] = deque(before, maxlen=self.steps + 1)
+
+        def late(k: int, signal: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+            line.append(signal.copy())
+            return line[0].copy()
+
+        return late
+
+
+@dataclass(frozen=True)
+class SensorDelay(_Delaying):
+    """The controller gets y_{k−steps}; until that exists, y_0."""
+
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the delay line of one run."""
-        return Injection(measured=_delayed(self.steps, []))
+        return Injection(measured=self._line([]))
 
 
 @dataclass(frozen=True)
@@ -242,18 +246,13 @@ class ActuatorLoss(_Windowed):
 
 
 @dataclass(frozen=True)
-class ActuatorDelay(Fault):
+class ActuatorDelay(_Delaying):
     """The plant gets u_{k−steps}; until that exists, the input nearest to zero inside the limits."""
-
-    steps: int
-
-    def __post_init__(self) -> None:
-        checks.count(self.steps, "steps", 0)
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the delay line of one run."""
         rest = np.clip(np.zeros(len(wiring.inputs.low)), *wiring.inputs)
-        return Injection(applied=_delayed(self.steps, [rest] * self.steps))
+        return Injection(applied=self._line([rest] * self.steps))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost, Sizes
-from koopmpc.control.limits import SOFTENED, Limits
+from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.errors import ShapeError
 from koopmpc.loop.run import Run
 from koopmpc.values import Value
@@ -254,14 +254,17 @@ def beyond(run: Run) -> Float[np.ndarray, " T1"]:
 
 def _broken(run: Run, limits: Limits) -> tuple[Float[np.ndarray, "T n"], Float[np.ndarray, "T0 nu"]]:
     """Return by how much x_1 … x_T and their limited outputs are beyond their limits, and each change of the input."""
-    values, nu, ny = _states(run)[1:], run.U.shape[1], 0
-    if limits.of is not None:
-        outputs = limits.of.bind(run.states)(values)
-        ny, values = outputs.shape[1], np.hstack([values, outputs])
-    changed, rates = np.diff(run.U, axis=0), limits.rates(nu)
-    free = np.full(nu, np.inf)
-    low, high = (-free, free) if rates is None else rates
-    return _excess(values, *limits.ends(values.shape[1] - ny, ny)), _excess(changed, low, high)
+    values, box = limited(limits, _states(run)[1:], run.states)
+    changed, rates = np.diff(run.U, axis=0), limits.rates(run.U.shape[1])
+    return _excess(values, *box), np.zeros(changed.shape) if rates is None else _excess(changed, *rates)
+
+
+def limited(
+    limits: Limits, X: Float[np.ndarray, "M nx"], states: Sequence[str]
+) -> tuple[Float[np.ndarray, "M n"], Interval]:
+    """Return the rows [x; of(x)] of all that limits can be of, and the box of these."""
+    Y = X[:, :0] if limits.of is None else limits.of.bind(states)(X)
+    return np.hstack([X, Y]), limits.ends(X.shape[1], Y.shape[1])
 
 
 def _excess(
@@ -277,12 +280,8 @@ def _excess(
 
 def _by_output(name: str, values: Float[np.ndarray, " nr"], tracked: Sequence[str] | None) -> dict[str, str]:
     if tracked is None:
-        return {name: _vector(values)}
+        return {name: "[" + ", ".join(f"{value:.4g}" for value in values) + "]"}
     return {f"{name}, {output}": f"{value:.4g}" for output, value in zip(tracked, values, strict=True)}
-
-
-def _vector(values: Float[np.ndarray, " n"]) -> str:
-    return "[" + ", ".join(f"{v:.4g}" for v in values) + "]"
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -117,12 +117,20 @@ class StepRows(Value):
             Y.append(last.y_next)
             reference.append(last.reference if last.reference_next is None else last.reference_next)
         held = [np.zeros(len(s.u)) if s.u_reference is None else s.u_reference for s in steps]
+        moves = [s.move for s in steps]
+        known = [getattr(m, "known", None) for m in moves]  # a user's own Move may lack it
         return StepRows(
             X=np.array(X, dtype=np.float64),
             Y=np.array(Y, dtype=np.float64),
             U=np.array([s.u for s in steps], dtype=np.float64),
             reference=np.array(reference, dtype=np.float64),
-            **_columns_of([s.move for s in steps]),
+            status=tuple([Status.OPTIMAL if m is None else m.status for m in moves]),
+            fallback=tuple([Fallback.NONE if m is None else m.fallback for m in moves]),
+            solve_time=np.array([0.0 if m is None else m.solve_time for m in moves], dtype=np.float64),
+            iterations=np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
+            slack=np.array([0.0 if m is None else m.slack for m in moves], dtype=np.float64),
+            known=np.array([-1 if looked is None else int(looked) for looked in known], dtype=np.int64),
+            solver=tuple([str(getattr(m, "solver", "")) for m in moves]),
             u_reference=np.array(held, dtype=np.float64),
         )
 
@@ -144,20 +152,6 @@ class StepRows(Value):
     def part(self, first: int, last: int) -> "StepRows":
         """Return rows first … last − 1; the state after the last move is among them where `last` is beyond it."""
         return StepRows(**{name: values[first:last] for name, values in self.columns().items()})
-
-
-def _columns_of(moves: Sequence[Move | None]) -> dict[str, Any]:
-    """Return the columns of `StepRows` that moves fill; a step without a Move counts as solved, in no time."""
-    known = [getattr(m, "known", None) for m in moves]  # a user's own Move may lack it
-    return {
-        "status": tuple([Status.OPTIMAL if m is None else m.status for m in moves]),
-        "fallback": tuple([Fallback.NONE if m is None else m.fallback for m in moves]),
-        "solve_time": np.array([0.0 if m is None else m.solve_time for m in moves], dtype=np.float64),
-        "iterations": np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
-        "slack": np.array([0.0 if m is None else m.slack for m in moves], dtype=np.float64),
-        "known": np.array([-1 if looked is None else int(looked) for looked in known], dtype=np.int64),
-        "solver": tuple([str(getattr(m, "solver", "")) for m in moves]),
-    }
 
 
 _OF_STATES = ("X", "Y", "reference")  # the columns with a row for each state; the others have one for each move

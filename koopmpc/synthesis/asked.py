@@ -14,6 +14,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import short
 from koopmpc.lifting.state import State
+from koopmpc.loop.metrics import limited
 from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
@@ -74,11 +75,7 @@ class Asked(Value):
 
     def beyond(self, X: Float[np.ndarray, "T nx"], states: Sequence[str]) -> Float[np.ndarray, " T"]:
         """Return for each state its largest violation of a limit, as a share of that limit's size."""
-        values, (low, high) = X, self.limits.states(X.shape[1])
-        if self.limits.of is not None:
-            Y = self.limits.of.bind(states)(X)
-            y_low, y_high = self.limits.outputs(Y.shape[1])
-            values, low, high = np.hstack([X, Y]), np.concatenate([low, y_low]), np.concatenate([high, y_high])
+        values, (low, high) = limited(self.limits, X, states)
         return (np.maximum(np.maximum(low - values, values - high), 0.0) / self.limit_sizes).max(axis=1)
 
     def hull(self, free: Sequence[int], tracked: Sequence[int]) -> tuple[Float[np.ndarray, " nx"], ...]:
@@ -111,7 +108,7 @@ def asked_of(
     Raises
     ------
     DataError, ShapeError
-        A size does not fit, NaN, an angle that is no state, no horizon.
+        A size does not fit, NaN, an angle that is no state.
     """
     cost, limits = checked(cost, limits)
     nx, states = data.nx, data.states
@@ -130,7 +127,6 @@ def asked_of(
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    horizon = checks.count(horizon, "horizon")
     steps = RUN * horizon
     if len(rows) == 1:
         rows = np.repeat(rows, steps + 1, axis=0)
@@ -146,9 +142,8 @@ def asked_of(
         )
         if not len(points):
             raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
-    ends = [limits.states(nx)] + ([] if limits.of is None else [limits.outputs(ny)])
-    values = X if limits.of is None else np.hstack([X, limits.of.bind(states)(X)])
-    sizes = np.concatenate([end.high - end.low for end in ends])
+    values, box = limited(limits, X, states)
+    sizes = box.high - box.low
     sizes = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.maximum(np.ptp(values, axis=0), 1e-300))
     return Asked(
         cost=cost,
@@ -245,16 +240,13 @@ def outside_limits(asked: Asked, data: Episodes) -> list[str]:
 
     A reference that rests is not looked at here: `unheld` says what can be held instead.
     """
-    cost, limits, states = asked.cost.of.bind(data.states), asked.limits, data.states
-    names, starts, boxes = list(states), asked.starts, [limits.states(data.nx)]
-    if limits.of is not None:
-        of = limits.of.bind(states)
-        names, starts = [*names, *of.names], np.hstack([starts, of(starts)])
-        boxes.append(limits.outputs(of.nz))
-    ends = np.concatenate([np.column_stack([box.low, box.high]) for box in boxes])
-    targets = dict(zip(cost.names, asked.reference.T, strict=True)) if asked.moves else {}
+    limits, states = asked.limits, data.states
+    names = states if limits.of is None else (*states, *limits.of.bind(states).names)
+    starts, box = limited(limits, asked.starts, states)
+    tracked = asked.cost.of.bind(states).names
+    targets = dict(zip(tracked, asked.reference.T, strict=True)) if asked.moves else {}
     said: list[str] = []
-    for name, start, (low, high) in zip(names, starts.T, ends, strict=True):
+    for name, start, low, high in zip(names, starts.T, *box, strict=True):
         for what, values, meaning in (
             ("a start", start, "no input can keep the limit from there; start inside it, or widen it"),
             ("the reference", targets.get(name), "the loop stays at the limit there; ask for less, or widen it"),

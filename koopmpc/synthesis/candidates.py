@@ -97,6 +97,14 @@ class Candidate(Value):
         return Candidate(self.name, bound, sized, self.bilinear)
 
 
+def model_of(candidate: Candidate, data: Episodes | Source, ridge: float, read: ReadOptions) -> AnyPredictor:
+    """Return the model of these data; the ridge of a bilinear one pulls it towards z⁺ = z."""
+    psi, embedding = candidate.lifting, candidate.embedding
+    if candidate.bilinear:
+        return bilinear_edmd(data, psi, embedding=embedding, ridge=ridge, difference=True, **read)
+    return edmd(data, psi, embedding=embedding, ridge=ridge, towards=candidate.towards, **read)
+
+
 def expanded(
     given: Sequence[Candidate | Lifting], episodes: Episodes, delays: Sequence[int], bilinear: bool
 ) -> list[Candidate]:
@@ -110,7 +118,9 @@ def expanded(
         if isinstance(one, Candidate):
             found.append(one.bind(episodes.states, episodes.inputs))
             continue
-        name = f"{i}: {_title(lifting_of(one))}"
+        psi = lifting_of(one)
+        parts = psi.parts if isinstance(psi, Sum) else (psi,)
+        name = f"{i}: {' + '.join(type(part).__name__ for part in parts)}"
         for d in delays:
             try:
                 bound = Candidate(name, one, Delay(d) if d else None).bind(episodes.states, episodes.inputs)
@@ -135,12 +145,13 @@ def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.ran
     pairs = sum(len(episode) for episode in episodes)
     room = min(_REGRESSORS, max(pairs // _EACH, 2 * (episodes.nx + episodes.nu)))
     X = np.concatenate([episode.X[:-1] for episode in episodes])
+    base, present = State() + Constant(), State(list(range(episodes.nx)))
     found: list[Candidate] = []
     for d in delays:
         embedding = Delay(d) if d else None
-        families = list(_trigonometric(episodes.states, X))
-        families += list(_scaled(episodes, X, rng)) if d == 0 else [_quadratic(episodes.nx)]
-        for name, lifting in [("x, 1", State() + Constant()), *families]:
+        families = [("x, 1", base), *_trigonometric(episodes.states, X)]
+        families += _scaled(episodes, X, rng) if d == 0 else [("monomials 2", base + present * present)]
+        for name, lifting in families:
             one = Candidate(name, lifting, embedding).bind(episodes.states, episodes.inputs)
             nz, nu = one.lifting.nz, episodes.nu
             if nz > MOST or (nz + nu > room and name != "x, 1"):
@@ -207,11 +218,6 @@ def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Itera
             yield f"fourier {k} ({where}) × squares", base + circle + squares + circle * (others + squares)
 
 
-def _quadratic(nx: int) -> tuple[str, Lifting]:
-    present = State(list(range(nx)))
-    return "monomials 2", State() + Constant() + present * present
-
-
 def _scaled(
     episodes: Episodes, X: Float[np.ndarray, "M nx"], rng: np.random.Generator
 ) -> Iterator[tuple[str, Lifting]]:
@@ -237,11 +243,6 @@ def _scaled(
         yield f"thin plate {len(centers)}", scaled(ThinPlate(centers))
     for count in (50, 100):
         yield f"random fourier {count}", scaled(RandomFourier(count, width, rng))
-
-
-def _title(lifting: Lifting) -> str:
-    parts = lifting.parts if isinstance(lifting, Sum) else (lifting,)
-    return " + ".join(type(part).__name__ for part in parts)
 
 
 Designed = KoopmanMPC | BilinearMPC
@@ -333,16 +334,9 @@ class Recipe(Value):
         scheduler: str | None = None,
     ) -> AnyPredictor:
         """Return the model of these data, with the weights `near`. Doubts about the fit stand in its report."""
-        one = self.candidate
-        options = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
         with unwarned():
-            if not one.bilinear:
-                return edmd(
-                    data, one.lifting, embedding=one.embedding, ridge=self.ridge, towards=one.towards, **options
-                )
-            return bilinear_edmd(
-                data, one.lifting, embedding=one.embedding, ridge=self.ridge, difference=True, **options
-            )
+            read = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
+            return model_of(self.candidate, data, self.ridge, read)
 
     def controller(
         self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False

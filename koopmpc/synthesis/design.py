@@ -20,15 +20,26 @@ from koopmpc.errors import DataError, FitWarning
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
-from koopmpc.parallel import Progress, StageProgress, Workers
+from koopmpc.parallel import StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
 from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, usual
 from koopmpc.synthesis.candidates import angles as angular
-from koopmpc.synthesis.cross_validation import LEAST, Trial, Tried, tried
+from koopmpc.synthesis.cross_validation import (
+    LEAST,
+    Folds,
+    Trial,
+    Tried,
+    folded,
+    mended,
+    only,
+    sampled,
+    smoothed,
+    tried,
+    without,
+)
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
-from koopmpc.synthesis.folds import Folds, folded, mended, only, sampled, smoothed, without
 from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
-from koopmpc.synthesis.select import RIDGES
+from koopmpc.synthesis.select import RIDGES, stage
 from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
 from koopmpc.validate.text import percent
 
@@ -151,7 +162,7 @@ def design(
             notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
     noise = np.zeros(held.nx)
     if smooth:
-        (source, held, freed), noise = smoothed(source, held)
+        source, held, freed, noise = smoothed(source, held)
         notes = (*notes, *freed)
     checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
     past = sorted({checks.count(d, "delays", 0) for d in delays})
@@ -170,7 +181,7 @@ def design(
         )
     trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
     with Workers(workers, scheduler) as pool:
-        results = pool.map(tried, trials, _stage(progress, "models"), size=lambda trial: trial.candidate.size)
+        results = pool.map(tried, trials, stage(progress, "models"), size=lambda trial: trial.candidate.size)
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
         test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, noise, pool)
         doubts = [*left.values(), *doubts]
@@ -251,16 +262,11 @@ def _models(
 ) -> list[Candidate]:
     """Return the models to try; each lifting also has the observables that cost and limits are of."""
     models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
-    needed = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
+    asking = (of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State))
+    needed = [of.bind(held.states) for of in asking]
     if not needed:
         return models
-    added: list[Candidate] = []
-    for one in models:
-        lifting = one.lifting
-        for of in needed:
-            lifting = lifting + of.bind(held.states)
-        added.append(replace(one, lifting=lifting).bind(held.states, held.inputs))
-    return added
+    return [replace(one, lifting=sum(needed, one.lifting)).bind(held.states, held.inputs) for one in models]
 
 
 def _test(
@@ -276,7 +282,7 @@ def _test(
     Each fold has a surrogate of either family that is fitted to the two others. The model that does not know fold k
     meets surrogates of which one does not know fold k + 1, the other fold k + 2.
     """
-    data, fold = folds.episodes, folds.fold
+    data = folds.episodes
     wanted: list[Condition] = []
     for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
         for k in range(FOLDS):
@@ -304,7 +310,7 @@ def _test(
     tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
     low, high = asked.hull(free, tracked)
     room = margin_room(asked, data) if tighten else None
-    test = LoopTest(asked, data, fold, tuple(surrogates), tuple(conditions), low, high, room, noise)
+    test = LoopTest(asked, data, folds.fold, tuple(surrogates), tuple(conditions), low, high, room, noise)
     unreachable = unheld(surrogates[0], asked)
     holds = not asked.moves and not unreachable
     return test, [*unreachable, *outside_limits(asked, data), *outside_data(asked, data, tracked, free)], holds
@@ -347,17 +353,12 @@ def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
     worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
     ranked = sorted(range(len(results)), key=lambda i: (worst[i], i))
     found: list[Recipe] = []
-
-    def add(i: int, indices: set[int], tail: int | None = None) -> None:
-        candidate, ridges = results[i].candidate, results[i].ridges
-        found.extend(Recipe(candidate, ridges[place], tail=tail) for place in sorted(indices))
-
     for bilinear in (False, True):
-        for i in [i for i in ranked if results[i].candidate.bilinear == bilinear][:_SCREENED]:
-            add(i, {places[i]})
-    for i, one in enumerate(results):
+        best = [i for i in ranked if results[i].candidate.bilinear == bilinear][:_SCREENED]
+        found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in best]
+    for one, place in zip(results, places, strict=True):
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
-            add(i, {0, places[i]}, tail=0)
+            found += [Recipe(one.candidate, one.ridges[i], tail=0) for i in sorted({0, place})]
     return found
 
 
@@ -374,9 +375,9 @@ def _rounds(
     with the estimator that was best. This takes longest, and so it begins as soon as that estimator is known; the
     second linear model fills the other workers meanwhile.
     """
-    run, every = partial(judged, test), tuple(range(len(test.conditions)))
-    first = pool.map(run, [Job(one, test.nominal) for one in screened], _stage(progress, "closed loops"), size=Job.size)
-    score = scores(ratios(first), test.weights[list(test.nominal)])
+    run, every = partial(judged, test), range(len(test.conditions))
+    first = pool.map(run, [Job(one, test.nominal) for one in screened], stage(progress, "closed loops"), size=Job.size)
+    score = scores(ratios(first), test.weights[test.nominal])
     ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
@@ -386,28 +387,21 @@ def _rounds(
     for place, one in enumerate(linear):
         ends = (None, 0) if one.tail is None else (0,)
         some = [replace(one, estimator=each, tail=tail) for tail in ends for each in estimators]
-        if place == 0:
-            second += some
-        else:
-            third += some
+        (second if place == 0 else third).extend(some)
     jobs = _jobs(second, screened, first, every)
-    outcomes = pool.map(run, jobs, _stage(progress, "closed loops of the best"), size=Job.size)
+    outcomes = pool.map(run, jobs, stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
         tried_ones = scores(ratios(outcomes[: len(estimators)]), test.weights)
         best = estimators[int(np.argmin(tried_ones))]
         third.append(replace(bilinear[0], estimator=best, weighted=True))
         third += [replace(one, estimator=best) for one in bilinear[1:]]
     jobs = _jobs(third, screened, first, every)
-    outcomes += pool.map(run, jobs, _stage(progress, "closed loops of the last"), size=Job.size)
+    outcomes += pool.map(run, jobs, stage(progress, "closed loops of the last"), size=Job.size)
     return _leaderboard(test, (screened, first), ([*second, *third], outcomes))
 
 
-def _stage(progress: StageProgress | None, name: str) -> Progress | None:
-    return None if progress is None else partial(progress, name)
-
-
 def _jobs(
-    chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: tuple[int, ...]
+    chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: Sequence[int]
 ) -> list[Job]:
     """Return the jobs of a later round; models and runs of earlier rounds are not made again."""
     jobs: list[Job] = []
@@ -422,7 +416,7 @@ def _jobs(
 def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
     """Return the rows and the outcome of each: the last round before the others, and the best first in each."""
     both: list[tuple[DesignRow, Outcome]] = []
-    nominal = test.weights[list(test.nominal)]
+    nominal = test.weights[test.nominal]
     for off, (recipes, outcomes), weights in ((True, last, test.weights), (False, screened, nominal)):
         part: list[tuple[DesignRow, Outcome]] = []
         each = ratios(outcomes)
@@ -443,14 +437,15 @@ def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[
 
 
 def _expected(test: LoopTest, outcome: Outcome) -> Expected:
-    as_learned = np.array([one.gain == 1.0 for one in test.conditions])
-    near = [one for one in test.conditions if one.gain == 1.0]
+    nominal = test.nominal
+    off = [j for j in range(len(test.conditions)) if j not in nominal]
+    near = [test.conditions[j] for j in nominal]
     known = outcome.broken[np.isfinite(outcome.cost)]
     return Expected(
-        cost=outcome.cost[as_learned],
-        cost_off=outcome.cost[~as_learned],
-        violation=outcome.violation[as_learned],
-        violation_off=outcome.violation[~as_learned],
+        cost=outcome.cost[nominal],
+        cost_off=outcome.cost[off],
+        violation=outcome.violation[nominal],
+        violation_off=outcome.violation[off],
         broken=float(known.mean()) if known.size else 1.0,
         starts=np.array([one.x0 for one in near]),
         surrogate=tuple(one.surrogate for one in near),

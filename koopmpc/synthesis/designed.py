@@ -102,8 +102,8 @@ class Expected(Value):
     def __str__(self) -> str:
         """Return what to expect in words."""
         pairs = [
-            ("cost", _spread(self.cost, "{:.4g}")),
-            ("with inputs 20 % off", _spread(self.cost_off, "{:.4g}")),
+            ("cost", _spread(self.cost)),
+            ("with inputs 20 % off", _spread(self.cost_off)),
             ("largest violation", f"{_worst(self.violation)}; with inputs 20 % off {_worst(self.violation_off)}"),
             ("steps that violate", f"{percent(self.broken)}, an estimate from held-out surrogates and no promise"),
             ("lost runs", f"{self.lost} of {len(self.cost) + len(self.cost_off)}"),
@@ -226,12 +226,11 @@ class Design:
         return "\n".join(said)
 
 
-def _spread(values: Float[np.ndarray, " runs"], form: str) -> str:
+def _spread(values: Float[np.ndarray, " runs"]) -> str:
     known = values[np.isfinite(values)]
     if not known.size:
         return "every run was lost"
-    ends = [form.format(float(value)) for value in (np.median(known), known.min(), known.max())]
-    return f"median {ends[0]}, from {ends[1]} to {ends[2]} over surrogates and starts"
+    return f"median {np.median(known):.4g}, from {known.min():.4g} to {known.max():.4g} over surrogates and starts"
 
 
 def _worst(values: Float[np.ndarray, " runs"]) -> str:

@@ -22,7 +22,7 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
-from koopmpc.synthesis.folds import only, without
+from koopmpc.synthesis.cross_validation import only, without
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.scoring import AnyPredictor, score
 
@@ -98,9 +98,9 @@ class LoopTest:
         return replace(limits, capped=(*limits.capped, *said))
 
     @property
-    def nominal(self) -> tuple[int, ...]:
+    def nominal(self) -> list[int]:
         """The conditions in which the inputs act as in the data."""
-        return tuple(i for i, condition in enumerate(self.conditions) if condition.gain == 1.0)
+        return [i for i, condition in enumerate(self.conditions) if condition.gain == 1.0]
 
     @property
     def weights(self) -> Float[np.ndarray, " conditions"]:
@@ -159,7 +159,7 @@ class Job:
     """
 
     recipe: Recipe
-    conditions: tuple[int, ...]
+    conditions: Sequence[int]
     known: Outcome | None = None
     known_runs: bool = False
 
@@ -254,15 +254,11 @@ def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequen
             controller = recipe.controller(model, asked.cost, limits, asked.horizon, brief=True)
         for j in mine:
             one = test.conditions[conditions[j]]
-            try:
-                run = _run(test, one, controller, conditions[j])
-            except LostError:
-                continue
-            total = metrics(run).cost
-            if not np.isfinite(total):
+            run, cost[j] = _run(test, one, controller, conditions[j])
+            if run is None:
                 continue
             over = asked.beyond(run.X[1:], run.states)
-            cost[j], violation[j], broken[j] = total, over.max(), np.mean(over > BROKEN)
+            violation[j], broken[j] = over.max(), np.mean(over > BROKEN)
             if one.gain == 1.0:
                 visited[j] = run.X
     states = np.concatenate([np.zeros((0, test.episodes.nx)), *(visited[j] for j in sorted(visited))])
@@ -283,13 +279,7 @@ def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
     It may lose no more runs than they, and cost a quarter more, as a geometric mean. A few more data can change a
     lifted model much: its observables are not invariant, so its forecasts of many steps rest on small numbers.
     """
-    cost = np.full(len(outcome.cost), np.inf)
-    for j, one in enumerate(test.conditions):
-        try:
-            total = metrics(_run(test, one, controller, j)).cost
-        except LostError:
-            continue
-        cost[j] = total if np.isfinite(total) else np.inf
+    cost = np.array([_run(test, one, controller, j)[1] for j, one in enumerate(test.conditions)])
     both = np.isfinite(cost) & np.isfinite(outcome.cost)
     if np.sum(~np.isfinite(cost)) > np.sum(~np.isfinite(outcome.cost)):
         return False
@@ -298,29 +288,33 @@ def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
     return not both.any() or bool(change.mean() <= np.log(CONFIRMED))
 
 
-def _run(test: LoopTest, one: Condition, controller: Designed, seed: int) -> Run:
-    """Return the closed loop, with the states without their past."""
+def _run(test: LoopTest, one: Condition, controller: Designed, seed: int) -> tuple[Run | None, float]:
+    """Return the closed loop, with the states without their past, and its cost; None and inf where it is lost."""
     asked, surrogate = test.asked, test.surrogates[one.surrogate]
-    run = simulate(
-        Fenced(test.plant(one), test.low, test.high),
-        controller,
-        x0=surrogate.start(one.x0),
-        reference=asked.reference[one.first : one.first + asked.steps + 1],
-        steps=asked.steps,
-        noise=surrogate.noise,
-        measured=surrogate.w if len(surrogate.w) else None,
-        rng=seed,
-    )
-    nx = test.episodes.nx
-    return replace(
+    try:
+        run = simulate(
+            Fenced(test.plant(one), test.low, test.high),
+            controller,
+            x0=surrogate.start(one.x0),
+            reference=asked.reference[one.first : one.first + asked.steps + 1],
+            steps=asked.steps,
+            noise=surrogate.noise,
+            measured=surrogate.w if len(surrogate.w) else None,
+            rng=seed,
+        )
+    except LostError:
+        return None, np.inf
+    run = replace(
         run,
-        X=run.X[:, :nx],
+        X=run.X[:, : test.episodes.nx],
         states=test.episodes.states,
         cost=asked.cost,
         limits=asked.limits,
         angles=asked.angles,
         u_reference=one.u_reference,
     )
+    cost = metrics(run).cost
+    return (run, cost) if np.isfinite(cost) else (None, np.inf)
 
 
 def ratios(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:

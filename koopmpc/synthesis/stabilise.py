@@ -205,21 +205,20 @@ class _Trials:
         policy = excitation.start(steps, self._plant.dt, self._draw)
         x0 = self._x_ref + start * self._size * self._draw.uniform(-1, 1, len(self._size))
         y = np.asarray(self._plant.reset(x0, self._draw), dtype=np.float64)
-        X, U = [y], list[Float[np.ndarray, " nu"]]()
-        for k in range(steps):
-            if not (np.abs(y - self._x_ref) <= self._size).all() or getattr(self._plant, "ended", ""):
-                return self._episode(X, U), False
-            u = np.asarray(policy(k, y), dtype=np.float64)
+        X, U, inside = [y], list[Float[np.ndarray, " nu"]](), self._inside(y)
+        while len(U) < steps and inside and not getattr(self._plant, "ended", ""):
+            u = np.asarray(policy(len(U), y), dtype=np.float64)
             y = np.asarray(self._plant.step(u.copy()), dtype=np.float64)
+            inside = self._inside(y)
             if not np.isfinite(y).all():
-                return self._episode(X, U), False
+                break
             X.append(y)
             U.append(u)
-        inside = bool((np.abs(y - self._x_ref) <= self._size).all())
-        return self._episode(X, U), inside
+        episode = Episode(X=np.array(X), U=np.array(U).reshape(len(U), len(self._plant.inputs)))
+        return episode, inside and len(U) == steps
 
-    def _episode(self, X: list[Float[np.ndarray, " nx"]], U: list[Float[np.ndarray, " nu"]]) -> Episode:
-        return Episode(X=np.array(X), U=np.array(U).reshape(len(U), len(self._plant.inputs)))
+    def _inside(self, y: Float[np.ndarray, " nx"]) -> bool:
+        return bool((np.abs(y - self._x_ref) <= self._size).all())
 
 
 def _feedback(

@@ -21,9 +21,7 @@ from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
 SECOND = 3.0  # times the error of the best that a surrogate of another family may have
-INVARIANT = (
-    0.25  # share of an increment that a state may decide which the plant does not feel: learned models err as much
-)
+INVARIANT = 0.25  # share of an increment that a state may decide which the plant does not feel: models err as much
 UNHELD = 0.02  # share of the data's range by which an equilibrium may miss the reference
 _SAMPLE = 500  # states that this is tried on
 _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")

@@ -7,9 +7,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.synthesis.candidates import angles
-from koopmpc.synthesis.cross_validation import Trial, tried
-from koopmpc.synthesis.folds import folded, sampled, usual_horizon
-from koopmpc.synthesis.selection import choice
+from koopmpc.synthesis.cross_validation import Trial, folded, sampled, tried, usual_horizon
+from koopmpc.synthesis.select import choice
 from tests.roundtrip import returned
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])
