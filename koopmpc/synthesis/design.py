@@ -16,7 +16,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, FitWarning
+from koopmpc.errors import DataError, FitWarning, ShapeError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
@@ -262,11 +262,19 @@ def _models(
 ) -> list[Candidate]:
     """Return the models to try; each lifting also has the observables that cost and limits are of."""
     models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
-    asking = (of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State))
-    needed = [of.bind(held.states) for of in asking]
-    if not needed:
+    asking = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
+    if not asking:
         return models
-    return [replace(one, lifting=sum(needed, one.lifting)).bind(held.states, held.inputs) for one in models]
+    found: list[Candidate] = []
+    for one in models:
+        states = held.states if one.lifting.bound is None else one.lifting.bound  # under delays those and their past
+        try:
+            needed = [of.bind(states) for of in asking]
+            found.append(replace(one, lifting=sum(needed, one.lifting)).bind(held.states, held.inputs))
+        except ShapeError:  # such observables are of the states alone
+            if not one.delays:
+                raise
+    return found
 
 
 def _test(
