@@ -15,7 +15,7 @@ from koopmpc.bench.results import RunRow, reached
 from koopmpc.bench.store import load_rows
 from koopmpc.errors import LogError
 from koopmpc.loop.metrics import metrics
-from koopmpc.recording.format.reader import load_run
+from koopmpc.recording.reader import load_run
 from koopmpc.validate.text import plain_table
 
 SURE = 0.05  # a regression needs a p below this where there are enough pairs to reach it

@@ -23,7 +23,7 @@ from koopmpc.figures.sweeps import attraction, profiles, svg, times, trajectorie
 from koopmpc.loop.metrics import duration
 from koopmpc.loop.run import Run
 from koopmpc.recording.description import STATUS_WORDS
-from koopmpc.recording.format.reader import load_run
+from koopmpc.recording.reader import load_run
 from koopmpc.validate.text import markdown_table, plain_table
 
 _SURE = (0.025, 0.975)  # the ends of an interval

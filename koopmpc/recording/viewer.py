@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from koopmpc.errors import LogError
-from koopmpc.recording.format.rrd import check_log
+from koopmpc.recording.rrd import check_log
 
 PORT, WEB_PORT = 9876, 9090
 _START = 15.0  # longest wait for a viewer that was opened [s]

@@ -22,7 +22,7 @@ from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
 _WRITERS = {".parquet": parquet.write, ".csv": csv.write}
-_READERS = {".rrd": ("koopmpc.recording.format.reader", "run_episodes")}  # imported when such a file is opened
+_READERS = {".rrd": ("koopmpc.recording.reader", "run_episodes")}  # imported when such a file is opened
 
 
 def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:

@@ -11,19 +11,20 @@ from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.interrupts import heard
 from koopmpc.loop.metrics import metrics, running_cost
 from koopmpc.loop.run import About, Run
-from koopmpc.recording.description import drawable, table_figures, title_of
-from koopmpc.recording.format.reader import load_run
-from koopmpc.recording.format.writer import file_recording, times
-from koopmpc.recording.views.blueprint import (
+from koopmpc.recording.blueprint import (
     LIMIT,
     REFERENCE,
     color,
+    draw_line,
     framed,
     input_limits,
     readable,
     shared_time,
     state_limits,
 )
+from koopmpc.recording.description import drawable, table_figures, title_of
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.rrd import file_recording
 from koopmpc.validate.text import markdown_table
 
 _MOST = 8  # plots of states and inputs in one column
@@ -78,9 +79,9 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
             for r, (run, values) in enumerate(zip(runs, curves, strict=True)):
                 if values is not None:
                     held = {"interpolation_mode": "StepAfter"} if entity.startswith("input") else {}
-                    _line(rec, f"{entity}/{r + 1}", names[r], color(r), 2.0, values, run.dt, **held)
+                    draw_line(rec, f"{entity}/{r + 1}", names[r], color(r), 2.0, values, run.dt, **held)
             for r, (name, shade, values, dt) in enumerate(_marks(runs, title)):
-                _line(rec, f"{entity}/mark/{r}", name, shade, 1.0, values, dt)
+                draw_line(rec, f"{entity}/mark/{r}", name, shade, 1.0, values, dt)
         text = rr.TextDocument(drawable(f"{heading}{_table(runs, names)}"), media_type=rr.MediaType.MARKDOWN)
         rec.log("metrics", text, static=True)
 
@@ -137,17 +138,6 @@ def _marks(runs: Sequence[Run], title: str) -> list[tuple[str, Any, np.ndarray, 
                 line = ("limits", LIMIT, np.full(2, value), run.steps * run.dt)
                 found.setdefault(b"l" + np.float64(value).tobytes(), line)
     return list(found.values())
-
-
-def _line(
-    rec: Any, entity: str, name: str, shade: Any, width: float, values: np.ndarray, dt: float, **style: Any
-) -> None:
-    import rerun as rr
-
-    k = np.flatnonzero(np.isfinite(values))
-    if len(k):
-        rec.log(entity, rr.SeriesLines(names=drawable(name), colors=shade, widths=width, **style), static=True)
-        rec.send_columns(entity, times(k, dt), rr.Scalars.columns(scalars=values[k]))
 
 
 def _view(entity: str, title: str, curves: Sequence[np.ndarray | None], first: bool, length: float) -> Any:

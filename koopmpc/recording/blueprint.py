@@ -1,5 +1,5 @@
 # pyright: basic
-"""The default blueprint: plots on the left; animation, eigenvalues and text on the right; a title above."""
+"""What the viewer shows of a run: the look of its curves and eigenvalues, and the blueprint, which lays them out."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,14 @@ import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.figures.animation import project
+from koopmpc.figures.style import SEQUENTIAL, shades
 from koopmpc.loop.run import About
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable, status_words
-from koopmpc.recording.format.rrd import LogBlock
-from koopmpc.recording.views.eigenvalues import eigenvalue_views
-from koopmpc.recording.views.scenes import BACKGROUND, Extent
+from koopmpc.recording.rrd import times
+from koopmpc.recording.scenes import BACKGROUND, Extent
 from koopmpc.scene import Color
+from koopmpc.validate.residuals import ResidualDMD
 
 PALETTE: tuple[Color, ...] = (
     (88, 166, 255), (255, 166, 87), (86, 211, 160), (240, 120, 170),
@@ -37,6 +38,10 @@ _DISTANCE = 0.75  # of the eye from the middle of a scene in space, in its diago
 SEPARATE = 4  # up to so many states have a plot each
 VIEW = "koopmpc.View"  # components that plots alone show, beside the numbers of an entity, in single precision
 LOG_TIME = "log10_seconds"  # the one of them that solver/time_ms and solver/deadline_ms have
+_WIDEST = 3.0  # largest half width of the picture of eigenvalues
+_CLOSE = 0.35  # share of the picture below which the eigenvalues get one of their own
+_BELOW, _ABOVE = 1e-2, 1e1  # residuals of the darkest and the lightest shade, over the tolerance
+_LIGHT = 0.85  # share of the colour scale in use; the rest is too light for points
 
 _STATUS_COLORS: dict[Status, Color] = {
     Status.UNCONSTRAINED: (46, 160, 120),
@@ -51,22 +56,33 @@ def ahead(horizon: int) -> list[int]:
     return sorted({round(i * horizon / min(horizon, _AHEAD)) for i in range(1, min(horizon, _AHEAD) + 1)})
 
 
+_Limit = tuple[str, float]  # name, value
+
+
 @dataclass(frozen=True)
 class Panel:
-    """One plot of states: its entity, its title, and which states, references and measurements it shows, by index."""
+    """One plot of states: its entity, its title, and which states, references and measurements it shows, by index.
+
+    `limits` are the finite limits of these states: name and value of each.
+    """
 
     entity: str
     title: str
     states: list[int]
     references: list[int]
     measured: list[int]
+    limits: list[_Limit]
+
+    def called(self, what: str, names: Sequence[str]) -> list[str]:
+        """Return the names of curves that say `what` of these states; where there is one state it goes without."""
+        return [what if len(self.states) == 1 else f"{name}, {what}" for name in names]
 
 
 def panels(about: About, nr: int) -> list[Panel]:
     """Return a plot a state, or one plot for all of many states."""
-    tracked, places = about.tracked(nr), range(len(about.states))
+    tracked, places, limits = about.tracked(nr), range(len(about.states)), state_limits(about)
     if len(about.states) > SEPARATE:
-        return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))])]
+        return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))], limits)]
     return [
         Panel(
             f"plots/{i}",
@@ -74,20 +90,18 @@ def panels(about: About, nr: int) -> list[Panel]:
             [i],
             [j for j, other in enumerate(tracked) if other == name],
             [j for j, other in enumerate(about.outputs) if other == name],
+            [limit for limit in limits if limit[0] == name],
         )
         for i, name in enumerate(about.states)
     ]
 
 
-def styles(about: About, rows: LogBlock) -> dict[str, Any]:
-    """Return the static archetypes by entity that name and colour what `rows` hold."""
-    nr = rows.reference.shape[1]
-    tracked, bounds = about.tracked(nr), state_limits(about)
-    stages = ahead(rows.plan_U.shape[1]) if len(rows.planned) else []
-
+def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
+    """Return the static archetypes by entity that name and colour the curves of a run, `horizon` 0 without plans."""
+    stages = ahead(horizon)
     found = {
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
-        "reference": _lines([f"{name}, reference" for name in tracked], REFERENCE, 1.5),
+        "reference": _lines([f"{name}, reference" for name in about.tracked(nr)], REFERENCE, 1.5),
         "measurement": _points([f"{name}, measured" for name in about.outputs], _MEASURED, 1.5),
         "control/u": _lines(about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, **_HELD),
         "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0),
@@ -97,21 +111,15 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
     }
     found |= {f"plots/u/ahead/{j}": _points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
     for panel in panels(about, nr):
-        alone = len(panel.states) == 1
-
-        def called(what: str, names: Sequence[str], alone: bool = alone) -> list[str]:
-            return [what if alone else f"{name}, {what}" for name in names]
-
-        own = [about.states[i] for i in panel.states]
-        limits = called("limits", [name for name, _ in bounds if name in own])
+        limits = panel.called("limits", [name for name, _ in panel.limits])
         found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0)
-        one = _points(called("prediction", own), _PREDICTION, 1.6)
-        found |= {f"{panel.entity}/ahead/{j}": one for j in stages}
+        predicted = panel.called("prediction", [about.states[i] for i in panel.states])
+        points = _points(predicted, _PREDICTION, 1.6)
+        found |= {f"{panel.entity}/ahead/{j}": points for j in stages}
     return found
 
 
 _HELD: dict[str, Any] = {"interpolation_mode": "StepAfter"}
-_Limit = tuple[str, float]  # name, value
 
 
 def input_limits(about: About) -> list[_Limit]:
@@ -150,12 +158,24 @@ def color(i: int) -> Color:
     return PALETTE[i % len(PALETTE)]
 
 
-def _lines(names: Sequence[str], colors: Color | Sequence[Color], width: float, **more: Any) -> Any:
+def _lines(names: Sequence[str], colors: Color | list[Color], width: float, **more: Any) -> Any:
     """Return lines of one colour, or of a colour each."""
     import rerun as rr
 
-    each = [colors] * len(names) if isinstance(colors, tuple) and isinstance(colors[0], int) else list(colors)
+    each = colors if isinstance(colors, list) else [colors] * len(names)
     return rr.SeriesLines(names=[drawable(name) for name in names], colors=each, widths=[width] * len(names), **more)
+
+
+def draw_line(
+    rec: Any, entity: str, name: str, shade: Color, width: float, values: np.ndarray, dt: float, **style: Any
+) -> None:
+    """Write the finite values of one curve over the steps 0, 1, …; nothing where there is none."""
+    import rerun as rr
+
+    k = np.flatnonzero(np.isfinite(values))
+    if len(k):  # the viewer crashes on a timeline without rows
+        rec.log(entity, rr.SeriesLines(names=drawable(name), colors=shade, widths=width, **style), static=True)
+        rec.send_columns(entity, times(k, dt), rr.Scalars.columns(scalars=values[k]))
 
 
 def _points(names: Sequence[str], shade: Color, size: float) -> Any:
@@ -337,3 +357,74 @@ def readable(values: Sequence[float], ticks: float) -> Any:
 
 def _title(what: str, names: tuple[str, ...]) -> str:
     return f"{what}: {names[0]}" if len(names) == 1 else f"{what}s"
+
+
+def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> dict[str, Any]:
+    """Return static archetypes by entity. Rerun's y points down.
+
+    Without residuals eigenvalues outside the unit circle are red. With them a point is the darker the smaller its
+    residual, and one that may be spurious is a ring.
+    """
+    import rerun as rr
+
+    values = np.asarray(model.eigenvalues if residuals is None else residuals.eigenvalues)
+    turn = np.linspace(0, 2 * np.pi, 721)
+    size = _reach(model)
+    axes = [[(-size, 0), (size, 0)], [(0, -size), (0, size)]]
+    at = np.stack([np.real(values), -np.imag(values)], axis=1)
+    labels = [f"λ = {v:.4f}, |λ| = {abs(v):.4f}" for v in values]
+    if residuals is None:
+        outside = np.abs(values) > 1 + 1e-9
+        colors = np.where(outside[:, None], [214, 60, 60], [40, 110, 200]).astype(np.uint8)
+    else:
+        labels = [f"{label}, residual {r:.2g}" for label, r in zip(labels, residuals.residuals, strict=True)]
+        share = np.clip(residuals.residuals / residuals.tolerance, _BELOW, _ABOVE)
+        level = np.log(share / _BELOW) / np.log(_ABOVE / _BELOW)
+        colors = shades(_LIGHT * level, SEQUENTIAL)
+    drawn = {
+        "model/axes": rr.LineStrips2D(axes, radii=rr.Radius.ui_points(0.5), colors=[205, 210, 216], draw_order=1),
+        "model/circle": rr.LineStrips2D(
+            [np.stack([np.cos(turn), np.sin(turn)], axis=1)],
+            radii=rr.Radius.ui_points(1.0),
+            colors=[120, 130, 145],
+            draw_order=2,
+        ),
+        "model/eigenvalues": rr.Points2D(
+            at, radii=rr.Radius.ui_points(5.0), colors=colors, labels=labels, show_labels=False, draw_order=30
+        ),
+    }
+    if residuals is not None and residuals.spurious.any():
+        drawn["model/spurious"] = rr.Points2D(
+            at[residuals.spurious], radii=rr.Radius.ui_points(2.6), colors=BACKGROUND, draw_order=31
+        )
+    return drawn
+
+
+def _reach(model: Predictor) -> float:
+    """Return the half width of the picture, which holds the unit circle and the eigenvalues up to |λ| = 2.6."""
+    values = np.asarray(model.eigenvalues)
+    return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)
+
+
+def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
+    """Return the view of the unit circle, and a closer one where the eigenvalues crowd."""
+    size, values = _reach(model), np.asarray(model.eigenvalues)
+    views = [_circle_view("Eigenvalues, unit circle", 0.0, size)]
+    told = "Closer; rings may be spurious" if residuals else "Closer"
+    re, im = np.real(values), np.imag(values)
+    half = max(np.ptp(re), np.ptp(im)) / 2
+    if half < _CLOSE * size:
+        views.append(_circle_view(told, (re.min() + re.max()) / 2, 1.3 * half + 1e-3))
+    return views
+
+
+def _circle_view(name: str, x: float, size: float) -> Any:
+    """Return the view of the square of half width `size` about x on the real axis."""
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(
+        origin="model",
+        name=name,
+        background=list(BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=[x - size, x + size], y_range=[-size, size]),
+    )
