@@ -19,7 +19,8 @@ from koopmpc import disk
 from koopmpc.bench.results import ORACLE, RunRow
 from koopmpc.bench.store import load_rows, manifest_of
 from koopmpc.control.move import Fallback, Status
-from koopmpc.figures.sweeps import attraction, profiles, svg, times, trajectories
+from koopmpc.figures.reports import attraction, profiles, times, trajectories
+from koopmpc.figures.style import svg
 from koopmpc.loop.metrics import duration
 from koopmpc.loop.run import Run
 from koopmpc.recording.description import STATUS_WORDS

@@ -8,7 +8,7 @@ stays when it is let go. matplotlib is imported where it is used.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
-from io import BytesIO
+from io import BytesIO, StringIO
 from os import PathLike
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, ParamSpec, TypeVar, cast
 
@@ -202,6 +202,15 @@ def save(made: "Figure", path: str | PathLike[str]) -> None:
             _save_png(made, stream)
         else:
             made.savefig(stream, format=suffix[1:], metadata=_METADATA[suffix])
+
+
+@styled
+def svg(made: "Figure") -> str:
+    """Return the figure as an <svg> element, to stand in a page; it scales with the width that it has."""
+    out = StringIO()
+    made.savefig(out, format="svg", metadata=_METADATA[".svg"])
+    text = out.getvalue()
+    return text[text.index("<svg") :]
 
 
 def _save_png(made: "Figure", stream: BinaryIO) -> None:

@@ -14,9 +14,8 @@ from koopmpc.bench.results import RESULTS
 from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError
-from koopmpc.figures.comparisons import error
 from koopmpc.figures.eigenvalues import spectrum
-from koopmpc.figures.series import rollout
+from koopmpc.figures.series import error, rollout
 from koopmpc.fitting.audited import Data, evenly
 from koopmpc.fitting.repair import IN_MEMORY, PAST, Divided, divided, noted, shortened
 from koopmpc.identify.fits.edmd import edmd

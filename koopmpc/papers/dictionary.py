@@ -17,7 +17,7 @@ import numpy as np
 
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import unwarned
-from koopmpc.figures.plots import Plot, plots
+from koopmpc.figures.reports import Plot, plots
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.radial import Gaussian

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, LogError
-from koopmpc.figures.plane import Axes, Plane, eigenfunctions_on, plane_through
+from koopmpc.figures.eigenvalues import Axes, Plane, eigenfunctions_on, plane_through
 from koopmpc.figures.style import CYCLIC, SEQUENTIAL, shades
 from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
