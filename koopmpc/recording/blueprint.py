@@ -166,6 +166,13 @@ def _lines(names: Sequence[str], colors: Color | list[Color], width: float, **mo
     return rr.SeriesLines(names=[drawable(name) for name in names], colors=each, widths=[width] * len(names), **more)
 
 
+def write_page(rec: Any, entity: str, text: str, *more: Any) -> None:
+    """Write Markdown as a page that does not change, and `more` of the same entity."""
+    import rerun as rr
+
+    rec.log(entity, rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN), *more, static=True)
+
+
 def draw_line(
     rec: Any, entity: str, name: str, shade: Color, width: float, values: np.ndarray, dt: float, **style: Any
 ) -> None:
@@ -329,6 +336,14 @@ def _animation(extent: Extent) -> Any:
     return rrb.Spatial2DView(origin="world", name=name, background=list(BACKGROUND), visual_bounds=fixed)
 
 
+def plane_view(origin: str, name: str, x: Sequence[float], y: Sequence[float]) -> Any:
+    """Return the view of what is drawn in the plane within these ranges of x and y, y down."""
+    import rerun.blueprint as rrb
+
+    bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+    return rrb.Spatial2DView(origin=origin, name=name, background=list(BACKGROUND), visual_bounds=bounds)
+
+
 def readable(values: Sequence[float], ticks: float) -> Any:
     """Return an axis a little wider than `values` that holds two ticks with numbers; None where they span nothing.
 
@@ -409,22 +424,15 @@ def _reach(model: Predictor) -> float:
 def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
     """Return the view of the unit circle, and a closer one where the eigenvalues crowd."""
     size, values = _reach(model), np.asarray(model.eigenvalues)
-    views = [_circle_view("Eigenvalues, unit circle", 0.0, size)]
+    views = [_around("Eigenvalues, unit circle", 0.0, size)]
     told = "Closer; rings may be spurious" if residuals else "Closer"
     re, im = np.real(values), np.imag(values)
     half = max(np.ptp(re), np.ptp(im)) / 2
     if half < _CLOSE * size:
-        views.append(_circle_view(told, (re.min() + re.max()) / 2, 1.3 * half + 1e-3))
+        views.append(_around(told, (re.min() + re.max()) / 2, 1.3 * half + 1e-3))
     return views
 
 
-def _circle_view(name: str, x: float, size: float) -> Any:
-    """Return the view of the square of half width `size` about x on the real axis."""
-    import rerun.blueprint as rrb
-
-    return rrb.Spatial2DView(
-        origin="model",
-        name=name,
-        background=list(BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[x - size, x + size], y_range=[-size, size]),
-    )
+def _around(name: str, x: float, size: float) -> Any:
+    """Return the view of the eigenvalues in the square of half width `size` about x on the real axis."""
+    return plane_view("model", name, [x - size, x + size], [-size, size])

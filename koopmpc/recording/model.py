@@ -18,11 +18,18 @@ from koopmpc.figures.eigenvalues import Axes, Plane, eigenfunctions_on, plane_th
 from koopmpc.figures.style import CYCLIC, SEQUENTIAL, shades
 from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.recording.blueprint import color, draw_eigenvalues, eigenvalue_views, framed, shared_time
+from koopmpc.recording.blueprint import (
+    color,
+    draw_eigenvalues,
+    eigenvalue_views,
+    framed,
+    plane_view,
+    shared_time,
+    write_page,
+)
 from koopmpc.recording.description import drawable, written_with
 from koopmpc.recording.reader import Entity, naming, read_columns
 from koopmpc.recording.rrd import file_recording, times
-from koopmpc.recording.scenes import BACKGROUND
 from koopmpc.scene import Color
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.report import TrustReport
@@ -101,8 +108,7 @@ def record_model(
     layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)
     with file_recording(path, "koopmpc-model", layout) as rec:
         rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
-        text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
-        rec.log("report", text, static=True)
+        write_page(rec, "report", _page(predictor, report, note))
         facts = _facts(predictor) | {"horizon": horizon, "band": ahead[0].band if ahead else ""}
         about = {"format": _FORMAT, "written_with": written_with(), "dt": predictor.dt, "facts": facts}
         about |= {"states": list(predictor.states), "forecasts": len(ahead)}
@@ -199,17 +205,10 @@ def _eigenfunctions(predictor: LinearPredictor, which: Sequence[int], plane: Pla
     return pictures
 
 
-def _plane_view(entity: str, title: str, plane: Plane) -> Any:
+def _picture_view(entity: str, title: str, plane: Plane) -> Any:
     """Return the view of one picture, with room for the words around it."""
-    import rerun.blueprint as rrb
-
     n, m = len(plane.across), len(plane.up)
-    return rrb.Spatial2DView(
-        origin=entity,
-        name=drawable(title),
-        background=list(BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[-0.3 * n, 1.1 * n], y_range=[-0.08 * m, 1.25 * m]),
-    )
+    return plane_view(entity, drawable(title), [-0.3 * n, 1.1 * n], [-0.08 * m, 1.25 * m])
 
 
 def _picture(entity: str, pixels: np.ndarray, plane: Plane) -> dict[str, Any]:
@@ -308,7 +307,7 @@ def _blueprint(
     text = rrb.TextDocumentView(origin="report", name="Report")
     rows: list[Any] = [rrb.Horizontal(*eigenvalue_views(predictor, residuals=told))]
     if surface is not None:
-        views = [_plane_view(entity, title, surface) for entity, title, _ in pictures]
+        views = [_picture_view(entity, title, surface) for entity, title, _ in pictures]
         rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
     return framed(
         rrb.Horizontal(

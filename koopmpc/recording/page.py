@@ -14,7 +14,7 @@ from koopmpc import checks, disk
 from koopmpc.errors import DataError
 from koopmpc.figures.style import save
 from koopmpc.interrupts import heard
-from koopmpc.recording.blueprint import color, draw_line, framed
+from koopmpc.recording.blueprint import color, draw_line, framed, write_page
 from koopmpc.recording.description import drawable
 from koopmpc.recording.rrd import file_recording
 from koopmpc.validate.text import markdown_table
@@ -69,8 +69,6 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
     LogError
         The path cannot be written.
     """
-    import rerun as rr
-
     if not tabs:
         raise DataError("there is no curve to record; pass at least one tab")
     slugs = [_slug(tab.title) for tab in tabs]
@@ -79,7 +77,7 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
         raise DataError(f"two tabs are called {twice!r}; name each by a title of its own")
     tables = [_tables(tab) for tab in tabs]
     with file_recording(path, application, _blueprint(tabs, slugs)) as rec:
-        rec.log("page", rr.TextDocument(drawable(page), media_type="text/markdown"), static=True)
+        write_page(rec, "page", page)
         for tab, slug, curves in zip(tabs, slugs, tables, strict=True):
             for j, column in enumerate(tab.columns):
                 for i, (name, X) in enumerate(curves.items()):

@@ -110,11 +110,8 @@ class LogColumns:
     def vectors(self, entity: str) -> np.ndarray:
         """Return the rows 0, 1, … up to the first that is missing."""
         k, values = self.matrix(entity)
-        return values[: _whole(k)]
-
-    def column(self, entity: str) -> np.ndarray:
-        """Return one number a row: 0, 1, … up to the first that is missing."""
-        return self.vectors(entity).reshape(-1)
+        gaps = np.flatnonzero(k != np.arange(len(k)))
+        return values[: gaps[0]] if len(gaps) else values
 
     def held(self, entity: str, component: str, column: np.ndarray) -> np.ndarray:
         """Return `column`, with the numbers of this component in the rows that have one."""
@@ -146,12 +143,6 @@ def _bytes(values: Any) -> Any:
 
 def _key(entity: str, component: str) -> tuple[str, str]:
     return f"/{entity.removeprefix('/')}", component
-
-
-def _whole(k: np.ndarray) -> int:
-    """Return the number of rows before the first gap in 0, 1, 2, …."""
-    gaps = np.flatnonzero(k != np.arange(len(k)))
-    return int(gaps[0]) if len(gaps) else len(k)
 
 
 def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
@@ -207,7 +198,7 @@ def _run(log: LogColumns, path: Path) -> Run:
     about, planned_steps = about_of(log, path)
     X, reference = log.vectors(Entity.STATE), log.vectors(Entity.REFERENCE)
     U = log.vectors(Entity.INPUT)
-    seconds = log.held(Entity.SOLVER, "seconds", log.column(Entity.SOLVER) / 1e3)
+    seconds = log.held(Entity.SOLVER, "seconds", log.vectors(Entity.SOLVER).reshape(-1) / 1e3)
     iterations = log.held(Entity.SOLVER, "iterations", np.zeros(len(seconds), dtype=np.int64))
     counts = [len(X) - 1, len(seconds)]
     counts += [len(U)] if about.inputs else []

@@ -28,6 +28,7 @@ from koopmpc.recording.blueprint import (
     panels,
     status_value,
     styles,
+    write_page,
 )
 from koopmpc.recording.description import (
     application_of,
@@ -82,33 +83,23 @@ class LogBlock(StepRows):
 
     def cut(self, first: int, last: int) -> "LogBlock":
         """Return rows first … last − 1, counted from this block's own first row."""
-        p = slice(*np.searchsorted(self.planned, [self.k + first, self.k + last]))
-        plans = (self.planned[p], self.plan_X[p], self.plan_U[p])
-        return _block(self.k + first, self.part(first, last), *plans)
-
-
-def _block(
-    k: int,
-    rows: StepRows,
-    planned: Int[np.ndarray, " p"],
-    plan_X: Float[np.ndarray, "p N1 nx_plan"],
-    plan_U: Float[np.ndarray, "p N nu_plan"],
-) -> LogBlock:
-    return LogBlock(**rows.columns(), k=k, planned=planned, plan_X=plan_X, plan_U=plan_U)
+        rows, p = self.part(first, last), slice(*np.searchsorted(self.planned, [self.k + first, self.k + last]))
+        plans: dict[str, Any] = {"planned": self.planned[p], "plan_X": self.plan_X[p], "plan_U": self.plan_U[p]}
+        return LogBlock(**rows.columns(), k=self.k + first, **plans)
 
 
 def block_of_run(run: Run) -> LogBlock:
     """Return the whole of `run` as one block."""
     plans = run.plans or _NO_PLANS
-    return _block(0, run, np.arange(len(plans.X)), plans.X, plans.U)
+    return LogBlock(**run.columns(), k=0, planned=np.arange(len(plans.X)), plan_X=plans.X, plan_U=plans.U)
 
 
 def block_of_steps(steps: Sequence[Step], nx: int, *, end: bool) -> LogBlock:
     """Return consecutive steps as a block; with `end`, the state that the last one led to follows."""
-    plans = [step.plan for step in steps if step.plan is not None]
-    whole = Plans.of(plans) or _NO_PLANS
-    planned = np.array([step.k for step in steps if step.plan is not None], dtype=np.int64)
-    return _block(steps[0].k, StepRows.of(steps, nx, end=end), planned, whole.X, whole.U)
+    plans = [(step.k, plan) for step in steps if (plan := step.plan) is not None]
+    planned = np.array([k for k, _ in plans], dtype=np.int64)
+    rows, whole = StepRows.of(steps, nx, end=end), Plans.of([plan for _, plan in plans]) or _NO_PLANS
+    return LogBlock(**rows.columns(), k=steps[0].k, planned=planned, plan_X=whole.X, plan_U=whole.U)
 
 
 def blocks(rows: LogBlock, least: int = 100, most: int = 5) -> list[LogBlock]:
@@ -188,8 +179,7 @@ class Writer:
     def _write(self, rows: LogBlock, drawings: dict[str, Drawing]) -> None:
         import rerun as rr
 
-        n, m = len(rows.X), len(rows.U)
-        k = rows.k + np.arange(n)
+        k = rows.k + np.arange(len(rows.X))
         if not self._looks:
             self._looks = styles(self._about, self._nr, rows.horizon)
             for entity, style in self._looks.items():
@@ -210,42 +200,43 @@ class Writer:
             self._style(Entity.MEASUREMENT, self._looks[Entity.MEASUREMENT])
         self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured], [i for p in shown for i in p.measured])
         self._vectors(Entity.REFERENCE, k, rows.reference, [i for p in shown for i in p.references])
-        if m:
-            self._vectors(Entity.INPUT, k[:m], rows.U)
-            held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
-            self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
-            gave = np.flatnonzero(rows.slack)
-            self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
-            looked = np.flatnonzero(rows.known >= 0)
-            self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
-            ends = self._ends(k[:m])
-            limits = [value for _, value in input_limits(self._about)]
-            self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
-            if len(ends):
-                powers = np.full(len(ends), np.log10(self._about.dt))
-                line = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers})
-                scalars = rr.Scalars.columns(scalars=np.full(len(ends), 1e3 * self._about.dt))
-                self._send(Entity.DEADLINE, ends, [*scalars, *line])
-            timed = rows.solve_time > 0
-            powers = np.log10(rows.solve_time[timed]).astype(np.float32)
-            drawn = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers}).partition(timed.astype(np.int64))
-            ms = 1e3 * rows.solve_time
-            parts = {
-                "seconds": (rows.solve_time, ms / 1e3 != rows.solve_time),
-                "iterations": (rows.iterations, rows.iterations != 0),
-            }
-            exact: list[Any] = []
-            for name, (column, held) in parts.items():
-                values = np.ascontiguousarray(column[held])
-                self._sum(f"/{Entity.SOLVER}:{name}", values.data)
-                if held.any():
-                    columns = rr.DynamicArchetype.columns("koopmpc.Solver", components={name: values})
-                    exact += [*columns.partition(held.astype(np.int64))]
-            scalars = rr.Scalars.columns(scalars=ms)
-            self._sum(f"/{Entity.SOLVER}:scalars", ms.data, k[:m])
-            self._send(Entity.SOLVER, k[:m], [*scalars, *exact, *drawn])
+        if len(rows.U):
+            self._moves(rows, k[: len(rows.U)])
         self.flush()  # static archetypes reach the file before the states do
         self._vectors(Entity.STATE, k, rows.X, [i for panel in shown for i in panel.states])
+
+    def _moves(self, rows: LogBlock, k: np.ndarray) -> None:
+        """Write the inputs at steps k, their limits, and what the solver did for them."""
+        import rerun as rr
+
+        self._vectors(Entity.INPUT, k, rows.U)
+        held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
+        self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
+        gave = np.flatnonzero(rows.slack)
+        self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
+        looked = np.flatnonzero(rows.known >= 0)
+        self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
+        ends = self._ends(k)
+        limits = [value for _, value in input_limits(self._about)]
+        self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
+        if len(ends):
+            powers = np.full(len(ends), np.log10(self._about.dt))
+            line = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers})
+            scalars = rr.Scalars.columns(scalars=np.full(len(ends), 1e3 * self._about.dt))
+            self._send(Entity.DEADLINE, ends, [*scalars, *line])
+        ms, timed = 1e3 * rows.solve_time, rows.solve_time > 0
+        columns = [*rr.Scalars.columns(scalars=ms)]
+        for name, column, held in (
+            ("seconds", rows.solve_time, ms / 1e3 != rows.solve_time),
+            ("iterations", rows.iterations, rows.iterations != 0),
+        ):
+            values = np.ascontiguousarray(column[held])
+            self._sum(f"/{Entity.SOLVER}:{name}", values.data)
+            if held.any():
+                columns += _where(held, "koopmpc.Solver", name, values)
+        columns += _where(timed, VIEW, LOG_TIME, np.log10(rows.solve_time[timed]).astype(np.float32))
+        self._sum(f"/{Entity.SOLVER}:scalars", ms.data, k)
+        self._send(Entity.SOLVER, k, columns)
 
     def flush(self) -> None:
         """Wait until the sinks have what was written; raise where the disk has refused it."""
@@ -270,9 +261,8 @@ class Writer:
                 text = f"The metrics cannot be computed: {error}"
         if not self._opened:
             self._open()
-        document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
         numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
-        self._rec.log(Entity.METRICS, document, rr.AnyValues(**numbers), static=True)
+        write_page(self._rec, Entity.METRICS, text, rr.AnyValues(**numbers))
         if self._extent.ranges() != self._shown:
             send_blueprint(self._rec, application_of(self._about), self._blueprint())
         self.flush()
@@ -305,10 +295,8 @@ class Writer:
             self._file.attach(self._rec, *sinks)
         self._rec.send_recording_name(drawable(title_of(self._about)))
         self._sum(f"/{Entity.DESCRIPTION}:json", self._json.encode())
-        text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log(Entity.DESCRIPTION, text, rr.AnyValues(json=self._json), static=True)
-        heading = rr.TextDocument(drawable(f"**{title_of(self._about)}**"), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log("title", heading, static=True)
+        write_page(self._rec, Entity.DESCRIPTION, self._page, rr.AnyValues(json=self._json))
+        write_page(self._rec, "title", f"**{title_of(self._about)}**")
         self.flush()  # a log that is cut says what it was
         send_blueprint(self._rec, application_of(self._about), self._blueprint())
         if self._model is not None:
@@ -453,20 +441,24 @@ class Writer:
             x = y if np.isnan(x).any() and len(y) == len(x) else x
             shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
             now.append([] if shapes is None else self._names.checked(shapes, rows.k + i))
-        drawn = draw(self._names, now, self._extent)
-        found = {f"world/{name}": drawing for name, drawing in drawn.items()}
+        layers = {"world": draw(self._names, now, self._extent)}
         if ahead or self._ahead:
             self._ahead = True
             futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
-            drawn = draw_ahead(self._names, now, futures, self._extent)
-            found |= {f"world/prediction/{name}": drawing for name, drawing in drawn.items()}
+            layers["world/prediction"] = draw_ahead(self._names, now, futures, self._extent)
         aims = self._reference.of(rows, scene)
         if any(aims):
             for aim in aims:
                 self._names.checked(aim, rows.k) if aim else None
-            drawn = draw_reference(self._names, now, aims, self._extent)
-            found |= {f"world/reference/{name}": drawing for name, drawing in drawn.items()}
-        return found
+            layers["world/reference"] = draw_reference(self._names, now, aims, self._extent)
+        return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
+
+
+def _where(held: np.ndarray, archetype: str, component: str, values: np.ndarray) -> Any:
+    """Return the columns of a component that only some rows have: a value for each of those."""
+    import rerun as rr
+
+    return rr.DynamicArchetype.columns(archetype, components={component: values}).partition(held.astype(np.int64))
 
 
 def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
