@@ -103,7 +103,9 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
         "reference": _lines([f"{name}, reference" for name in about.tracked(nr)], REFERENCE, 1.5),
         "measurement": _points([f"{name}, measured" for name in about.outputs], _MEASURED, 1.5),
-        "control/u": _lines(about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, **_HELD),
+        "control/u": _lines(
+            about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, interpolation_mode="StepAfter"
+        ),
         "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0),
         "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
         "solver/deadline_ms": _lines(["deadline [ms]"], LIMIT, 1.0),
@@ -117,9 +119,6 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
         points = _points(predicted, _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": points for j in stages}
     return found
-
-
-_HELD: dict[str, Any] = {"interpolation_mode": "StepAfter"}
 
 
 def input_limits(about: About) -> list[_Limit]:
@@ -166,6 +165,14 @@ def _lines(names: Sequence[str], colors: Color | list[Color], width: float, **mo
     return rr.SeriesLines(names=[drawable(name) for name in names], colors=each, widths=[width] * len(names), **more)
 
 
+def _points(names: Sequence[str], shade: Color, size: float) -> Any:
+    """Return points of one colour and size."""
+    import rerun as rr
+
+    drawn = [drawable(name) for name in names]
+    return rr.SeriesPoints(names=drawn, colors=[shade] * len(drawn), marker_sizes=[size] * len(drawn))
+
+
 def write_page(rec: Any, entity: str, text: str, *more: Any) -> None:
     """Write Markdown as a page that does not change, and `more` of the same entity."""
     import rerun as rr
@@ -185,14 +192,6 @@ def draw_line(
         rec.send_columns(entity, times(k, dt), rr.Scalars.columns(scalars=values[k]))
 
 
-def _points(names: Sequence[str], shade: Color, size: float) -> Any:
-    """Return points of one colour and size."""
-    import rerun as rr
-
-    drawn = [drawable(name) for name in names]
-    return rr.SeriesPoints(names=drawn, colors=[shade] * len(drawn), marker_sizes=[size] * len(drawn))
-
-
 def _alone(style: Any, component: str) -> Any:
     """Return what draws this component of an entity in place of the vector that it belongs to."""
     from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
@@ -209,9 +208,12 @@ def _shown(panel: Panel) -> dict[str, list[Any]]:
         "/reference": [(i, _lines(["reference"], REFERENCE, 1.5)) for i in panel.references],
         "/measurement": [(i, _points(["measured"], _MEASURED, 1.5)) for i in panel.measured],
     }
-    if len(panel.states) > SEPARATE:  # the vectors, as they are
-        return {entity: [] for entity, parts in lines.items() if parts}
-    return {entity: [_alone(style, str(i)) for i, style in parts] for entity, parts in lines.items() if parts}
+    whole = len(panel.states) > SEPARATE  # then the vectors, as they are
+    return {
+        entity: [] if whole else [_alone(style, str(i)) for i, style in parts]
+        for entity, parts in lines.items()
+        if parts
+    }
 
 
 def blueprint(
@@ -232,38 +234,31 @@ def blueprint(
     """
     import rerun.blueprint as rrb
 
-    def plot(
-        entity: str,
-        name: str,
-        contents: Sequence[str] = (),
-        axis_y: Any = None,
-        titled: bool = True,
-        own: Mapping[str, list[Any]] | None = None,
-    ) -> Any:
+    def plot(entity: str, name: str, drawn: Mapping[str, list[Any]], axis_y: Any) -> Any:
+        """Return the plot of an entity and of others, `drawn` as they are told to be, or else as they are."""
+        told = {other: looks for other, looks in drawn.items() if looks}
         return rrb.TimeSeriesView(
-            titlebar=titled,
-            contents=[f"/{entity}/**", *contents],
+            titlebar=roomy,
+            contents=[f"/{entity}/**", *drawn],
             name=drawable(name),
             axis_x=shared_time(length),
             axis_y=axis_y,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
-            overrides=cast("Any", _now(entity, horizon, about.dt) | {e: v for e, v in (own or {}).items() if v}),
+            overrides=cast("Any", _now(entity, horizon, about.dt) | told),
         )
 
     rows = panels(about, nr)
     roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
     axes = [readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
     parts = [_shown(row) for row in rows]
-    shown = [
-        plot(row.entity, row.title, [*part], axis, roomy, part)
-        for row, axis, part in zip(rows, axes, parts, strict=True)
-    ]
+    shown = [plot(row.entity, row.title, part, axis) for row, axis, part in zip(rows, axes, parts, strict=True)]
+    inputs = f"Input: {about.inputs[0]}" if len(about.inputs) == 1 else "Inputs"
     bounds = readable([v for _, v in input_limits(about)], _TICKS[roomy])
-    shown.append(plot("plots/u", _title("Input", about.inputs), ["/control/u", "/control/limits"], bounds, roomy))
+    shown.append(plot("plots/u", inputs, {"/control/u": [], "/control/limits": []}, bounds))
     slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
     time = {"/solver/time_ms": [_alone(_lines(["time of a step [10^y s]"], color(2), 1.5), LOG_TIME)]}
     time["/solver/deadline_ms"] = [_alone(_lines(["sample time, its deadline"], LIMIT, 1.0), LOG_TIME)]
-    shown.append(plot("solver/log", _STEP_TIME, [*time], slowest, roomy, time))
+    shown.append(plot("solver/log", _STEP_TIME, time, slowest))
     status = rrb.StateTimelineView(origin="solver/status", name="How each step ended")
     left = rrb.Vertical(*shown, status, row_shares=[1.0] * len(shown) + [max(0.5, 0.12 * len(shown))])
     texts = rrb.Tabs(
@@ -271,12 +266,10 @@ def blueprint(
         rrb.TextDocumentView(origin="description", name="Description"),
         rrb.TextLogView(origin="log", name="Log"),
     )
-    lower = texts if model is None else rrb.Horizontal(eigenvalue_views(model)[0], texts)
-    if extent is not None:
-        right, shares = rrb.Vertical(_animation(extent), lower, row_shares=[3.0, 2.0]), [1.0, 1.0]
-    else:  # without an animation the plots get the room
-        right = texts if model is None else rrb.Vertical(eigenvalue_views(model)[0], texts)
-        shares = [2.6, 1.0]
+    beside = rrb.Vertical if extent is None else rrb.Horizontal
+    right, shares = texts if model is None else beside(eigenvalue_views(model)[0], texts), [2.6, 1.0]
+    if extent is not None:  # without an animation the plots get the room
+        right, shares = rrb.Vertical(_animation(extent), right, row_shares=[3.0, 2.0]), [1.0, 1.0]
     title = rrb.TextDocumentView(origin="title", name="Run", titlebar=False)
     return framed(rrb.Vertical(title, rrb.Horizontal(left, right, column_shares=shares), row_shares=[1.0, 18.0]))
 
@@ -368,10 +361,6 @@ def readable(values: Sequence[float], ticks: float) -> Any:
         low, high = (below, high) if low - below < above - high else (low, above)
     margin = 0.08 * (high - low)
     return rrb.ScalarAxis(range=[low - margin, high + margin])
-
-
-def _title(what: str, names: tuple[str, ...]) -> str:
-    return f"{what}: {names[0]}" if len(names) == 1 else f"{what}s"
 
 
 def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> dict[str, Any]:

@@ -116,10 +116,7 @@ class LogColumns:
     def held(self, entity: str, component: str, column: np.ndarray) -> np.ndarray:
         """Return `column`, with the numbers of this component in the rows that have one."""
         k, widths, values = self.rows(entity, component)
-        k, flat = k[widths > 0], np.array(values)
-        inside, found = k < len(column), column.copy()
-        found[k[inside]] = flat[inside]
-        return found
+        return _filled(column, k[widths > 0], np.array(values))
 
     def changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
@@ -139,6 +136,13 @@ def _bytes(values: Any) -> Any:
     if isinstance(values, pa.StringArray):
         return "".join(values.to_pylist()).encode()
     return np.ascontiguousarray(values).data
+
+
+def _filled(rows: np.ndarray, k: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return a copy of `rows` with these values in its rows k; what lies beyond its end is left out."""
+    found, inside = rows.copy(), k < len(rows)
+    found[k[inside]] = values[inside]
+    return found
 
 
 def _key(entity: str, component: str) -> tuple[str, str]:
@@ -257,21 +261,14 @@ def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
     k, values = log.matrix(Entity.MEASUREMENT)
     if not len(k):
         return X.copy()
-    if values.shape[1] != X.shape[1]:
-        return values
-    Y = X.copy()
-    inside = k < len(Y)
-    Y[k[inside]] = values[inside]
-    return Y
+    return _filled(X, k, values) if values.shape[1] == X.shape[1] else values
 
 
 def _sparse(log: LogColumns, entity: str, steps: int, width: int, absent: float = 0.0) -> np.ndarray:
     """Return the rows of an entity, `absent` where no row was written."""
     k, values = log.matrix(entity)
-    held, inside = np.full((steps, width), absent), k < steps
-    if len(k):
-        held[k[inside]] = values[inside]
-    return held
+    held = np.full((steps, width), absent)
+    return _filled(held, k, values) if len(k) else held
 
 
 def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
@@ -309,9 +306,7 @@ def _plans(log: LogColumns, steps: int) -> Plans | None:
         if width is None or not len(k):
             return None
         whole = np.full((steps, values.shape[1] // width, width), np.nan)
-        inside = k < steps
-        whole[k[inside]] = values[inside].reshape(-1, *whole.shape[1:])
-        parts.append(whole)
+        parts.append(_filled(whole, k, values.reshape(-1, *whole.shape[1:])))
     return Plans(*parts)
 
 

@@ -41,16 +41,7 @@ from koopmpc.recording.description import (
 )
 from koopmpc.recording.reader import NO_SOLVER, Entity
 from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
-from koopmpc.recording.scenes import (
-    Drawing,
-    Extent,
-    Names,
-    ReferenceScenes,
-    draw,
-    draw_ahead,
-    draw_reference,
-    stages,
-)
+from koopmpc.recording.scenes import Drawing, Extent, Names, ReferenceScenes, draw, draw_ahead, draw_reference, stages
 from koopmpc.scene import Scene
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
