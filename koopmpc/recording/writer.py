@@ -41,7 +41,7 @@ from koopmpc.recording.description import (
 )
 from koopmpc.recording.reader import NO_SOLVER, Entity
 from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
-from koopmpc.recording.scenes import Drawing, Extent, Names, ReferenceScenes, draw, draw_ahead, draw_reference, stages
+from koopmpc.recording.scenes import Drawing, Scenes
 from koopmpc.scene import Scene
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
@@ -127,20 +127,18 @@ class Writer:
 
         A `growing` log is there while it is written, any other takes its place at the end.
         """
-        self._about, self._scene, self._model = about, scene, model
+        self._about, self._model, self._scenes = about, model, Scenes(about, scene)
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._viewer, self._steps = viewer, steps
-        self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
+        self._opened = False
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
-        self._extent, self._shown = Extent(), Extent().ranges()
+        self._shown = self._scenes.extent.ranges()
         self._last = {Entity.QP: NO_SOLVER}  # the last word of each column that is written where it changes
         self._looks: dict[str, Any] = {}  # of the curves
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
         self._places: dict[str, int] = {}  # a checksum of the steps of its rows
-        self._u: np.ndarray | None = None
-        self._names, self._reference = Names(), ReferenceScenes(about)
         self._plans: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # plans that look beyond what is written
         self._file: LogFile | None = None
         self._rec: Any = None
@@ -159,7 +157,10 @@ class Writer:
             self._spans = self._found_spans(rows)
         self._horizon = max(self._horizon, rows.horizon)
         parts = blocks(rows)
-        drawings = [self._drawings(part) for part in parts]  # all, because the layout is as wide as the widest
+        drawings = [  # all, because the layout is as wide as the widest
+            self._scenes.drawn(part.k, part, list(zip(part.planned, part.plan_X, part.plan_U, strict=True)))
+            for part in parts
+        ]
         if not self._opened:
             self._open()
         if len(rows.U):
@@ -176,7 +177,7 @@ class Writer:
             for entity, style in self._looks.items():
                 if entity != Entity.MEASUREMENT:  # it may have no row
                     self._style(entity, style)
-        if drawings and self._extent.in_space:
+        if drawings and self._scenes.extent.in_space:
             self._style("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for entity, drawing in drawings.items():
             if drawing.style is not None:
@@ -254,7 +255,7 @@ class Writer:
             self._open()
         numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
         write_page(self._rec, Entity.METRICS, text, rr.AnyValues(**numbers))
-        if self._extent.ranges() != self._shown:
+        if self._scenes.extent.ranges() != self._shown:
             send_blueprint(self._rec, application_of(self._about), self._blueprint())
         self.flush()
         self._release()
@@ -295,12 +296,11 @@ class Writer:
                 self._style(entity, drawing)
 
     def _blueprint(self) -> Any:
-        self._shown = self._extent.ranges()
-        extent = self._extent if self._scene is not None else None
+        self._shown = self._scenes.extent.ranges()
         return blueprint(
             self._about,
             self._nr,
-            extent=extent,
+            extent=self._scenes.extent if self._scenes.scene is not None else None,
             model=self._model,
             horizon=self._horizon,
             spans=self._spans,
@@ -414,35 +414,6 @@ class Writer:
             self._sum(f"/{entity}:state", "".join(told).encode(), k)
             self._send(entity, k, rr.StateChange.columns(state=told))
         return changed
-
-    def _drawings(self, rows: LogBlock) -> dict[str, Drawing]:
-        """Return the scene of every row, and of a few stages of its plan, by entity."""
-        scene = self._scene
-        if scene is None:
-            return {}
-        ahead: dict[int, list[Any]] = {}
-        for k, X, U in zip(rows.planned, rows.plan_X, rows.plan_U, strict=True):
-            if np.isfinite(X).all() and np.isfinite(U).all():
-                ahead[int(k)] = [
-                    self._names.checked(scene(X[i], U[min(i, len(U) - 1)]), int(k)) for i in stages(len(U))
-                ]
-        now: list[Sequence[Any]] = []
-        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
-            self._u = rows.U[i] if i < len(rows.U) else self._u
-            x = y if np.isnan(x).any() and len(y) == len(x) else x
-            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
-            now.append([] if shapes is None else self._names.checked(shapes, rows.k + i))
-        layers = {"world": draw(self._names, now, self._extent)}
-        if ahead or self._ahead:
-            self._ahead = True
-            futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
-            layers["world/prediction"] = draw_ahead(self._names, now, futures, self._extent)
-        aims = self._reference.of(rows, scene)
-        if any(aims):
-            for aim in aims:
-                self._names.checked(aim, rows.k) if aim else None
-            layers["world/reference"] = draw_reference(self._names, now, aims, self._extent)
-        return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
 
 
 def _where(held: np.ndarray, archetype: str, component: str, values: np.ndarray) -> Any:
