@@ -92,7 +92,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.predict.predictors import BilinearPredictor as BilinearPredictor
     from koopmpc.predict.predictors import LinearPredictor as LinearPredictor
     from koopmpc.predict.predictors import load_model as load_model
-    from koopmpc.recording.format.reader import load_run as load_run
+    from koopmpc.recording.reader import load_run as load_run
     from koopmpc.recording.recorder import Recorder as Recorder
     from koopmpc.recording.recorder import record as record
     from koopmpc.synthesis.design import design as design

@@ -19,8 +19,8 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.loop.metrics import Metrics, beyond, duration, metrics
 from koopmpc.loop.run import Run
-from koopmpc.recording.format.reader import load_run
 from koopmpc.recording.model import ModelLog, load_model_log
+from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import record
 from koopmpc.validate.text import plain_table
 

@@ -20,11 +20,12 @@ from rich.text import Text
 from koopmpc import disk
 from koopmpc.bench.store import ORACLE, RunRow, load_rows, manifest_of
 from koopmpc.control.move import Fallback, Status
-from koopmpc.figures.sweeps import attraction, profiles, svg, times, trajectories
+from koopmpc.figures.reports import attraction, profiles, times, trajectories
+from koopmpc.figures.style import svg
 from koopmpc.loop.metrics import Metrics, duration
 from koopmpc.loop.run import Run
 from koopmpc.recording.description import STATUS_WORDS
-from koopmpc.recording.format.reader import load_run
+from koopmpc.recording.reader import load_run
 from koopmpc.validate.text import markdown_table, plain_table
 
 _SURE = (0.025, 0.975)  # the ends of an interval

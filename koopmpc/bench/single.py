@@ -32,7 +32,7 @@ from koopmpc.loop.realtime import in_real_time
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
 from koopmpc.plants.step_map import StepMap
-from koopmpc.recording.format.reader import load_run
+from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder, record
 
 FAULTS: dict[str, Fault] = {

@@ -195,9 +195,9 @@ def view(
     """Open logs in one Rerun viewer, one beside the other or, with --compare, in the same plots."""
     import tempfile
 
+    from koopmpc.recording.comparison import record_comparison
     from koopmpc.recording.viewer import need_display, served
     from koopmpc.recording.viewer import view as open_viewer
-    from koopmpc.recording.views.comparison import record_comparison
 
     with friendly():
         shown = list(logs)

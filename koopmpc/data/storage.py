@@ -112,7 +112,7 @@ def _read(file: Path, told: Told) -> Episodes:
     if not told.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
     if suffix == ".rrd":
-        return import_module("koopmpc.recording.format.reader").run_episodes(file)  # of a room below this one
+        return import_module("koopmpc.recording.reader").run_episodes(file)  # of a room below this one
     try:
         X, U, steps, text = _own(file, suffix, about)
         named = json.loads(text)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.figures.comparisons import error as error
-    from koopmpc.figures.comparisons import reconstruction as reconstruction
-    from koopmpc.figures.comparisons import runs as runs
+    from koopmpc.figures.eigenvalues import eigenfunctions as eigenfunctions
     from koopmpc.figures.eigenvalues import spectrum as spectrum
-    from koopmpc.figures.plane import eigenfunctions as eigenfunctions
+    from koopmpc.figures.series import error as error
+    from koopmpc.figures.series import reconstruction as reconstruction
     from koopmpc.figures.series import rollout as rollout
     from koopmpc.figures.series import run as run
+    from koopmpc.figures.series import runs as runs
     from koopmpc.figures.style import save as save
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,20 +1,36 @@
 # pyright: basic
-"""The eigenvalues of A over the unit circle, and how far each can be trusted."""
+"""The spectrum of a model: its eigenvalues over the unit circle, and its eigenfunctions over a plane of two states."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from koopmpc.figures.style import SEQUENTIAL, figure, styled
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError
+from koopmpc.figures.style import CYCLIC, SEQUENTIAL, Width, figure, styled
+from koopmpc.lifting.base import index
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.residuals import ResidualDMD, eigenpairs
 from koopmpc.validate.scoring import AnyPredictor
+from koopmpc.values import Value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LEAST, _MOST = 1e-12, 1e3  # residuals below are rounding; those above are drawn as if they were the second
 _CROWDED = 0.35  # share of the picture below which the eigenvalues get a closer picture
+_ROWS = 4096  # states that are lifted at once
+_CUT = 0.8 * np.pi  # lines of equal phase end here, because the phase jumps at ±π
+_EDGE = 0.08  # share of the width next to each side that stays free of labels, which would be cut there
+_PAPER: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
+_QUARTERS = {-np.pi / 2: "−π/2", 0.0: "0", np.pi / 2: "π/2"}
+Axes = tuple[int | str, int | str]
+Over = Episodes | Sequence[tuple[float, float]]
 
 
 @styled
@@ -106,3 +122,220 @@ def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
             **look,
         )
     return points
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Value):
+    """A grid over two states, all others held.
+
+    Attributes
+    ----------
+    axes
+        Indices of the two states.
+    names
+        Their names with units.
+    across, up
+        Grid lines of the first state and of the second.
+    at
+        (nx,) the state that the plane goes through.
+    """
+
+    axes: tuple[int, int]
+    names: tuple[str, str]
+    across: Float[np.ndarray, " nc"]
+    up: Float[np.ndarray, " nr"]
+    at: Float[np.ndarray, " nx"]
+
+    @property
+    def points(self) -> Float[np.ndarray, "M nx"]:
+        """States of the grid, one a row: `up` is the slow index."""
+        X = np.tile(self.at, (len(self.up) * len(self.across), 1))
+        X[:, self.axes[0]] = np.tile(self.across, len(self.up))
+        X[:, self.axes[1]] = np.repeat(self.up, len(self.across))
+        return X
+
+
+def plane_through(
+    states: Sequence[str], axes: Axes, over: Over, at: ArrayLike | None = None, points: int = 121
+) -> Plane:
+    """Return the plane over the two states `axes`.
+
+    Parameters
+    ----------
+    states
+        Names of all.
+    axes
+        The two, by index or name.
+    over
+        Two ranges (low, high), or episodes: then what they cover.
+    at
+        (nx,) what the other states are held at; by default the median of the episodes, else 0.
+    points
+        Grid lines along each axis.
+
+    Raises
+    ------
+    DataError
+        There is no such state, both are one, or a range is empty.
+    """
+    first, second = (index(state, states, "the plane") for state in axes)
+    if first == second:
+        raise DataError(f"the plane is asked for {states[first]} twice; name two states")
+    if isinstance(over, Episodes):
+        X = np.concatenate([episode.X for episode in over])
+        ranges = np.column_stack([X.min(axis=0), X.max(axis=0)])[[first, second]]
+        held = np.median(X, axis=0)
+    else:
+        ranges, held = checks.array(cast(ArrayLike, over), "over", (2, 2)), np.zeros(len(states))
+    for name, (low, high) in zip((states[first], states[second]), ranges, strict=True):
+        if not low < high:
+            raise DataError(f"the range of {name} is {low:g} to {high:g}; pass (low, high) with low < high")
+    lines = checks.count(points, "points", least=2)
+    return Plane(
+        (first, second),
+        (states[first], states[second]),
+        np.linspace(float(ranges[0, 0]), float(ranges[0, 1]), lines),
+        np.linspace(float(ranges[1, 0]), float(ranges[1, 1]), lines),
+        held if at is None else checks.array(at, "at", (len(states),)),
+    )
+
+
+def eigenfunctions_on(
+    predictor: LinearPredictor, which: int | Sequence[int], plane: Plane
+) -> Complex[np.ndarray, "k nr nc"]:
+    """Return φ_j on the grid for each j of `which`, scaled so that the largest |φ_j| on it is 1.
+
+    An eigenfunction is defined up to a factor: the phase of a complex one starts anywhere.
+
+    Raises
+    ------
+    DataError
+        There is no such eigenvalue, φ_j is 0 on all of the plane, or A is defective.
+    """
+    chosen = [which] if isinstance(which, int | np.integer) else list(which)
+    for j in chosen:
+        if not 0 <= j < predictor.nz:
+            raise DataError(f"there is no eigenfunction {j}; the predictor has 0 … {predictor.nz - 1}")
+    if not chosen:
+        raise DataError("which names no eigenfunction; pass an index, or several")
+    left, X = predictor.left_eigenvectors[chosen].T, plane.points
+    parts = [predictor.lift(X[i : i + _ROWS]) @ left for i in range(0, len(X), _ROWS)]
+    phi = np.concatenate(parts).T.reshape(len(chosen), len(plane.up), len(plane.across))
+    largest = np.abs(phi).max(axis=(1, 2))
+    if (largest == 0).any():
+        j = chosen[int(np.argmin(largest))]
+        raise DataError(f"eigenfunction {j} is 0 on all of the plane; hold the other states elsewhere (at=…)")
+    return phi / largest[:, None, None]
+
+
+@styled
+def eigenfunctions(
+    predictor: LinearPredictor,
+    which: int | Sequence[int],
+    plane: Axes,
+    over: Over,
+    *,
+    at: ArrayLike | None = None,
+    points: int = 121,
+) -> "Figure":
+    """Draw φ_j(x) = ξ_jᴴ ψ(x) over two states: |φ_j| and its phase; of a real eigenvalue φ_j itself.
+
+    The largest |φ_j| of the plane is 1. Without input, states on one line of equal |φ_j| move to another such line
+    together, and so do states on one line of equal phase.
+
+    Parameters
+    ----------
+    predictor
+        Linear.
+    which
+        Indices j in the order of ``predictor.eigenvalues``.
+    plane
+        The two states, by index or name: across, up.
+    over
+        Two ranges ((low, high), (low, high)), or episodes: then what they cover.
+    at
+        (nx,) what the other states are held at; by default the median of the episodes, else 0.
+    points
+        Grid lines along each axis.
+
+    Raises
+    ------
+    DataError
+        There is no such eigenfunction or state, a range is empty, A is defective, or φ_j is 0 on the plane.
+    """
+    covered = predictor.embed(over) if isinstance(over, Episodes) else over
+    grid = plane_through(predictor.point_names, plane, covered, at, points)
+    phi = eigenfunctions_on(predictor, which, grid)
+    chosen = [which] if isinstance(which, int | np.integer) else list(which)
+    values: Any = predictor.eigenvalues[chosen]
+    real = values.imag == 0
+    cells: list[tuple[int, str]] = []
+    for k, alone in enumerate(real):
+        if not alone and len(cells) % 2:
+            cells.append((k, "empty"))  # magnitude and phase stand side by side
+        cells += [(k, "real")] if alone else [(k, "magnitude"), (k, "phase")]
+    columns = min(len(cells), 2)
+    rows = -(-len(cells) // columns)
+    width: Width = "one column" if columns == 1 else "two columns"
+    made, axes = figure(rows, columns, width=width, height=0.4 + 2.4 * rows)
+    drawn = axes.flat[: len(cells)]
+    for panel, (k, kind) in zip(drawn, cells, strict=True):
+        _draw(made, panel, grid, phi[k], values[k], f"φ{_subscript(chosen[k])}", kind)
+    for empty in (*axes.flat[len(cells) :], *(p for p, (_, kind) in zip(drawn, cells, strict=True) if kind == "empty")):
+        empty.remove()
+    return made
+
+
+def _draw(made: Any, axes: Any, plane: Plane, phi: Any, value: complex, name: str, kind: str) -> None:
+    match kind:
+        case "real":
+            _surface(made, axes, plane, phi.real, name)
+        case "magnitude":
+            _surface(made, axes, plane, np.abs(phi), f"|{name}|")
+        case "phase":
+            _phase(made, axes, plane, np.angle(phi), f"phase of {name} [rad]")
+        case _:
+            return
+    turn = "" if value.imag == 0 else f" {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
+    axes.set(title=f"λ = {value.real:.4g}{turn}", xlabel=plane.names[0], ylabel=plane.names[1])
+    axes.grid(visible=False)
+
+
+def _subscript(j: int) -> str:
+    return str(j).translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
+
+
+def _surface(made: Any, axes: Any, plane: Plane, values: np.ndarray, label: str) -> None:
+    """Draw the values as shades, and lines of equal value that are labelled; dashed below zero."""
+    mesh = axes.pcolormesh(plane.across, plane.up, values, cmap=SEQUENTIAL, shading="gouraud", rasterized=True)
+    made.colorbar(mesh, ax=axes, label=label)
+    if np.ptp(values) > 1e-9:
+        lines = axes.contour(plane.across, plane.up, values, levels=6, colors="white", linewidths=0.7)
+        axes.clabel(lines, fontsize=6, fmt="%g")
+
+
+def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) -> None:
+    """Draw the phase in colours that close at ±π, with lines at the quarters that can be read in grey."""
+    from matplotlib.patheffects import withStroke
+
+    mesh = axes.pcolormesh(
+        plane.across, plane.up, phase, cmap=CYCLIC, vmin=-np.pi, vmax=np.pi, shading="nearest", rasterized=True
+    )
+    bar = made.colorbar(mesh, ax=axes, label=label)
+    bar.set_ticks([-np.pi, *_QUARTERS, np.pi], labels=["−π", *_QUARTERS.values(), "π"])
+    inner = np.where(np.abs(phase) < _CUT, phase, np.nan)
+    inside = np.abs(inner[np.isfinite(inner)])
+    if inside.size and np.ptp(phase) > 1e-9:
+        look: dict[str, Any] = {
+            "levels": list(_QUARTERS),
+            "colors": "black",
+            "linewidths": 0.8,
+            "linestyles": ["--", "-", ":"],
+        }
+        lines = axes.contour(plane.across, plane.up, inner, **look)
+        halo = withStroke(linewidth=2.0, foreground="white")  # a halo, because the darkest shade is as dark as the line
+        lines.set_path_effects([halo])
+        across = np.quantile(plane.across, [_EDGE, 1 - _EDGE])
+        texts: Any = axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)
+        for text in texts:
+            text.set(x=np.clip(text.get_position()[0], *across), bbox=_PAPER)

@@ -5,12 +5,11 @@ A figure is a `matplotlib.figure.Figure` of its own: nothing of pyplot, so no di
 stays when it is let go. matplotlib is imported where it is used.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
-from io import BytesIO
+from io import BytesIO, StringIO
 from os import PathLike
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, cast
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-P = ParamSpec("P")
-T = TypeVar("T")
 Width = Literal["one column", "two columns"]
 
 WIDTHS: dict[str, float] = {"one column": 3.5, "two columns": 7.16}  # widths on a page in two columns [in]
@@ -71,15 +68,18 @@ _METADATA: dict[str, dict[str, Any]] = {
 }
 
 
-def styled(plot: Callable[P, T]) -> Callable[P, T]:
-    """Return `plot`, drawn in this style whatever the user's own settings are; those come back after it."""
+@contextmanager
+def _settings() -> Iterator[None]:
+    import matplotlib as mpl
 
-    @wraps(plot)
-    def within(*args: P.args, **kwargs: P.kwargs) -> T:
-        with _settings():
-            return plot(*args, **kwargs)
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(cast("Any", _RC))
+        yield
 
-    return within
+
+styled = _settings()
+"""Decorator: what a function draws is in this style whatever the user's own settings are; those come back after it."""
 
 
 def figure(rows: int, columns: int = 1, *, width: Width, height: float, **more: Any) -> "tuple[Figure, np.ndarray]":
@@ -204,6 +204,15 @@ def save(made: "Figure", path: str | PathLike[str]) -> None:
             made.savefig(stream, format=suffix[1:], metadata=_METADATA[suffix])
 
 
+@styled
+def svg(made: "Figure") -> str:
+    """Return the figure as an <svg> element, to stand in a page; it scales with the width that it has."""
+    out = StringIO()
+    made.savefig(out, format="svg", metadata=_METADATA[".svg"])
+    text = out.getvalue()
+    return text[text.index("<svg") :]
+
+
 def _save_png(made: "Figure", stream: BinaryIO) -> None:
     """Write a .png: lines in 256 colours, a third of the bytes and no change to the eye; shades in all of theirs."""
     from PIL import Image
@@ -216,13 +225,3 @@ def _save_png(made: "Figure", stream: BinaryIO) -> None:
     if not shaded:
         picture = picture.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
     picture.save(stream, "PNG", optimize=True, dpi=resolution)
-
-
-@contextmanager
-def _settings() -> Iterator[None]:
-    import matplotlib as mpl
-
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(cast("Any", _RC))
-        yield

@@ -13,9 +13,8 @@ from koopmpc import checks
 from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError
-from koopmpc.figures.comparisons import error
 from koopmpc.figures.eigenvalues import spectrum
-from koopmpc.figures.series import rollout
+from koopmpc.figures.series import error, rollout
 from koopmpc.fitting.repair import IN_MEMORY, PAST, Data, Divided, noted, read
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State

@@ -11,8 +11,8 @@ from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
 from koopmpc.errors import unwarned
-from koopmpc.figures.plane import eigenfunctions
-from koopmpc.figures.plots import Plot, plots
+from koopmpc.figures.eigenvalues import eigenfunctions
+from koopmpc.figures.reports import Plot, plots
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kernel import kernel_edmd
 from koopmpc.lifting.base import Lifting

@@ -22,7 +22,7 @@ from rich.table import Table
 
 from koopmpc.checks import nearest
 from koopmpc.errors import ProblemError
-from koopmpc.figures.plots import Plot, plots
+from koopmpc.figures.reports import Plot, plots
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.page import Page, record_curves
 from koopmpc.validate.text import plain_table

@@ -7,7 +7,7 @@ import numpy as np
 from koopmpc.data.collect import collect
 from koopmpc.data.excitation import Noise
 from koopmpc.errors import unwarned
-from koopmpc.figures.comparisons import reconstruction
+from koopmpc.figures.series import reconstruction
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.papers import snyder_control as control
 from koopmpc.papers import snyder_theory as theory

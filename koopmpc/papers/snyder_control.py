@@ -17,7 +17,7 @@ from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.excitation import Feedback, Noise
 from koopmpc.errors import unwarned
-from koopmpc.figures.comparisons import runs as plot_runs
+from koopmpc.figures.series import runs as plot_runs
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from koopmpc.data.episodes import Episodes
-from koopmpc.figures.comparisons import reconstruction
-from koopmpc.figures.plane import eigenfunctions
-from koopmpc.figures.plots import Plot, plots
+from koopmpc.figures.eigenvalues import eigenfunctions
+from koopmpc.figures.reports import Plot, plots
+from koopmpc.figures.series import reconstruction
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.recording.format.reader import run_episodes as run_episodes
     from koopmpc.recording.model import record_model as record_model
+    from koopmpc.recording.reader import run_episodes as run_episodes
     from koopmpc.recording.viewer import view as view
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

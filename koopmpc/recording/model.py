@@ -14,14 +14,22 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, LogError
-from koopmpc.figures.plane import Axes, Plane, plane_through
+from koopmpc.figures.eigenvalues import Axes, Plane, eigenfunctions_on, plane_through
+from koopmpc.figures.style import CYCLIC, SEQUENTIAL, shades
 from koopmpc.interrupts import heard
 from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.recording.blueprint import (
+    color,
+    draw_eigenvalues,
+    eigenvalue_views,
+    framed,
+    plane_view,
+    shared_time,
+    write_page,
+)
 from koopmpc.recording.description import drawable, written_with
-from koopmpc.recording.format.rrd import Entity, naming, read_columns
-from koopmpc.recording.format.writer import file_recording, times
-from koopmpc.recording.views.blueprint import color, framed, shared_time
-from koopmpc.recording.views.eigenvalues import draw_eigenfunctions, draw_eigenvalues, eigenvalue_views, plane_view
+from koopmpc.recording.reader import Entity, naming, read_columns
+from koopmpc.recording.rrd import file_recording, times
 from koopmpc.scene import Color
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.report import TrustReport
@@ -35,6 +43,7 @@ _ESCAPED, _BEFORE = re.compile(r"([*_`])"), r"\\\1"  # signs that Markdown would
 _SHOWN = 6  # plots of states in one column
 _EIGENFUNCTIONS = 2  # drawn unless told
 _FORMAT = "koopmpc-model-1"
+_INK: Color = (250, 250, 250)  # of the words around a picture
 
 Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], one value a step
 Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
@@ -99,8 +108,7 @@ def record_model(
     layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)
     with file_recording(path, "koopmpc-model", layout) as rec:
         rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
-        text = rr.TextDocument(drawable(_page(predictor, report, note)), media_type=rr.MediaType.MARKDOWN)
-        rec.log("report", text, static=True)
+        write_page(rec, "report", _page(predictor, report, note))
         facts = _facts(predictor) | {"horizon": horizon, "band": ahead[0].band if ahead else ""}
         about = {"format": _FORMAT, "written_with": written_with(), "dt": predictor.dt, "facts": facts}
         about |= {"states": list(predictor.states), "forecasts": len(ahead)}
@@ -168,11 +176,61 @@ def _pictures(
     surface = plane_through(predictor.point_names, plane, predictor.embed(episodes), at, points=181)
     chosen = _leading(predictor, report) if which is None else list(which)
     try:
-        return draw_eigenfunctions(predictor, chosen, surface), surface, ""
+        return _eigenfunctions(predictor, chosen, surface), surface, ""
     except DataError as error:
         if which is not None:
             raise
         return [], None, f"No eigenfunctions are drawn: {error}."
+
+
+def _eigenfunctions(predictor: LinearPredictor, which: Sequence[int], plane: Plane) -> list[Picture]:
+    """Return the pictures of eigenfunctions: of a real one itself, of a complex one its magnitude and its phase."""
+    pictures: list[Picture] = []
+    for j, phi in zip(which, eigenfunctions_on(predictor, which, plane), strict=True):
+        value = predictor.eigenvalues[j]
+        if value.imag == 0:
+            low, high = float(phi.real.min()), float(phi.real.max())
+            level = (phi.real - low) / ((high - low) or 1.0)
+            shown = {"value": (f"φ{j}, λ = {value.real:.4g}", shades(level, SEQUENTIAL))}
+        else:
+            title = f"|φ{j}|, λ = {value.real:.4g} {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
+            turns = np.angle(phi) / (2 * np.pi) + 0.5  # dark at 0, blue below, red above, light at ±π
+            shown = {
+                "magnitude": (title, shades(np.abs(phi), SEQUENTIAL)),
+                "phase": (f"Phase of φ{j}", shades(turns, CYCLIC)),
+            }
+        for part, (title, pixels) in shown.items():
+            entity = f"eigenfunction/{j}/{part}"
+            pictures.append((entity, title, _picture(entity, pixels, plane)))
+    return pictures
+
+
+def _picture_view(entity: str, title: str, plane: Plane) -> Any:
+    """Return the view of one picture, with room for the words around it."""
+    n, m = len(plane.across), len(plane.up)
+    return plane_view(entity, drawable(title), [-0.3 * n, 1.1 * n], [-0.08 * m, 1.25 * m])
+
+
+def _picture(entity: str, pixels: np.ndarray, plane: Plane) -> dict[str, Any]:
+    """Return the picture, rows from the top down, and its axes in words."""
+    import rerun as rr
+
+    m, n = pixels.shape[:2]
+    (x, y), across, up = map(drawable, plane.names), plane.across, plane.up
+    words = {
+        (0.04 * n, 1.06 * m): f"{across[0]:.3g}",
+        (0.5 * n, 1.14 * m): x,
+        (1.0 * n, 1.06 * m): f"{across[-1]:.3g}",
+        (-0.09 * n, 0.96 * m): f"{up[0]:.3g}",
+        (-0.15 * n, 0.5 * m): y,
+        (-0.09 * n, 0.04 * m): f"{up[-1]:.3g}",
+    }
+    return {
+        f"{entity}/picture": rr.Image(np.ascontiguousarray(pixels[::-1])),
+        f"{entity}/axes": rr.Points2D(
+            list(words), labels=list(words.values()), radii=0.0, colors=_INK, show_labels=True, draw_order=40
+        ),
+    }
 
 
 def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int]:
@@ -249,7 +307,7 @@ def _blueprint(
     text = rrb.TextDocumentView(origin="report", name="Report")
     rows: list[Any] = [rrb.Horizontal(*eigenvalue_views(predictor, residuals=told))]
     if surface is not None:
-        views = [plane_view(entity, title, surface) for entity, title, _ in pictures]
+        views = [_picture_view(entity, title, surface) for entity, title, _ in pictures]
         rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
     return framed(
         rrb.Horizontal(

@@ -14,10 +14,13 @@ from koopmpc import checks, disk
 from koopmpc.errors import DataError
 from koopmpc.figures.style import save
 from koopmpc.interrupts import heard
+from koopmpc.recording.blueprint import color, draw_line, framed, write_page
 from koopmpc.recording.description import drawable
-from koopmpc.recording.format.writer import file_recording, times
-from koopmpc.recording.views.blueprint import color, framed
+from koopmpc.recording.rrd import file_recording
 from koopmpc.validate.text import markdown_table
+
+if TYPE_CHECKING:
+    from koopmpc.figures.style import Figure
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,6 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
     LogError
         The path cannot be written.
     """
-    import rerun as rr
-
     if not tabs:
         raise DataError("there is no curve to record; pass at least one tab")
     slugs = [_slug(tab.title) for tab in tabs]
@@ -76,16 +77,12 @@ def record_curves(tabs: Sequence[Curves], path: str | Path, *, application: str,
         raise DataError(f"two tabs are called {twice!r}; name each by a title of its own")
     tables = [_tables(tab) for tab in tabs]
     with file_recording(path, application, _blueprint(tabs, slugs)) as rec:
-        rec.log("page", rr.TextDocument(drawable(page), media_type="text/markdown"), static=True)
+        write_page(rec, "page", page)
         for tab, slug, curves in zip(tabs, slugs, tables, strict=True):
             for j, column in enumerate(tab.columns):
                 for i, (name, X) in enumerate(curves.items()):
-                    k = np.flatnonzero(np.isfinite(X[:, j]))
-                    if not len(k):
-                        continue  # the viewer crashes on a timeline without rows
                     entity = f"{slug}/{_slug(column)}/{i}_{_slug(name)}"  # drawn in this order: the truth below
-                    rec.log(entity, rr.SeriesLines(names=drawable(name), colors=color(i), widths=2.0), static=True)
-                    rec.send_columns(entity, times(k, tab.dt), rr.Scalars.columns(scalars=X[k, j]))
+                    draw_line(rec, entity, name, color(i), 2.0, X[:, j], tab.dt)
 
 
 def _tables(tab: Curves) -> dict[str, np.ndarray]:
@@ -120,10 +117,6 @@ def _blueprint(tabs: Sequence[Curves], slugs: Sequence[str]) -> Any:
 def _slug(name: str) -> str:
     """Return the name as part of an entity's path."""
     return re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "curve"
-
-
-if TYPE_CHECKING:
-    from koopmpc.figures.style import Figure
 
 
 @dataclass

@@ -19,9 +19,8 @@ from koopmpc.errors import DataError
 from koopmpc.interrupts import heard
 from koopmpc.loop.run import About, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
-from koopmpc.recording.format.rrd import block_of_run, block_of_steps
-from koopmpc.recording.format.writer import Writer
 from koopmpc.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
+from koopmpc.recording.writer import Writer, block_of_run, block_of_steps
 from koopmpc.scene import Scene
 
 _BATCH = 0.2  # time between two batches [s]

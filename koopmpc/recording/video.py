@@ -13,9 +13,8 @@ from koopmpc import checks
 from koopmpc.errors import LogError
 from koopmpc.figures.animation import Stroke, draw_frames, project, save_video
 from koopmpc.recording.description import title_of
-from koopmpc.recording.format.reader import about_of
-from koopmpc.recording.format.rrd import LogColumns, naming, read_columns
-from koopmpc.recording.views.scenes import BACKGROUND, faces
+from koopmpc.recording.reader import LogColumns, about_of, naming, read_columns
+from koopmpc.recording.scenes import BACKGROUND, faces
 from koopmpc.scene import Color
 
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from koopmpc.errors import LogError
-from koopmpc.recording.format.rrd import check_log
+from koopmpc.recording.rrd import check_log
 
 PORT, WEB_PORT = 9876, 9090
 _START = 15.0  # longest wait for a viewer that was opened [s]
@@ -81,14 +81,21 @@ def start_viewer(*arguments: str, port: int) -> "subprocess.Popen[bytes] | None"
         start_new_session=True,
         env=os.environ | {"RUST_LOG": "error"},  # its notes would cover the picture
     )
+    if not _comes_up(viewer, port):
+        viewer.kill()
+        viewer.wait()
+        return None
+    return viewer
+
+
+def _comes_up(viewer: "subprocess.Popen[bytes]", port: int) -> bool:
+    """Wait until the process listens at `port`; return False where it ends before, or never does."""
     deadline = time.monotonic() + _START
     while time.monotonic() < deadline and viewer.poll() is None:
         if is_up(port):
-            return viewer
+            return True
         time.sleep(0.05)
-    viewer.kill()
-    viewer.wait()
-    return None
+    return False
 
 
 def program() -> Path:
@@ -150,9 +157,7 @@ def served(
     if server is None:
         command = shlex.join([str(program()), "--serve-web", *paths])
         raise LogError(f"the server did not start; run `{command}` to see what it says")
-    deadline = time.monotonic() + _START
-    while not is_up(port) and server.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)  # the page comes up after the data
+    _comes_up(server, port)  # the page comes up after the data
     try:
         yield f"http://127.0.0.1:{port}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy", data
     finally:

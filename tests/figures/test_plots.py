@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.figures.plots import Plot, plots
+from koopmpc.figures.reports import Plot, plots
 
 
 def test_every_curve_is_drawn_in_its_panel_with_one_look_a_name():

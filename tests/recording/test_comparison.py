@@ -9,10 +9,10 @@ import pytest
 
 import koopmpc as km
 from koopmpc.loop.metrics import running_cost
-from koopmpc.recording.format.rrd import read_columns
+from koopmpc.recording.comparison import record_comparison
 from koopmpc.recording.page import Curves, Page, record_curves
+from koopmpc.recording.reader import read_columns
 from koopmpc.recording.video import export_video
-from koopmpc.recording.views.comparison import record_comparison
 from tests.recording.runs import make_run
 
 

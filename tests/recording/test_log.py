@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.loop.run import About, StepRows
 from koopmpc.recording.description import _FORMAT, drawable, from_json, to_json, to_markdown
-from koopmpc.recording.format.rrd import block_of_run, blocks, read_columns
-from koopmpc.recording.views.scenes import ReferenceScenes
+from koopmpc.recording.reader import read_columns
+from koopmpc.recording.scenes import ReferenceScenes
+from koopmpc.recording.writer import block_of_run, blocks
 from tests.fixtures.logs.make import FOLDER as LOGS
 from tests.fixtures.logs.make import made
 from tests.recording.runs import make_run, options

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.figures.plane import eigenfunctions_on, plane_through
-from koopmpc.recording.format.rrd import LogColumns, read_columns
+from koopmpc.figures.eigenvalues import eigenfunctions_on, plane_through
+from koopmpc.recording.reader import LogColumns, read_columns
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 from tests.recording.viewing import drawn
 

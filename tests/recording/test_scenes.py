@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import koopmpc as km
 from koopmpc.figures.animation import project
+from koopmpc.recording.scenes import Extent, Names, draw, draw_ahead, stages
 from koopmpc.recording.video import export_video
-from koopmpc.recording.views.scenes import Extent, Names, draw, draw_ahead, stages
 
 coordinate = st.floats(-10, 10)
 

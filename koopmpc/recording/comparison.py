@@ -10,20 +10,22 @@ import numpy as np
 from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.interrupts import heard
 from koopmpc.loop.metrics import metrics, running_cost
-from koopmpc.loop.run import About, Run
-from koopmpc.recording.description import drawable, table_figures, title_of
-from koopmpc.recording.format.reader import load_run
-from koopmpc.recording.format.writer import file_recording, times
-from koopmpc.recording.views.blueprint import (
+from koopmpc.loop.run import Run
+from koopmpc.recording.blueprint import (
     LIMIT,
     REFERENCE,
     color,
+    draw_line,
     framed,
     input_limits,
     readable,
     shared_time,
     state_limits,
+    write_page,
 )
+from koopmpc.recording.description import drawable, table_figures, title_of
+from koopmpc.recording.reader import load_run
+from koopmpc.recording.rrd import file_recording
 from koopmpc.validate.text import markdown_table
 
 _MOST = 8  # plots of states and inputs in one column
@@ -48,7 +50,6 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
         A log is missing, damaged, or none of a run; there are less than two; no state or input is common to two runs;
         the path cannot be written.
     """
-    import rerun as rr
     import rerun.blueprint as rrb
 
     if len(logs) < 2:
@@ -78,11 +79,10 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
             for r, (run, values) in enumerate(zip(runs, curves, strict=True)):
                 if values is not None:
                     held = {"interpolation_mode": "StepAfter"} if entity.startswith("input") else {}
-                    _line(rec, f"{entity}/{r + 1}", names[r], color(r), 2.0, values, run.dt, **held)
+                    draw_line(rec, f"{entity}/{r + 1}", names[r], color(r), 2.0, values, run.dt, **held)
             for r, (name, shade, values, dt) in enumerate(_marks(runs, title)):
-                _line(rec, f"{entity}/mark/{r}", name, shade, 1.0, values, dt)
-        text = rr.TextDocument(drawable(f"{heading}{_table(runs, names)}"), media_type=rr.MediaType.MARKDOWN)
-        rec.log("metrics", text, static=True)
+                draw_line(rec, f"{entity}/mark/{r}", name, shade, 1.0, values, dt)
+        write_page(rec, "metrics", f"{heading}{_table(runs, names)}")
 
 
 def _names(runs: Sequence[Run], paths: Sequence[Path]) -> tuple[list[str], str]:
@@ -90,7 +90,7 @@ def _names(runs: Sequence[Run], paths: Sequence[Path]) -> tuple[list[str], str]:
 
     Where two titles are the same they have the name of the file too.
     """
-    titles = [title_of(About(**run.about())).split(" · ") for run in runs]
+    titles = [title_of(run).split(" · ") for run in runs]
     shared = [part for part in titles[0] if all(part in other for other in titles)]
     short = [" · ".join(part for part in title if part not in shared) for title in titles]
     whole = [" · ".join(title) for title in titles]
@@ -126,28 +126,16 @@ def _marks(runs: Sequence[Run], title: str) -> list[tuple[str, Any, np.ndarray, 
     """Return the references and limits of a plot: name, colour, values, sample time; those that are equal once."""
     found: dict[bytes, tuple[str, Any, np.ndarray, float]] = {}
     for run in runs:
-        about = About(**run.about())
-        tracked = about.tracked(run.reference.shape[1])
+        tracked = run.tracked(run.reference.shape[1])
         if title in tracked:
             values = run.reference[:, tracked.index(title)]
             key = b"r" + (values[:1] if np.ptp(values) == 0 else values).tobytes()
             found.setdefault(key, ("reference", REFERENCE, values, run.dt))
-        for name, value in (*state_limits(about), *input_limits(about)):
+        for name, value in (*state_limits(run), *input_limits(run)):
             if name == title:
                 line = ("limits", LIMIT, np.full(2, value), run.steps * run.dt)
                 found.setdefault(b"l" + np.float64(value).tobytes(), line)
     return list(found.values())
-
-
-def _line(
-    rec: Any, entity: str, name: str, shade: Any, width: float, values: np.ndarray, dt: float, **style: Any
-) -> None:
-    import rerun as rr
-
-    k = np.flatnonzero(np.isfinite(values))
-    if len(k):
-        rec.log(entity, rr.SeriesLines(names=drawable(name), colors=shade, widths=width, **style), static=True)
-        rec.send_columns(entity, times(k, dt), rr.Scalars.columns(scalars=values[k]))
 
 
 def _view(entity: str, title: str, curves: Sequence[np.ndarray | None], first: bool, length: float) -> Any:
@@ -168,7 +156,7 @@ def _table(runs: Sequence[Run], names: Sequence[str]) -> str:
     columns: list[dict[str, str]] = []
     for run in runs:
         try:
-            columns.append(table_figures(metrics(run), About(**run.about()), run.reference.shape[1]))
+            columns.append(table_figures(metrics(run), run, run.reference.shape[1]))
         except (KoopmpcError, ValueError) as error:
             columns.append({"cost": f"cannot be computed: {error}"})
     rows = _in_order([list(column) for column in columns])

@@ -2,21 +2,34 @@
 """Writer: the rows of a run as a Rerun recording, the same for a finished run and for a running loop."""
 
 import json
-import uuid
 import zlib
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from koopmpc.control.move import Fallback, Status
+from koopmpc.control.move import Fallback
 from koopmpc.errors import KoopmpcError
 from koopmpc.interrupts import deferred
 from koopmpc.loop.metrics import metrics
-from koopmpc.loop.run import About, Run
+from koopmpc.loop.run import About, Plans, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
+from koopmpc.recording.blueprint import (
+    LOG_TIME,
+    SEPARATE,
+    VIEW,
+    ahead,
+    blueprint,
+    draw_eigenvalues,
+    input_limits,
+    panels,
+    status_value,
+    styles,
+    write_page,
+)
 from koopmpc.recording.description import (
     application_of,
     drawable,
@@ -26,101 +39,70 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
-from koopmpc.recording.format.logfile import CHECK, LogFile
-from koopmpc.recording.format.rrd import NO_SOLVER, Entity, LogBlock, blocks
-from koopmpc.recording.views.blueprint import (
-    LOG_TIME,
-    SEPARATE,
-    VIEW,
-    ahead,
-    blueprint,
-    input_limits,
-    panels,
-    state_limits,
-    status_value,
-    styles,
-)
-from koopmpc.recording.views.eigenvalues import draw_eigenvalues
-from koopmpc.recording.views.scenes import (
-    Drawing,
-    Extent,
-    Names,
-    ReferenceScenes,
-    draw,
-    draw_ahead,
-    draw_reference,
-    stages,
-)
+from koopmpc.recording.reader import NO_SOLVER, Entity
+from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
+from koopmpc.recording.scenes import Drawing, Scenes
 from koopmpc.scene import Scene
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
-PATIENCE = 10.0  # longest wait for a file that is written at once [s]
+_NO_PLANS = Plans(np.empty((0, 0, 0)), np.empty((0, 0, 0)))
 
 
-def _new_recording(application: str) -> Any:
-    """Return a recording of its own; those that have ended give their memory and threads back.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LogBlock(StepRows):
+    """Rows k, k+1, … of a run, and the plans of those steps that have one.
 
-    Rerun keeps what has ended until it is asked. It would also let go of a recording that the user made global by
-    ``rr.init``: where there is one, nothing is asked, and Rerun itself tidies up at the next ``rr.init``.
+    Attributes
+    ----------
+    k
+        The step of the first row.
+    planned
+        (p,) steps that have a plan.
+    plan_X, plan_U
+        (p, N+1, nx) and (p, N, nu) their plans.
     """
-    import rerun as rr
-    import rerun_bindings
 
-    with deferred():  # Python drops a Ctrl-C that comes in a deletion
-        if rr.get_global_data_recording() is None:
-            rerun_bindings.flush_and_cleanup_orphaned_recordings()
-        return rr.RecordingStream(application, recording_id=uuid.uuid4())
+    k: int
+    planned: Int[np.ndarray, " p"]
+    plan_X: Float[np.ndarray, "p N1 nx_plan"]
+    plan_U: Float[np.ndarray, "p N nu_plan"]
 
+    @property
+    def horizon(self) -> int:
+        """Length of the plans, 0 where there is none."""
+        return self.plan_U.shape[1] if len(self.planned) else 0
 
-def _send_blueprint(rec: Any, application: str, layout: Any) -> None:
-    """Send a blueprint, as ``rec.send_blueprint`` does, which keeps its memory and two threads for ever."""
-    import rerun as rr
-    import rerun_bindings
-
-    with deferred():
-        own = rerun_bindings.new_blueprint(
-            application_id=application, make_default=False, make_thread_default=False, default_enabled=True
-        )
-        stream = rr.RecordingStream._from_native(own)
-        stream.set_time("blueprint", sequence=0)
-        layout.to_blueprint()._log_to_stream(stream)
-        rerun_bindings.send_blueprint(stream.memory_recording().storage, False, True, recording=rec.to_native())
-        stream.disconnect()  # else what it holds and the stream hold each other
-        del stream
+    def cut(self, first: int, last: int) -> "LogBlock":
+        """Return rows first … last − 1, counted from this block's own first row."""
+        rows, p = self.part(first, last), slice(*np.searchsorted(self.planned, [self.k + first, self.k + last]))
+        plans: dict[str, Any] = {"planned": self.planned[p], "plan_X": self.plan_X[p], "plan_U": self.plan_U[p]}
+        return LogBlock(**rows.columns(), k=self.k + first, **plans)
 
 
-@contextmanager
-def file_recording(path: str | Path, application: str, layout: Any) -> Generator[Any]:
-    """Yield a recording that is written beside `path`, and takes its place at the end of the block.
+def block_of_run(run: Run) -> LogBlock:
+    """Return the whole of `run` as one block."""
+    plans = run.plans or _NO_PLANS
+    return LogBlock(**run.columns(), k=0, planned=np.arange(len(plans.X)), plan_X=plans.X, plan_U=plans.U)
 
-    Raises
-    ------
-    LogError
-        The path cannot be written.
+
+def block_of_steps(steps: Sequence[Step], nx: int, *, end: bool) -> LogBlock:
+    """Return consecutive steps as a block; with `end`, the state that the last one led to follows."""
+    plans = [(step.k, plan) for step in steps if (plan := step.plan) is not None]
+    planned = np.array([k for k, _ in plans], dtype=np.int64)
+    rows, whole = StepRows.of(steps, nx, end=end), Plans.of([plan for _, plan in plans]) or _NO_PLANS
+    return LogBlock(**rows.columns(), k=steps[0].k, planned=planned, plan_X=whole.X, plan_U=whole.U)
+
+
+def blocks(rows: LogBlock, least: int = 100, most: int = 5) -> list[LogBlock]:
+    """Return `rows` as consecutive blocks of at least `least` steps, at most `most` of them.
+
+    The state that the last move led to belongs to the last block.
     """
-    file = LogFile(path)
-    rec: Any = None
-    try:
-        rec = _new_recording(application)
-        file.attach(rec)
-        _send_blueprint(rec, application, layout)
-        yield rec
-        rec.flush(timeout_sec=PATIENCE)
-        rec.disconnect()
-        file.close()
-    except BaseException:
-        if rec is not None:
-            rec.disconnect()
-        file.discard()
-        raise
-
-
-def times(k: np.ndarray, dt: float) -> list[Any]:
-    """Return the two timelines of rows at steps `k`: step, and sim_time = k dt to the nanosecond."""
-    import rerun as rr
-
-    nanoseconds = np.rint(k * dt * 1e9).astype("timedelta64[ns]")
-    return [rr.TimeColumn("step", sequence=k), rr.TimeColumn("sim_time", duration=nanoseconds)]
+    moves = len(rows.U)
+    size = max(least, -(-moves // most))
+    starts = range(0, moves - size + 1, size) if moves > size else range(1)
+    ends = [*starts[1:], len(rows.X)]
+    return [rows.cut(a, b) for a, b in zip(starts, ends, strict=True)]
 
 
 class Writer:
@@ -145,27 +127,25 @@ class Writer:
 
         A `growing` log is there while it is written, any other takes its place at the end.
         """
-        self._about, self._scene, self._model = about, scene, model
+        self._about, self._model, self._scenes = about, model, Scenes(about, scene)
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
         self._viewer, self._steps = viewer, steps
-        self._opened, self._ahead = False, False  # _ahead: a plan was drawn before
+        self._opened = False
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
-        self._extent, self._shown = Extent(), Extent().ranges()
-        self._status: tuple[Status, Fallback] | None = None
-        self._solver = NO_SOLVER
+        self._shown = self._scenes.extent.ranges()
+        self._last = {Entity.QP: NO_SOLVER}  # the last word of each column that is written where it changes
+        self._looks: dict[str, Any] = {}  # of the curves
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
         self._places: dict[str, int] = {}  # a checksum of the steps of its rows
-        self._u: np.ndarray | None = None
-        self._names, self._reference = Names(), ReferenceScenes(about)
         self._plans: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # plans that look beyond what is written
         self._file: LogFile | None = None
         self._rec: Any = None
         try:
             with deferred():  # no interrupt between the file and its name leaves it behind
                 self._file = None if path is None else LogFile(path, growing=growing)
-            self._rec = _new_recording(application_of(about))
+            self._rec = new_recording(application_of(about))
         except BaseException:  # a Ctrl-C
             self.discard()
             raise
@@ -175,9 +155,12 @@ class Writer:
         self._nr = rows.reference.shape[1]
         if not self._opened:
             self._spans = self._found_spans(rows)
-        self._horizon = max(self._horizon, rows.plan_U.shape[1] if len(rows.planned) else 0)
+        self._horizon = max(self._horizon, rows.horizon)
         parts = blocks(rows)
-        drawings = [self._drawings(part) for part in parts]  # all, because the layout is as wide as the widest
+        drawings = [  # all, because the layout is as wide as the widest
+            self._scenes.drawn(part.k, part, list(zip(part.planned, part.plan_X, part.plan_U, strict=True)))
+            for part in parts
+        ]
         if not self._opened:
             self._open()
         if len(rows.U):
@@ -188,63 +171,64 @@ class Writer:
     def _write(self, rows: LogBlock, drawings: dict[str, Drawing]) -> None:
         import rerun as rr
 
-        n, m = len(rows.X), len(rows.U)
-        k = rows.k + np.arange(n)
-        if Entity.STATE not in self._styled:
-            for entity, style in styles(self._about, rows).items():
+        k = rows.k + np.arange(len(rows.X))
+        if not self._looks:
+            self._looks = styles(self._about, self._nr, rows.horizon)
+            for entity, style in self._looks.items():
                 if entity != Entity.MEASUREMENT:  # it may have no row
                     self._style(entity, style)
-        if drawings and self._extent.in_space:
+        if drawings and self._scenes.extent.in_space:
             self._style("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for entity, drawing in drawings.items():
             if drawing.style is not None:
                 self._style(entity, drawing.style)
-            self._rec.send_columns(entity, times(k, self._about.dt), drawing.columns)
+            self._send(entity, k, drawing.columns)
         if len(rows.planned):
             self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
             self._vectors(Entity.PLAN_INPUTS, rows.planned, rows.plan_U)
         self._plots(rows, k)
         measured, shown = _differ(rows.X, rows.Y), panels(self._about, self._nr)
         if len(measured):
-            self._style(Entity.MEASUREMENT, styles(self._about, rows)[Entity.MEASUREMENT])
+            self._style(Entity.MEASUREMENT, self._looks[Entity.MEASUREMENT])
         self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured], [i for p in shown for i in p.measured])
         self._vectors(Entity.REFERENCE, k, rows.reference, [i for p in shown for i in p.references])
-        if m:
-            self._vectors(Entity.INPUT, k[:m], rows.U)
-            held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
-            self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
-            gave = np.flatnonzero(rows.slack)
-            self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
-            looked = np.flatnonzero(rows.known >= 0)
-            self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
-            ends = self._ends(k[:m])
-            limits = [value for _, value in input_limits(self._about)]
-            self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
-            if len(ends):
-                powers = np.full(len(ends), np.log10(self._about.dt))
-                line = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers})
-                scalars = rr.Scalars.columns(scalars=np.full(len(ends), 1e3 * self._about.dt))
-                self._rec.send_columns(Entity.DEADLINE, times(ends, self._about.dt), [*scalars, *line])
-            timed = rows.solve_time > 0
-            powers = np.log10(rows.solve_time[timed]).astype(np.float32)
-            shown = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers}).partition(timed.astype(np.int64))
-            ms = 1e3 * rows.solve_time
-            parts = {
-                "seconds": (rows.solve_time, ms / 1e3 != rows.solve_time),
-                "iterations": (rows.iterations, rows.iterations != 0),
-            }
-            exact: list[Any] = []
-            for name, (column, held) in parts.items():
-                values = np.ascontiguousarray(column[held])
-                self._sum(f"/{Entity.SOLVER}:{name}", values.data)
-                if held.any():
-                    columns = rr.DynamicArchetype.columns("koopmpc.Solver", components={name: values})
-                    exact += [*columns.partition(held.astype(np.int64))]
-            scalars = rr.Scalars.columns(scalars=ms)
-            self._sum(f"/{Entity.SOLVER}:scalars", ms.data, k[:m])
-            self._rec.send_columns(Entity.SOLVER, times(k[:m], self._about.dt), [*scalars, *exact, *shown])
+        if len(rows.U):
+            self._moves(rows, k[: len(rows.U)])
         self.flush()  # static archetypes reach the file before the states do
-        self._vectors(Entity.STATE, k, rows.X, [i for panel in panels(self._about, self._nr) for i in panel.states])
+        self._vectors(Entity.STATE, k, rows.X, [i for panel in shown for i in panel.states])
+
+    def _moves(self, rows: LogBlock, k: np.ndarray) -> None:
+        """Write the inputs at steps k, their limits, and what the solver did for them."""
+        import rerun as rr
+
+        self._vectors(Entity.INPUT, k, rows.U)
+        held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
+        self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
+        gave = np.flatnonzero(rows.slack)
+        self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
+        looked = np.flatnonzero(rows.known >= 0)
+        self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
+        ends = self._ends(k)
+        limits = [value for _, value in input_limits(self._about)]
+        self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
+        if len(ends):
+            powers = np.full(len(ends), np.log10(self._about.dt))
+            line = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers})
+            scalars = rr.Scalars.columns(scalars=np.full(len(ends), 1e3 * self._about.dt))
+            self._send(Entity.DEADLINE, ends, [*scalars, *line])
+        ms, timed = 1e3 * rows.solve_time, rows.solve_time > 0
+        columns = [*rr.Scalars.columns(scalars=ms)]
+        for name, column, held in (
+            ("seconds", rows.solve_time, ms / 1e3 != rows.solve_time),
+            ("iterations", rows.iterations, rows.iterations != 0),
+        ):
+            values = np.ascontiguousarray(column[held])
+            self._sum(f"/{Entity.SOLVER}:{name}", values.data)
+            if held.any():
+                columns += _where(held, "koopmpc.Solver", name, values)
+        columns += _where(timed, VIEW, LOG_TIME, np.log10(rows.solve_time[timed]).astype(np.float32))
+        self._sum(f"/{Entity.SOLVER}:scalars", ms.data, k)
+        self._send(Entity.SOLVER, k, columns)
 
     def flush(self) -> None:
         """Wait until the sinks have what was written; raise where the disk has refused it."""
@@ -269,11 +253,10 @@ class Writer:
                 text = f"The metrics cannot be computed: {error}"
         if not self._opened:
             self._open()
-        document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
         numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
-        self._rec.log(Entity.METRICS, document, rr.AnyValues(**numbers), static=True)
-        if self._extent.ranges() != self._shown:
-            _send_blueprint(self._rec, application_of(self._about), self._blueprint())
+        write_page(self._rec, Entity.METRICS, text, rr.AnyValues(**numbers))
+        if self._scenes.extent.ranges() != self._shown:
+            send_blueprint(self._rec, application_of(self._about), self._blueprint())
         self.flush()
         self._release()
         if self._file is not None:
@@ -304,23 +287,20 @@ class Writer:
             self._file.attach(self._rec, *sinks)
         self._rec.send_recording_name(drawable(title_of(self._about)))
         self._sum(f"/{Entity.DESCRIPTION}:json", self._json.encode())
-        text = rr.TextDocument(drawable(self._page), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log(Entity.DESCRIPTION, text, rr.AnyValues(json=self._json), static=True)
-        heading = rr.TextDocument(drawable(f"**{title_of(self._about)}**"), media_type=rr.MediaType.MARKDOWN)
-        self._rec.log("title", heading, static=True)
+        write_page(self._rec, Entity.DESCRIPTION, self._page, rr.AnyValues(json=self._json))
+        write_page(self._rec, "title", f"**{title_of(self._about)}**")
         self.flush()  # a log that is cut says what it was
-        _send_blueprint(self._rec, application_of(self._about), self._blueprint())
+        send_blueprint(self._rec, application_of(self._about), self._blueprint())
         if self._model is not None:
             for entity, drawing in draw_eigenvalues(self._model).items():
                 self._style(entity, drawing)
 
     def _blueprint(self) -> Any:
-        self._shown = self._extent.ranges()
-        extent = self._extent if self._scene is not None else None
+        self._shown = self._scenes.extent.ranges()
         return blueprint(
             self._about,
             self._nr,
-            extent=extent,
+            extent=self._scenes.extent if self._scenes.scene is not None else None,
             model=self._model,
             horizon=self._horizon,
             spans=self._spans,
@@ -348,6 +328,10 @@ class Writer:
             with np.errstate(over="ignore"):
                 parts = {str(i): values[:, i].astype(np.float32) for i in alone}
             columns = [*columns, *rr.DynamicArchetype.columns(VIEW, components=parts)]
+        self._send(entity, k, columns)
+
+    def _send(self, entity: str, k: np.ndarray, columns: Any) -> None:
+        """Write the rows at steps k of an entity."""
         self._rec.send_columns(entity, times(k, self._about.dt), columns)
 
     def _ends(self, k: np.ndarray) -> np.ndarray:
@@ -359,11 +343,10 @@ class Writer:
         """Return the least and the largest value of each plot of states; of a running loop nothing is known yet."""
         if self._steps is None:
             return {}
-        limits, found = state_limits(self._about), dict[str, list[float]]()
-        for panel in panels(self._about, rows.reference.shape[1]):
-            own = [self._about.states[i] for i in panel.states]
+        found: dict[str, list[float]] = {}
+        for panel in panels(self._about, self._nr):
             parts = [rows.X[:, panel.states], rows.Y[:, panel.measured], rows.reference[:, panel.references]]
-            values = np.concatenate([*map(np.ravel, parts), [value for name, value in limits if name in own]])
+            values = np.concatenate([*map(np.ravel, parts), [value for _, value in panel.limits]])
             values = values[np.isfinite(values)]
             found[panel.entity] = [float(values.min()), float(values.max())] if len(values) else []
         return found
@@ -377,10 +360,9 @@ class Writer:
         plans = zip(rows.planned.tolist(), rows.plan_X, rows.plan_U, strict=True)
         self._plans |= {step: (X, U) for step, X, U in plans if np.isfinite(X).any()}
         N = len(next(iter(self._plans.values()))[1]) if self._plans else 0
-        bounds, ends = state_limits(self._about), self._ends(k)
-        for panel in panels(self._about, rows.reference.shape[1]):
-            own = [self._about.states[i] for i in panel.states]
-            limits = [value for name, value in bounds if name in own]
+        shown, ends = panels(self._about, self._nr), self._ends(k)
+        for panel in shown:
+            limits = [value for _, value in panel.limits]
             self._vectors(f"{panel.entity}/limits", ends, np.tile(limits, (len(ends), 1)))
         for j in ahead(N):
             of = [step for step in self._plans if k[0] <= step + j <= k[-1]]
@@ -389,7 +371,7 @@ class Writer:
             at = np.array(of, dtype=np.int64) + j
             X = np.array([self._plans[step][0][j] for step in of]).reshape(len(of), -1)
             U = [self._plans[step][1][min(j, N - 1)] for step in of]
-            for panel in panels(self._about, rows.reference.shape[1]):
+            for panel in shown:
                 self._vectors(f"{panel.entity}/ahead/{j}", at, X[:, panel.states])
             self._vectors(f"plots/u/ahead/{j}", at, np.array(U))
         self._plans = {step: plan for step, plan in self._plans.items() if step + N > k[-1]}
@@ -412,57 +394,33 @@ class Writer:
         import rerun as rr
 
         pairs = list(zip(rows.status, rows.fallback, strict=True))
-        changed = [i for i, pair in enumerate(pairs) if pair != (pairs[i - 1] if i else self._status)]
-        self._status = pairs[-1]
-        if changed:
-            words = [status_value(*pairs[i]) for i in changed]
-            self._sum(f"/{Entity.STATUS}:state", "".join(words).encode(), rows.k + np.array(changed))
-            at = times(rows.k + np.array(changed), self._about.dt)
-            self._rec.send_columns(Entity.STATUS, at, rr.StateChange.columns(state=words))
-        solvers = [name or NO_SOLVER for name in rows.solver]
-        turns = [i for i, name in enumerate(solvers) if name != (solvers[i - 1] if i else self._solver)]
-        self._solver = solvers[-1]
-        if turns:
-            words, k = [solvers[i] for i in turns], rows.k + np.array(turns)
-            self._sum(f"/{Entity.QP}:state", "".join(words).encode(), k)
-            self._rec.send_columns(Entity.QP, times(k, self._about.dt), rr.StateChange.columns(state=words))
+        changed = self._changes(Entity.STATUS, rows.k, [status_value(*pair) for pair in pairs])
+        self._changes(Entity.QP, rows.k, [name or NO_SOLVER for name in rows.solver])
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
         if fallen:
             texts = [f"step {rows.k + i}: {status_words(*pairs[i])}" for i in fallen]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
-            self._rec.send_columns(Entity.FALLBACKS, times(rows.k + np.array(fallen), self._about.dt), columns)
+            self._send(Entity.FALLBACKS, rows.k + np.array(fallen), columns)
 
-    def _drawings(self, rows: LogBlock) -> dict[str, Drawing]:
-        """Return the scene of every row, and of a few stages of its plan, by entity."""
-        scene = self._scene
-        if scene is None:
-            return {}
-        ahead: dict[int, list[Any]] = {}
-        for k, X, U in zip(rows.planned, rows.plan_X, rows.plan_U, strict=True):
-            if np.isfinite(X).all() and np.isfinite(U).all():
-                ahead[int(k)] = [
-                    self._names.checked(scene(X[i], U[min(i, len(U) - 1)]), int(k)) for i in stages(len(U))
-                ]
-        now: list[Sequence[Any]] = []
-        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
-            self._u = rows.U[i] if i < len(rows.U) else self._u
-            x = y if np.isnan(x).any() and len(y) == len(x) else x
-            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
-            now.append([] if shapes is None else self._names.checked(shapes, rows.k + i))
-        drawn = draw(self._names, now, self._extent)
-        found = {f"world/{name}": drawing for name, drawing in drawn.items()}
-        if ahead or self._ahead:
-            self._ahead = True
-            futures = [ahead.get(rows.k + i, []) for i in range(len(now))]
-            drawn = draw_ahead(self._names, now, futures, self._extent)
-            found |= {f"world/prediction/{name}": drawing for name, drawing in drawn.items()}
-        aims = self._reference.of(rows, scene)
-        if any(aims):
-            for aim in aims:
-                self._names.checked(aim, rows.k) if aim else None
-            drawn = draw_reference(self._names, now, aims, self._extent)
-            found |= {f"world/reference/{name}": drawing for name, drawing in drawn.items()}
-        return found
+    def _changes(self, entity: Entity, first: int, words: Sequence[str]) -> list[int]:
+        """Write the words of the rows first, first + 1, … where they change; return which of the rows these are."""
+        import rerun as rr
+
+        before = [self._last.get(entity), *words]
+        changed = [i for i, word in enumerate(words) if word != before[i]]
+        self._last[entity] = words[-1]
+        if changed:
+            told, k = [words[i] for i in changed], first + np.array(changed)
+            self._sum(f"/{entity}:state", "".join(told).encode(), k)
+            self._send(entity, k, rr.StateChange.columns(state=told))
+        return changed
+
+
+def _where(held: np.ndarray, archetype: str, component: str, values: np.ndarray) -> Any:
+    """Return the columns of a component that only some rows have: a value for each of those."""
+    import rerun as rr
+
+    return rr.DynamicArchetype.columns(archetype, components={component: values}).partition(held.astype(np.int64))
 
 
 def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:

@@ -321,6 +321,49 @@ class ReferenceScenes:
         return least
 
 
+class Scenes:
+    """The drawings of a run, row by row: scene(x, u) of its states, of a few stages of its plans, of its reference.
+
+    `extent` holds all that was drawn; without a scene nothing is.
+    """
+
+    def __init__(self, about: About, scene: Scene | None) -> None:
+        self.scene, self.extent = scene, Extent()
+        self._names, self._reference = Names(), ReferenceScenes(about)
+        self._u: np.ndarray | None = None  # the last input
+        self._ahead = False  # a plan was drawn before
+
+    def drawn(
+        self, first: int, rows: StepRows, plans: Sequence[tuple[int, np.ndarray, np.ndarray]]
+    ) -> dict[str, Drawing]:
+        """Return the drawings of rows first, first + 1, … by entity; `plans` are steps with their planned X and U."""
+        scene = self.scene
+        if scene is None:
+            return {}
+        ahead: dict[int, list[list[Shape]]] = {}
+        for k, X, U in plans:
+            if np.isfinite(X).all() and np.isfinite(U).all():
+                later = ((X[i], U[min(i, len(U) - 1)]) for i in stages(len(U)))
+                ahead[int(k)] = [self._names.checked(scene(x, u), int(k)) for x, u in later]
+        now: list[list[Shape]] = []
+        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
+            self._u = rows.U[i] if i < len(rows.U) else self._u
+            x = y if np.isnan(x).any() and len(y) == len(x) else x
+            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
+            now.append([] if shapes is None else self._names.checked(shapes, first + i))
+        layers = {"world": draw(self._names, now, self.extent)}
+        if ahead or self._ahead:
+            self._ahead = True
+            futures = [ahead.get(first + i, []) for i in range(len(now))]
+            layers["world/prediction"] = draw_ahead(self._names, now, futures, self.extent)
+        aims = self._reference.of(rows, scene)
+        if any(aims):
+            for aim in filter(None, aims):
+                self._names.checked(aim, first)
+            layers["world/reference"] = draw_reference(self._names, now, aims, self.extent)
+        return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
+
+
 def stages(horizon: int) -> list[int]:
     """Return the few stages of a plan that are drawn, the last one among them."""
     return sorted({round(horizon * (i + 1) / _STAGES) for i in range(_STAGES)} - {0})

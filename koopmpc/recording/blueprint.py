@@ -1,5 +1,5 @@
 # pyright: basic
-"""The default blueprint: plots on the left; animation, eigenvalues and text on the right; a title above."""
+"""What the viewer shows of a run: the look of its curves and eigenvalues, and the blueprint, which lays them out."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,14 @@ import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.figures.animation import project
+from koopmpc.figures.style import SEQUENTIAL, shades
 from koopmpc.loop.run import About
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable, status_words
-from koopmpc.recording.format.rrd import LogBlock
-from koopmpc.recording.views.eigenvalues import eigenvalue_views
-from koopmpc.recording.views.scenes import BACKGROUND, Extent
+from koopmpc.recording.rrd import times
+from koopmpc.recording.scenes import BACKGROUND, Extent
 from koopmpc.scene import Color
+from koopmpc.validate.residuals import ResidualDMD
 
 PALETTE: tuple[Color, ...] = (
     (88, 166, 255), (255, 166, 87), (86, 211, 160), (240, 120, 170),
@@ -37,6 +38,10 @@ _DISTANCE = 0.75  # of the eye from the middle of a scene in space, in its diago
 SEPARATE = 4  # up to so many states have a plot each
 VIEW = "koopmpc.View"  # components that plots alone show, beside the numbers of an entity, in single precision
 LOG_TIME = "log10_seconds"  # the one of them that solver/time_ms and solver/deadline_ms have
+_WIDEST = 3.0  # largest half width of the picture of eigenvalues
+_CLOSE = 0.35  # share of the picture below which the eigenvalues get one of their own
+_BELOW, _ABOVE = 1e-2, 1e1  # residuals of the darkest and the lightest shade, over the tolerance
+_LIGHT = 0.85  # share of the colour scale in use; the rest is too light for points
 
 _STATUS_COLORS: dict[Status, Color] = {
     Status.UNCONSTRAINED: (46, 160, 120),
@@ -51,22 +56,33 @@ def ahead(horizon: int) -> list[int]:
     return sorted({round(i * horizon / min(horizon, _AHEAD)) for i in range(1, min(horizon, _AHEAD) + 1)})
 
 
+_Limit = tuple[str, float]  # name, value
+
+
 @dataclass(frozen=True)
 class Panel:
-    """One plot of states: its entity, its title, and which states, references and measurements it shows, by index."""
+    """One plot of states: its entity, its title, and which states, references and measurements it shows, by index.
+
+    `limits` are the finite limits of these states: name and value of each.
+    """
 
     entity: str
     title: str
     states: list[int]
     references: list[int]
     measured: list[int]
+    limits: list[_Limit]
+
+    def called(self, what: str, names: Sequence[str]) -> list[str]:
+        """Return the names of curves that say `what` of these states; where there is one state it goes without."""
+        return [what if len(self.states) == 1 else f"{name}, {what}" for name in names]
 
 
 def panels(about: About, nr: int) -> list[Panel]:
     """Return a plot a state, or one plot for all of many states."""
-    tracked, places = about.tracked(nr), range(len(about.states))
+    tracked, places, limits = about.tracked(nr), range(len(about.states)), state_limits(about)
     if len(about.states) > SEPARATE:
-        return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))])]
+        return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))], limits)]
     return [
         Panel(
             f"plots/{i}",
@@ -74,22 +90,22 @@ def panels(about: About, nr: int) -> list[Panel]:
             [i],
             [j for j, other in enumerate(tracked) if other == name],
             [j for j, other in enumerate(about.outputs) if other == name],
+            [limit for limit in limits if limit[0] == name],
         )
         for i, name in enumerate(about.states)
     ]
 
 
-def styles(about: About, rows: LogBlock) -> dict[str, Any]:
-    """Return the static archetypes by entity that name and colour what `rows` hold."""
-    nr = rows.reference.shape[1]
-    tracked, bounds = about.tracked(nr), state_limits(about)
-    stages = ahead(rows.plan_U.shape[1]) if len(rows.planned) else []
-
+def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
+    """Return the static archetypes by entity that name and colour the curves of a run, `horizon` 0 without plans."""
+    stages = ahead(horizon)
     found = {
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
-        "reference": _lines([f"{name}, reference" for name in tracked], REFERENCE, 1.5),
+        "reference": _lines([f"{name}, reference" for name in about.tracked(nr)], REFERENCE, 1.5),
         "measurement": _points([f"{name}, measured" for name in about.outputs], _MEASURED, 1.5),
-        "control/u": _lines(about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, **_HELD),
+        "control/u": _lines(
+            about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, interpolation_mode="StepAfter"
+        ),
         "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0),
         "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
         "solver/deadline_ms": _lines(["deadline [ms]"], LIMIT, 1.0),
@@ -97,21 +113,12 @@ def styles(about: About, rows: LogBlock) -> dict[str, Any]:
     }
     found |= {f"plots/u/ahead/{j}": _points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
     for panel in panels(about, nr):
-        alone = len(panel.states) == 1
-
-        def called(what: str, names: Sequence[str], alone: bool = alone) -> list[str]:
-            return [what if alone else f"{name}, {what}" for name in names]
-
-        own = [about.states[i] for i in panel.states]
-        limits = called("limits", [name for name, _ in bounds if name in own])
+        limits = panel.called("limits", [name for name, _ in panel.limits])
         found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0)
-        one = _points(called("prediction", own), _PREDICTION, 1.6)
-        found |= {f"{panel.entity}/ahead/{j}": one for j in stages}
+        predicted = panel.called("prediction", [about.states[i] for i in panel.states])
+        points = _points(predicted, _PREDICTION, 1.6)
+        found |= {f"{panel.entity}/ahead/{j}": points for j in stages}
     return found
-
-
-_HELD: dict[str, Any] = {"interpolation_mode": "StepAfter"}
-_Limit = tuple[str, float]  # name, value
 
 
 def input_limits(about: About) -> list[_Limit]:
@@ -150,11 +157,11 @@ def color(i: int) -> Color:
     return PALETTE[i % len(PALETTE)]
 
 
-def _lines(names: Sequence[str], colors: Color | Sequence[Color], width: float, **more: Any) -> Any:
+def _lines(names: Sequence[str], colors: Color | list[Color], width: float, **more: Any) -> Any:
     """Return lines of one colour, or of a colour each."""
     import rerun as rr
 
-    each = [colors] * len(names) if isinstance(colors, tuple) and isinstance(colors[0], int) else list(colors)
+    each = colors if isinstance(colors, list) else [colors] * len(names)
     return rr.SeriesLines(names=[drawable(name) for name in names], colors=each, widths=[width] * len(names), **more)
 
 
@@ -164,6 +171,25 @@ def _points(names: Sequence[str], shade: Color, size: float) -> Any:
 
     drawn = [drawable(name) for name in names]
     return rr.SeriesPoints(names=drawn, colors=[shade] * len(drawn), marker_sizes=[size] * len(drawn))
+
+
+def write_page(rec: Any, entity: str, text: str, *more: Any) -> None:
+    """Write Markdown as a page that does not change, and `more` of the same entity."""
+    import rerun as rr
+
+    rec.log(entity, rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN), *more, static=True)
+
+
+def draw_line(
+    rec: Any, entity: str, name: str, shade: Color, width: float, values: np.ndarray, dt: float, **style: Any
+) -> None:
+    """Write the finite values of one curve over the steps 0, 1, …; nothing where there is none."""
+    import rerun as rr
+
+    k = np.flatnonzero(np.isfinite(values))
+    if len(k):  # the viewer crashes on a timeline without rows
+        rec.log(entity, rr.SeriesLines(names=drawable(name), colors=shade, widths=width, **style), static=True)
+        rec.send_columns(entity, times(k, dt), rr.Scalars.columns(scalars=values[k]))
 
 
 def _alone(style: Any, component: str) -> Any:
@@ -182,9 +208,12 @@ def _shown(panel: Panel) -> dict[str, list[Any]]:
         "/reference": [(i, _lines(["reference"], REFERENCE, 1.5)) for i in panel.references],
         "/measurement": [(i, _points(["measured"], _MEASURED, 1.5)) for i in panel.measured],
     }
-    if len(panel.states) > SEPARATE:  # the vectors, as they are
-        return {entity: [] for entity, parts in lines.items() if parts}
-    return {entity: [_alone(style, str(i)) for i, style in parts] for entity, parts in lines.items() if parts}
+    whole = len(panel.states) > SEPARATE  # then the vectors, as they are
+    return {
+        entity: [] if whole else [_alone(style, str(i)) for i, style in parts]
+        for entity, parts in lines.items()
+        if parts
+    }
 
 
 def blueprint(
@@ -205,38 +234,31 @@ def blueprint(
     """
     import rerun.blueprint as rrb
 
-    def plot(
-        entity: str,
-        name: str,
-        contents: Sequence[str] = (),
-        axis_y: Any = None,
-        titled: bool = True,
-        own: Mapping[str, list[Any]] | None = None,
-    ) -> Any:
+    def plot(entity: str, name: str, drawn: Mapping[str, list[Any]], axis_y: Any) -> Any:
+        """Return the plot of an entity and of others, `drawn` as they are told to be, or else as they are."""
+        told = {other: looks for other, looks in drawn.items() if looks}
         return rrb.TimeSeriesView(
-            titlebar=titled,
-            contents=[f"/{entity}/**", *contents],
+            titlebar=roomy,
+            contents=[f"/{entity}/**", *drawn],
             name=drawable(name),
             axis_x=shared_time(length),
             axis_y=axis_y,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
-            overrides=cast("Any", _now(entity, horizon, about.dt) | {e: v for e, v in (own or {}).items() if v}),
+            overrides=cast("Any", _now(entity, horizon, about.dt) | told),
         )
 
     rows = panels(about, nr)
     roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
     axes = [readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
     parts = [_shown(row) for row in rows]
-    shown = [
-        plot(row.entity, row.title, [*part], axis, roomy, part)
-        for row, axis, part in zip(rows, axes, parts, strict=True)
-    ]
+    shown = [plot(row.entity, row.title, part, axis) for row, axis, part in zip(rows, axes, parts, strict=True)]
+    inputs = f"Input: {about.inputs[0]}" if len(about.inputs) == 1 else "Inputs"
     bounds = readable([v for _, v in input_limits(about)], _TICKS[roomy])
-    shown.append(plot("plots/u", _title("Input", about.inputs), ["/control/u", "/control/limits"], bounds, roomy))
+    shown.append(plot("plots/u", inputs, {"/control/u": [], "/control/limits": []}, bounds))
     slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
     time = {"/solver/time_ms": [_alone(_lines(["time of a step [10^y s]"], color(2), 1.5), LOG_TIME)]}
     time["/solver/deadline_ms"] = [_alone(_lines(["sample time, its deadline"], LIMIT, 1.0), LOG_TIME)]
-    shown.append(plot("solver/log", _STEP_TIME, [*time], slowest, roomy, time))
+    shown.append(plot("solver/log", _STEP_TIME, time, slowest))
     status = rrb.StateTimelineView(origin="solver/status", name="How each step ended")
     left = rrb.Vertical(*shown, status, row_shares=[1.0] * len(shown) + [max(0.5, 0.12 * len(shown))])
     texts = rrb.Tabs(
@@ -244,12 +266,10 @@ def blueprint(
         rrb.TextDocumentView(origin="description", name="Description"),
         rrb.TextLogView(origin="log", name="Log"),
     )
-    lower = texts if model is None else rrb.Horizontal(eigenvalue_views(model)[0], texts)
-    if extent is not None:
-        right, shares = rrb.Vertical(_animation(extent), lower, row_shares=[3.0, 2.0]), [1.0, 1.0]
-    else:  # without an animation the plots get the room
-        right = texts if model is None else rrb.Vertical(eigenvalue_views(model)[0], texts)
-        shares = [2.6, 1.0]
+    beside = rrb.Vertical if extent is None else rrb.Horizontal
+    right, shares = texts if model is None else beside(eigenvalue_views(model)[0], texts), [2.6, 1.0]
+    if extent is not None:  # without an animation the plots get the room
+        right, shares = rrb.Vertical(_animation(extent), right, row_shares=[3.0, 2.0]), [1.0, 1.0]
     title = rrb.TextDocumentView(origin="title", name="Run", titlebar=False)
     return framed(rrb.Vertical(title, rrb.Horizontal(left, right, column_shares=shares), row_shares=[1.0, 18.0]))
 
@@ -309,6 +329,14 @@ def _animation(extent: Extent) -> Any:
     return rrb.Spatial2DView(origin="world", name=name, background=list(BACKGROUND), visual_bounds=fixed)
 
 
+def plane_view(origin: str, name: str, x: Sequence[float], y: Sequence[float]) -> Any:
+    """Return the view of what is drawn in the plane within these ranges of x and y, y down."""
+    import rerun.blueprint as rrb
+
+    bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+    return rrb.Spatial2DView(origin=origin, name=name, background=list(BACKGROUND), visual_bounds=bounds)
+
+
 def readable(values: Sequence[float], ticks: float) -> Any:
     """Return an axis a little wider than `values` that holds two ticks with numbers; None where they span nothing.
 
@@ -335,5 +363,65 @@ def readable(values: Sequence[float], ticks: float) -> Any:
     return rrb.ScalarAxis(range=[low - margin, high + margin])
 
 
-def _title(what: str, names: tuple[str, ...]) -> str:
-    return f"{what}: {names[0]}" if len(names) == 1 else f"{what}s"
+def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> dict[str, Any]:
+    """Return static archetypes by entity. Rerun's y points down.
+
+    Without residuals eigenvalues outside the unit circle are red. With them a point is the darker the smaller its
+    residual, and one that may be spurious is a ring.
+    """
+    import rerun as rr
+
+    values = np.asarray(model.eigenvalues if residuals is None else residuals.eigenvalues)
+    turn = np.linspace(0, 2 * np.pi, 721)
+    size = _reach(model)
+    axes = [[(-size, 0), (size, 0)], [(0, -size), (0, size)]]
+    at = np.stack([np.real(values), -np.imag(values)], axis=1)
+    labels = [f"λ = {v:.4f}, |λ| = {abs(v):.4f}" for v in values]
+    if residuals is None:
+        outside = np.abs(values) > 1 + 1e-9
+        colors = np.where(outside[:, None], [214, 60, 60], [40, 110, 200]).astype(np.uint8)
+    else:
+        labels = [f"{label}, residual {r:.2g}" for label, r in zip(labels, residuals.residuals, strict=True)]
+        share = np.clip(residuals.residuals / residuals.tolerance, _BELOW, _ABOVE)
+        level = np.log(share / _BELOW) / np.log(_ABOVE / _BELOW)
+        colors = shades(_LIGHT * level, SEQUENTIAL)
+    drawn = {
+        "model/axes": rr.LineStrips2D(axes, radii=rr.Radius.ui_points(0.5), colors=[205, 210, 216], draw_order=1),
+        "model/circle": rr.LineStrips2D(
+            [np.stack([np.cos(turn), np.sin(turn)], axis=1)],
+            radii=rr.Radius.ui_points(1.0),
+            colors=[120, 130, 145],
+            draw_order=2,
+        ),
+        "model/eigenvalues": rr.Points2D(
+            at, radii=rr.Radius.ui_points(5.0), colors=colors, labels=labels, show_labels=False, draw_order=30
+        ),
+    }
+    if residuals is not None and residuals.spurious.any():
+        drawn["model/spurious"] = rr.Points2D(
+            at[residuals.spurious], radii=rr.Radius.ui_points(2.6), colors=BACKGROUND, draw_order=31
+        )
+    return drawn
+
+
+def _reach(model: Predictor) -> float:
+    """Return the half width of the picture, which holds the unit circle and the eigenvalues up to |λ| = 2.6."""
+    values = np.asarray(model.eigenvalues)
+    return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)
+
+
+def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
+    """Return the view of the unit circle, and a closer one where the eigenvalues crowd."""
+    size, values = _reach(model), np.asarray(model.eigenvalues)
+    views = [_around("Eigenvalues, unit circle", 0.0, size)]
+    told = "Closer; rings may be spurious" if residuals else "Closer"
+    re, im = np.real(values), np.imag(values)
+    half = max(np.ptp(re), np.ptp(im)) / 2
+    if half < _CLOSE * size:
+        views.append(_around(told, (re.min() + re.max()) / 2, 1.3 * half + 1e-3))
+    return views
+
+
+def _around(name: str, x: float, size: float) -> Any:
+    """Return the view of the eigenvalues in the square of half width `size` about x on the real axis."""
+    return plane_view("model", name, [x - size, x + size], [-size, size])

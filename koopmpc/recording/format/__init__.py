@@ -1,1 +1,0 @@
-"""Rows and columns of a log: writer and reader."""

@@ -1,0 +1,331 @@
+# pyright: basic
+"""The columns of a log, one table for the writer and the reader; load_run makes them the Run that was written."""
+
+import json
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from koopmpc.control.move import Fallback, Status
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.sampling import Signals, episodes_from
+from koopmpc.disk import path_of
+from koopmpc.errors import DataError, LogError
+from koopmpc.loop.run import About, Plans, Run
+from koopmpc.recording.description import from_json
+from koopmpc.recording.rrd import Column, check_log, read
+
+
+class Entity(StrEnum):
+    """Where the columns of a log stand.
+
+    An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
+    What only the viewer draws is not in it: `world`, `model`, `plots`, `title`, and components `koopmpc.View:…`:
+    one state alone in single precision, the power of ten of a time.
+    """
+
+    DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
+    STATE = "state"  # x_k, NaN where the plant hides it; written last, so a row that has its state is whole
+    MEASUREMENT = "measurement"  # y_k, in the rows where it is not x_k to the bit
+    REFERENCE = "reference"  # r_k
+    INPUT = "control/u"  # u_k as applied
+    INPUT_REFERENCE = "control/u_reference"  # the input that holds r_k, in the rows where it is not 0
+    INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and last step of a run or live block
+    SLACK = "solver/slack"  # how far the plan breaks a soft limit, in the rows where it does
+    KNOWN = "solver/known"  # 1 where the model knows and 0 where it does not, in the rows where a monitor looked
+    SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" where it is not ms / 1000 to the bit; "iterations" above 0
+    QP = "solver/qp"  # "state": which solver made the move, or "none", in the rows where it changes; "none" before all
+    DEADLINE = "solver/deadline_ms"  # dt [ms], at the same steps
+    STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes
+    PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
+    PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu
+    FALLBACKS = "log"  # text: a line where a fallback sets in
+    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", checksums of all columns
+
+
+DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
+NO_SOLVER = "none"  # the solver of a step that asked none
+
+
+class LogColumns:
+    """The columns of a recording: rows in order of their step, by (entity, component).
+
+    `torn` says that the file ends within a message.
+    """
+
+    def __init__(self, columns: Iterable[Column], entities: tuple[str, ...], torn: bool) -> None:
+        self._entities, self.torn = entities, torn
+        self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
+        for entity, component, k, values in columns:
+            steps = None if k is None else k.to_numpy(zero_copy_only=False).astype(np.int64)
+            self._parts.setdefault((entity, component), []).append((steps, values))
+
+    def static(self, entity: str, component: str) -> Any:
+        """Return the one value that does not change, or None."""
+        parts = self._parts.get(_key(entity, component))
+        return None if parts is None else parts[-1][1].to_pylist()[-1][0]
+
+    def entities(self) -> list[str]:
+        """Return the entities that have data."""
+        return list(dict.fromkeys(entity for entity, _ in self._parts))
+
+    def lists(self, entity: str, component: str) -> tuple[np.ndarray, list[Any]]:
+        """Return the steps and the list of values of each row, in order of the steps."""
+        parts = [(k, column) for k, column in self._parts.get(_key(entity, component), []) if k is not None]
+        pairs = [pair for k, column in parts for pair in zip(k.tolist(), column.to_pylist(), strict=True)]
+        pairs.sort(key=lambda pair: pair[0])
+        return np.array([k for k, _ in pairs], dtype=np.int64), [values for _, values in pairs]
+
+    def rows(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Return the steps, the width, and the flat values of a component, in order of the steps."""
+        import pyarrow as pa
+
+        parts = self._parts.get(_key(entity, component), [])
+        if not parts:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+        if parts[0][0] is None:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), parts[-1][1].flatten()
+        k = np.concatenate([k for k, _ in parts])
+        lists = pa.concat_arrays([column for _, column in parts])
+        order = np.argsort(k, kind="stable")
+        if (np.diff(k) < 0).any():
+            k, lists = k[order], lists.take(pa.array(order))
+        widths = lists.value_lengths().to_numpy(zero_copy_only=False)
+        return k, widths, lists.flatten()
+
+    def matrix(self, entity: str, component: str = "scalars") -> tuple[np.ndarray, np.ndarray]:
+        """Return the steps and one row of values each."""
+        k, widths, values = self.rows(entity, component)
+        flat = values if isinstance(values, np.ndarray) else values.to_numpy(zero_copy_only=False)
+        if len(widths) and (widths != widths[0]).any():
+            raise DataError(f"{entity} has rows of different lengths")
+        return k, np.array(flat).reshape(len(k), int(widths[0]) if len(widths) else 0)
+
+    def vectors(self, entity: str) -> np.ndarray:
+        """Return the rows 0, 1, … up to the first that is missing."""
+        k, values = self.matrix(entity)
+        gaps = np.flatnonzero(k != np.arange(len(k)))
+        return values[: gaps[0]] if len(gaps) else values
+
+    def held(self, entity: str, component: str, column: np.ndarray) -> np.ndarray:
+        """Return `column`, with the numbers of this component in the rows that have one."""
+        k, widths, values = self.rows(entity, component)
+        return _filled(column, k[widths > 0], np.array(values))
+
+    def changed(self) -> list[str]:
+        """Return the columns that differ from the checksums at the end of the log."""
+        sums: dict[str, int] = json.loads(self.static(Entity.METRICS, "sums"))
+        places: dict[str, int] = json.loads(self.static(Entity.METRICS, "places") or "{}")  # older logs have none
+        names = {key: key.split(":") for key in sums | places}
+        read = {key: self.rows(entity, name) for key, (entity, name) in names.items() if entity in self._entities}
+        bad = [key for key in sums if key in read and crc32(_bytes(read[key][2])) != sums[key]]
+        good = [key for key in places if key in read and key not in bad]
+        return bad + [key for key in good if crc32(_bytes(read[key][0])) != places[key]]
+
+
+def _bytes(values: Any) -> Any:
+    """Return the bytes of a column for its checksum."""
+    import pyarrow as pa
+
+    if isinstance(values, pa.StringArray):
+        return "".join(values.to_pylist()).encode()
+    return np.ascontiguousarray(values).data
+
+
+def _filled(rows: np.ndarray, k: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return a copy of `rows` with these values in its rows k; what lies beyond its end is left out."""
+    found, inside = rows.copy(), k < len(rows)
+    found[k[inside]] = values[inside]
+    return found
+
+
+def _key(entity: str, component: str) -> tuple[str, str]:
+    return f"/{entity.removeprefix('/')}", component
+
+
+def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
+    """Return the columns of the `entities` in the file.
+
+    Raises
+    ------
+    LogError
+        The file is missing, no .rrd, or damaged beyond a torn end.
+    """
+    check_log(path)
+    try:
+        columns, torn = read(path, entities)
+        return LogColumns(columns, entities, torn)
+    except LogError:
+        raise
+    except Exception as error:  # Rerun's reader raises exceptions of many kinds
+        raise LogError(f"{path} is no log, or is damaged: {error}") from error
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Raise LogError with the name of the file where its columns are not what koopmpc writes.
+
+    Raises
+    ------
+    LogError
+        The block failed on a value that it took from the columns.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, NotImplementedError, TypeError, ValueError) as error:
+        raise LogError(f"{path} is damaged: {error}") from error
+
+
+def load_run(path: str | Path) -> Run:
+    """Return the Run that `record` or a `Recorder` wrote to `path`, equal to the bit.
+
+    A log that was cut short, or whose writer died, yields the steps that are whole, and a UserWarning.
+
+    Raises
+    ------
+    LogError
+        The file is missing, no log of koopmpc, damaged, or holds no whole step.
+    """
+    path = path_of(path)
+    log = read_columns(path, tuple(f"/{entity}" for entity in Entity if entity not in DRAWN))
+    with naming(path):
+        return _run(log, path)
+
+
+def _run(log: LogColumns, path: Path) -> Run:
+    about, planned_steps = about_of(log, path)
+    X, reference = log.vectors(Entity.STATE), log.vectors(Entity.REFERENCE)
+    U = log.vectors(Entity.INPUT)
+    seconds = log.held(Entity.SOLVER, "seconds", log.vectors(Entity.SOLVER).reshape(-1) / 1e3)
+    iterations = log.held(Entity.SOLVER, "iterations", np.zeros(len(seconds), dtype=np.int64))
+    counts = [len(X) - 1, len(seconds)]
+    counts += [len(U)] if about.inputs else []
+    counts += [len(reference) - 1] if len(reference) else []
+    steps = min(counts)
+    if steps < 1:
+        raise LogError(f"{path} holds no whole step; its run ended before the second state was written")
+    end = log.static(Entity.METRICS, "steps")
+    total = planned_steps if end is None else end
+    if total != steps:
+        of = "" if total is None else f" of {total}"
+        warnings.warn(
+            f"{path} ends after step {steps}{of}: the file was cut short or its writer did not close it; "
+            "the run holds what is there",
+            UserWarning,
+            stacklevel=3,
+        )
+    elif end is None or log.torn:
+        warnings.warn(f"{path}: its end is cut, all {steps} steps are there", UserWarning, stacklevel=3)
+    if end == steps and (changed := log.changed()):
+        raise LogError(f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy")
+    status, fallback = _statuses(log, steps, path)
+    return Run(
+        X=X[: steps + 1],
+        Y=_measured(log, X)[: steps + 1],
+        U=U[:steps] if len(U) else np.empty((steps, 0)),
+        reference=reference[: steps + 1] if len(reference) else np.empty((steps + 1, 0)),
+        status=status,
+        fallback=fallback,
+        solve_time=seconds[:steps],
+        iterations=iterations[:steps].astype(np.int64),
+        plans=_plans(log, steps),
+        u_reference=_sparse(log, Entity.INPUT_REFERENCE, steps, len(about.inputs)),
+        slack=_sparse(log, Entity.SLACK, steps, 1)[:, 0],
+        known=_sparse(log, Entity.KNOWN, steps, 1, absent=-1.0)[:, 0].astype(np.int64),
+        solver=_solvers(log, steps),
+        **about.about(),
+    )
+
+
+def about_of(log: LogColumns, path: Path) -> tuple[About, int | None]:
+    """Return what does not change in a run, and its number of steps where it was known beforehand."""
+    text = log.static(Entity.DESCRIPTION, "json")
+    if text is None:
+        raise LogError(
+            f"{path} is a Rerun recording, but no log of koopmpc: it has no description, or was cut before it"
+        )
+    try:
+        return from_json(text)
+    except LogError as error:
+        raise LogError(f"{path} is damaged or of another version: {error}") from error
+
+
+def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
+    """Return the measurements: the states, except in the rows that were written separately."""
+    k, values = log.matrix(Entity.MEASUREMENT)
+    if not len(k):
+        return X.copy()
+    return _filled(X, k, values) if values.shape[1] == X.shape[1] else values
+
+
+def _sparse(log: LogColumns, entity: str, steps: int, width: int, absent: float = 0.0) -> np.ndarray:
+    """Return the rows of an entity, `absent` where no row was written."""
+    k, values = log.matrix(entity)
+    held = np.full((steps, width), absent)
+    return _filled(held, k, values) if len(k) else held
+
+
+def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
+    """Return status and fallback of each step: the last change at or before it."""
+    k, _, words = log.rows(Entity.STATUS, "state")
+    if not len(k) or k[0] != 0:
+        raise LogError(f"{path} lacks the status of its first step; it was not written by koopmpc")
+    try:
+        pairs = [_pair(word) for word in words.to_pylist()]
+    except KeyError as error:
+        raise LogError(f"{path} holds the status {error}, which this version of koopmpc does not know") from error
+    held = [pairs[i] for i in np.searchsorted(k, np.arange(steps), side="right") - 1]
+    return tuple(s for s, _ in held), tuple(f for _, f in held)
+
+
+def _solvers(log: LogColumns, steps: int) -> tuple[str, ...]:
+    """Return the solver of each step: the last change at or before it; older logs have none."""
+    k, _, words = log.rows(Entity.QP, "state")
+    names = [NO_SOLVER, *(words.to_pylist() if len(k) else [])]
+    held = np.searchsorted(k, np.arange(steps), side="right")
+    return tuple("" if names[i] == NO_SOLVER else names[i] for i in held)
+
+
+def _pair(word: str) -> tuple[Status, Fallback]:
+    status, _, fallback = word.partition(" → ")
+    return Status[status], Fallback[fallback or "NONE"]
+
+
+def _plans(log: LogColumns, steps: int) -> Plans | None:
+    """Return the plans, NaN where a step had none; None where no step had one."""
+    parts = []
+    for entity in (Entity.PLAN_STATES, Entity.PLAN_INPUTS):
+        k, values = log.matrix(entity)
+        width = log.static(entity, "last_width")
+        if width is None or not len(k):
+            return None
+        whole = np.full((steps, values.shape[1] // width, width), np.nan)
+        parts.append(_filled(whole, k, values.reshape(-1, *whole.shape[1:])))
+    return Plans(*parts)
+
+
+def run_episodes(path: Path) -> Episodes:
+    """Return the inputs and states of a run's log, or its measurements where the plant hides them all, as episodes.
+
+    A row with a missing value ends an episode.
+
+    Raises
+    ------
+    LogError
+        The log is missing, damaged, or was not written by koopmpc.
+    DataError
+        The run has no two steps in sequence whose state is known.
+    """
+    run = load_run(path)
+    steps = len(run.U)
+    U = np.vstack([run.U, np.full((1, run.U.shape[1]), np.nan)])
+    hidden = not np.isfinite(run.X).any()
+    X, names = (run.Y, run.outputs) if hidden else (run.X, run.states)
+    signals = Signals(None, X, U, np.empty((steps + 1, 0)), np.arange(steps + 1))
+    return Episodes(episodes_from([signals], run.dt, str(path)), run.dt, names, run.inputs)

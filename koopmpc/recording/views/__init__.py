@@ -1,1 +1,0 @@
-"""Views of the Rerun viewer: blueprint, scenes, curves, eigenvalues."""
