@@ -12,7 +12,6 @@ import casadi as ca
 import numpy as np
 
 import koopmpc as km
-from koopmpc.plants.dynamics import Integrator
 
 n = 128  # points of the ring [−π, π)
 place = 2 * np.pi * np.arange(n) / n - np.pi
@@ -51,7 +50,7 @@ class Wave(km.Dynamics):
 
 
 @dataclass(frozen=True)
-class SplitStep(Integrator):
+class SplitStep(km.plants.Integrator):
     """Strang's splitting: half a step of y_xxx exactly, a step of the rest by RK4, half a step of y_xxx; order 2."""
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:

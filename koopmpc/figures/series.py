@@ -356,12 +356,13 @@ def _relative_errors(
             relative = np.nan_to_num(np.linalg.norm(curve - truth, axis=1) / size, nan=np.inf)
         panel.semilogy(t, np.clip(relative, _LEAST, 10 * _HIGHEST), **line(names.index(name), len(t)))
         errors.append(relative[1:])
-    if errors:
-        # errors start at rounding and may pass through 0, so the axis starts at their 2 % quantile
-        usual = min(float(np.quantile(relative, 0.02)) for relative in errors)
-        highest = max(float(relative.max()) for relative in errors)
-        low, high = (float(np.log10(np.clip(v, _LEAST, _HIGHEST))) for v in (usual, highest))
-        panel.set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
+    if not errors:  # nothing to scale an axis by
+        return
+    # errors start at rounding and may pass through 0, so the axis starts at their 2 % quantile
+    usual = min(float(np.quantile(relative, 0.02)) for relative in errors)
+    highest = max(float(relative.max()) for relative in errors)
+    low, high = (float(np.log10(np.clip(v, _LEAST, _HIGHEST))) for v in (usual, highest))
+    panel.set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
     panel.yaxis.set_major_locator(LogLocator(numticks=_TICKS))
     panel.yaxis.set_minor_locator(NullLocator())
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.plants.dynamics import Integrator as Integrator
     from koopmpc.plants.gym_plant import GymPlant as GymPlant
     from koopmpc.plants.plant import SimulatedPlant as SimulatedPlant
     from koopmpc.plants.step_map import Affine as Affine

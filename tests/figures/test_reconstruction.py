@@ -33,6 +33,12 @@ def test_what_leaves_the_truth_leaves_the_picture():
     assert np.isfinite(made.axes[-1].get_ylim()).all()
 
 
+def test_a_case_without_a_reconstruction_shows_its_truth(tmp_path):
+    made = km.plot.reconstruction({"A": (TRUTH, {"near": TRUTH + 0.1}), "B": (TRUTH, {})}, 0.1, STATES)
+    made.savefig(tmp_path / "made.svg")
+    np.testing.assert_array_equal(made.axes[1].lines[0].get_ydata(), TRUTH[:, 0])
+
+
 def test_refusals():
     with pytest.raises(km.errors.DataError, match="there is no case to draw"):
         km.plot.reconstruction({}, 0.1, STATES)

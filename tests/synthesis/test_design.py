@@ -185,11 +185,21 @@ def test_measured_disturbances_reach_surrogates_and_controllers():
     assert found.expected.lost == 0
 
 
-def test_a_cost_on_observables_is_designed_for():
+@pytest.mark.parametrize(
+    ("of", "tried"),
+    [
+        (km.Fourier(1, [0]), {0, 1}),
+        (km.Gaussian(np.array([[0.3, 0.0], [0.0, 0.0]]), width=1.0), {0}),  # its centres are states without their past
+    ],
+    ids=["sines", "centres"],
+)
+def test_a_cost_on_observables_is_designed_for_with_and_without_delays(of, tried):
     rotor = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.1 * u[0]]), count=9, steps=30)
-    cost = km.Cost(Q=[1.0, 1.0], R=0.1, of=km.Fourier(1, [0]))
-    found = designed(rotor, cost, km.Limits(u_min=-2, u_max=2), reference=[np.sin(0.3), np.cos(0.3)], angles=[0])
+    cost = km.Cost(Q=[1.0, 1.0], R=0.1, of=of)
+    goal = of.bind(rotor.states)(np.array([[0.3, 0.0]]))[0]
+    found = designed(rotor, cost, km.Limits(u_min=-2, u_max=2), reference=goal, angles=[0], delays=[0, 1])
     assert found.expected.lost == 0
+    assert {row.recipe.candidate.delays for row in found.leaderboard} == tried
 
 
 def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():
