@@ -69,7 +69,7 @@ def _case(title: str, rows: list[RunRow]) -> Table:
         if row.metrics is None:
             lines.add_row(row.controller, "raised", style="red")
         else:
-            cells = _line(row, row.metrics, oracle, violated)
+            cells = _run_cells(row, row.metrics, oracle, violated)
             lines.add_row(row.controller, *cells, style="red" if row.failure else None)
     learned = max((row.training_time for row in rows), default=0.0)
     if learned:
@@ -78,7 +78,7 @@ def _case(title: str, rows: list[RunRow]) -> Table:
     return lines
 
 
-def _line(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
+def _run_cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
     """Yield the cells of a run after the controller's name."""
     yield f"{figures.cost:.1f}" if figures.cost < 1e5 else f"{figures.cost:.2g}"
     ratio = figures.cost / oracle if oracle > 0 else np.nan
@@ -226,7 +226,7 @@ _HEADINGS = ("controller", "condition", "runs", "reach", "cost", "ratio", "over"
 _WHOLE = ("controller", "runs", "reach", "p50", "p99", "cold")  # columns of a terminal that are not wrapped
 
 
-def _cells(own: Summary) -> tuple[str, ...]:
+def _summary_cells(own: Summary) -> tuple[str, ...]:
     def between(middle: float, low: float, high: float) -> str:
         if np.isnan(middle):
             return "–"
@@ -255,7 +255,7 @@ def summary_table(rows: Sequence[RunRow]) -> Group:
     parts: list[Table] = []
     for case, group in groupby(summaries(rows), key=lambda each: each.case):
         found = list(group)
-        cells = np.array([_cells(own) for own in found])
+        cells = np.array([_summary_cells(own) for own in found])
         told = [i for i in range(len(_HEADINGS)) if i == 0 or not np.isin(cells[:, i], ("0", "–")).all()]
         lines = plain_table(case, (), padding=(0, 0, 0, 1))
         for i in told:
@@ -307,7 +307,7 @@ def _sections(rows: Sequence[RunRow], found: Sequence[Summary], folder: Path) ->
     for title, group in groupby(found, key=lambda each: each.case):
         own = [row for row in rows if f"{row.problem}:{row.case}" == title]
         usual = [row for row in own if condition_of(row) == "–"] or own
-        lines = [_cells(summary) for summary in group]
+        lines = [_summary_cells(summary) for summary in group]
         logs = [row.log.name for row in own if row.log is not None and row.log.is_file()]
         yield _Section(title, _HEADINGS, lines, list(_pictures(own, usual, folder)), logs)
     whole = list(_profile(rows)) if len({each.case for each in found}) > 1 else []

@@ -27,7 +27,9 @@ from koopmpc.plants.step_map import StepMap
 
 _STATUS, _FALLBACK = list(Status), list(Fallback)
 _PLANTS = 8  # plants whose machine code a controller keeps
-_PLANT = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
+_PLANT_HEAD = (
+    "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"  # what stands above a plant in C
+)
 
 
 class NoCompilerWarning(UserWarning):
@@ -409,11 +411,11 @@ class Compiled:
         known = self._plants.get(id(plant))
         if known is not None:
             return known[1]
-        command = compiler()
-        if command is None or self.precision == "float":
+        command = compiler() if self.precision != "float" else None
+        if command is None:
             return None
         try:
-            code = library(_PLANT + plant_functions(plant.F, plant.h, Language()), command, private_cache())
+            code = library(_PLANT_HEAD + plant_functions(plant.F, plant.h, Language()), command, private_cache())
         except (DataError, OSError, subprocess.SubprocessError):
             return None
         while len(self._plants) >= _PLANTS:

@@ -223,8 +223,9 @@ def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
 class MPCBase:
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
-    A subclass calls `_keep` with every good plan, and ends a step with `_move` or `_fail`. A failed step returns the
-    next input of the last good plan, then the unconstrained input clipped, then the last input.
+    A subclass calls `_keep` with every good plan, ends a step with `_move` or `_fail`, and says in `_made_of` what it
+    is made of, for `save`. A failed step returns the next input of the last good plan, then the unconstrained input
+    clipped, then the last input.
 
     One thread at a time may call it: a second one gets a ThreadError. Give each thread a copy of its own.
 

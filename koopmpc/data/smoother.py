@@ -36,16 +36,6 @@ _SMALL = 1e-4  # of a state's spread: noise below is none
 _SHARE = 0.5  # of what the model misses in one step: noise below cannot be told from the model's own error
 
 
-# Of a Mender:
-_SIZE = 8.0  # standard deviations of what the others say of a measurement
-_FAR = 0.5  # of a state's spread: what is less far off spoils no fit
-_BESIDE = 3  # rows around a glitch that miss by it too
-_SOLVED = 0.3  # of a glitch that may be left in the rows around it once it is replaced
-_ROUNDS = 6  # of finding the largest ones and going on without them
-_FITS = 3  # of the model, each to data without the glitches that the one before found
-_FLOOR = 0.01  # of V: the least variance of the measurements
-
-
 @dataclass(frozen=True, eq=False)
 class Smoother(Value):
     """Estimate x_0 … x_T of an episode from all of its measurements, y_k = x_k + n_k, n_k ~ N(0, R), R diagonal.
@@ -276,6 +266,15 @@ def _alike(lengths: Sequence[int], delays: int) -> Iterator[list[_Passage]]:
             piece = _Passage(i, max(low - _OVERLAP, 0), min(high + _OVERLAP, length + 1), low, high)
             groups.setdefault((piece.last - piece.first).bit_length(), []).append(piece)
     yield from groups.values()
+
+
+_SIZE = 8.0  # standard deviations of what the others say of a measurement
+_FAR = 0.5  # of a state's spread: what is less far off spoils no fit
+_BESIDE = 3  # rows around a glitch that miss by it too
+_SOLVED = 0.3  # of a glitch that may be left in the rows around it once it is replaced
+_ROUNDS = 6  # of finding the largest ones and going on without them
+_FITS = 3  # of the model, each to data without the glitches that the one before found
+_FLOOR = 0.01  # of V: the least variance of the measurements
 
 
 class Glitch(NamedTuple):

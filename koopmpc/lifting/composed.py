@@ -1,4 +1,4 @@
-"""Liftings made of others: a + b, a * b, directions, picks and eigenfunctions of one, one of standardized states."""
+"""Liftings made of others: sums, products, directions, picks, of the present or standardized states; eigenfunctions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -204,6 +204,38 @@ class Picked(Lifting):
         """Return the chosen observables."""
         z = self.lifting.formula(x)
         return ca.vertcat(*(z[i] for i in self.which))
+
+
+@dataclass(frozen=True, eq=False)
+class Present(Lifting):
+    """ψ(ζ) = ψ(x) of a ζ = [x; u_{k−1}; x_{k−1}; …] that begins with the state x: its observables, under their names.
+
+    Parameters
+    ----------
+    lifting
+        ψ, bound to the names of x.
+
+    Raises
+    ------
+    ShapeError
+        ζ does not begin with these states.
+    """
+
+    lifting: Lifting
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of the lifting's own observables."""
+        x = self.lifting.bound_states
+        if states[: len(x)] != x:
+            raise ShapeError(f"the states are {', '.join(states)}; they must begin with {', '.join(x)}")
+        return self.lifting.names
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the lifting's formula of the first entries."""
+        return self.lifting.formula(x[: len(self.lifting.bound_states)])
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        self.lifting._fill(np.ascontiguousarray(x[: len(self.lifting.bound_states)]), Z)
 
 
 @dataclass(frozen=True, eq=False, init=False)

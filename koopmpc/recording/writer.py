@@ -135,8 +135,8 @@ class Writer:
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
         self._shown = self._scenes.extent.ranges()
         self._last = {Entity.QP: NO_SOLVER}  # the last word of each column that is written where it changes
-        self._looks: dict[str, Any] = {}  # of the curves, and of so many steps of prediction
-        self._looked = -1
+        self._looks: dict[str, Any] = {}  # styles of the curves, by entity
+        self._looked = -1  # the horizon that they were made for, −1 before any
         self._styled: set[str] = set()
         self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
         self._places: dict[str, int] = {}  # a checksum of the steps of its rows
@@ -174,6 +174,8 @@ class Writer:
 
         k = rows.k + np.arange(len(rows.X))
         if self._looked != self._horizon:  # the first plan may come later than the first block
+            if self._looked >= 0:
+                send_blueprint(self._rec, application_of(self._about), self._blueprint())
             self._looked, self._looks = self._horizon, styles(self._about, self._nr, self._horizon)
             for entity, style in self._looks.items():
                 if entity != Entity.MEASUREMENT:  # it may have no row

@@ -108,7 +108,7 @@ def mended(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str,
 
 
 def smoothed(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...], Float[np.ndarray, " nx"]]:
-    """Return source and episodes with smoothed states, a sentence if noise is found in them, and its size.
+    """Return source and episodes, smoothed where noise is found, a sentence that says so, and the size of the noise.
 
     The size is the (nx,) standard deviation of what was taken out, zero where that is nothing. The smoother is found
     on `held`; where that is not all of the source, its parts are smoothed as they are read.

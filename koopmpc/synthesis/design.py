@@ -16,9 +16,10 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, FitWarning, ShapeError
+from koopmpc.errors import DataError, FitWarning
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
@@ -204,6 +205,7 @@ def design(
                         f"{rows[place].title} is fitted without the episodes that took no part in the choice: with "
                         "them it does worse on the surrogates"
                     )
+                controller.reset()  # it begins without what it saw of the surrogates
                 return controller
         turned.append(
             f"passed over: {rows[place].title}, for fitted to all data it does worse than fitted to two folds"
@@ -262,19 +264,19 @@ def _models(
 ) -> list[Candidate]:
     """Return the models to try; each lifting also has the observables that cost and limits are of."""
     models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
+    if not models:
+        raise DataError("there is no candidate; pass at least one lifting, and numbers of delays, 0 for none")
     asking = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
-    if not asking:
+    needed = [of.bind(held.states) for of in asking]
+    if not needed:
         return models
-    found: list[Candidate] = []
-    for one in models:
-        states = held.states if one.lifting.bound is None else one.lifting.bound  # under delays those and their past
-        try:
-            needed = [of.bind(states) for of in asking]
-            found.append(replace(one, lifting=sum(needed, one.lifting)).bind(held.states, held.inputs))
-        except ShapeError:  # such observables are of the states alone
-            if not one.delays:
-                raise
-    return found
+
+    def complete(one: Candidate) -> Candidate:
+        """Return the candidate with these observables first: of two with one name it is the first that stays."""
+        first = [Present(of).bind(one.lifting.bound_states) for of in needed] if one.delays else needed
+        return replace(one, lifting=sum([*first[1:], one.lifting], first[0])).bind(held.states, held.inputs)
+
+    return [complete(one) for one in models]
 
 
 def _test(

@@ -1,5 +1,7 @@
 """Reconstructions and closed loops, drawn: what is in the picture, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,3 +66,10 @@ def test_runs_of_two_plants_are_refused():
         km.plot.runs({"left": {}})
     with pytest.raises(km.errors.DataError, match="different states or inputs"):
         km.plot.runs({"left": {"one": make_run(nx=2, T=5), "two": make_run(nx=3, T=5)}})
+
+
+def test_a_reference_that_is_not_of_the_state_is_not_drawn_where_nothing_says_what_it_is_of():
+    run = make_run(cost=False)
+    references = (run.reference[:, :2], run.reference, run.reference[:, :1])
+    made = [km.plot.runs({"A": {"a": replace(run, reference=each)}}) for each in references]
+    assert [len(each.axes[0].lines) for each in made] == [2, 1, 1]

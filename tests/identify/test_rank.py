@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.edmd import kept, known_factor, leading, lost, optimal_factor
+from koopmpc.identify.fits.edmd import kept_rank, known_factor, leading_directions, optimal_factor, truncation_loss
 from koopmpc.identify.solve import RegressionRows
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs, random_episodes
@@ -54,7 +54,7 @@ def test_the_hard_threshold_is_that_of_all_singular_values_whether_given_or_zero
     every = np.array([20.0, 9.0, 0.3, 0.2, 0.1])
     s = np.pad(every, (0, 3))[:given_values]
     median = np.median(np.where(np.arange(5) < given_values, every, 0.0))
-    count, words = kept("hard-threshold", s, samples=5, nz=40)
+    count, words = kept_rank("hard-threshold", s, samples=5, nz=40)
     assert words.endswith(f"{optimal_factor(5 / 40) * median:.3g}")
     assert count == 2
 
@@ -172,18 +172,18 @@ def test_a_rank_that_cannot_be_kept_is_refused() -> None:
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, 1.5])
 def test_a_share_of_energy_that_is_none_is_refused(share: float) -> None:
     with pytest.raises(km.errors.DataError, match=f"rank is {share:g}; .*a share of energy between 0 and 1"):
-        kept(share, np.array([2.0, 1.0]), 9, 2)
+        kept_rank(share, np.array([2.0, 1.0]), 9, 2)
 
 
 @pytest.mark.parametrize(("share", "rank"), [(0.1, 1), (16 / 21, 1), (0.77, 2), (20 / 21, 2), (0.96, 3), (0.999, 3)])
 def test_the_least_number_of_directions_that_hold_the_share_is_kept(share: float, rank: int) -> None:
-    assert kept(share, np.array([4.0, 2.0, 1.0]), 9, 3)[0] == rank
+    assert kept_rank(share, np.array([4.0, 2.0, 1.0]), 9, 3)[0] == rank
 
 
 def test_a_rank_is_at_most_the_number_of_observables() -> None:
-    assert kept(2, np.ones(2), 9, 2) == (2, "")
+    assert kept_rank(2, np.ones(2), 9, 2) == (2, "")
     with pytest.raises(km.errors.DataError, match="rank is 3, but the lifting has 2 observables"):
-        kept(3, np.ones(2), 9, 2)
+        kept_rank(3, np.ones(2), 9, 2)
 
 
 @pytest.mark.parametrize("decoded", [False, True])
@@ -193,18 +193,18 @@ def test_what_a_truncation_loses_is_the_part_outside_its_basis(decoded: bool) ->
     C = rng.normal(size=(3, 5)) if decoded else None
     gap = Z @ (np.eye(5) - basis @ basis.T)
     expected = np.sqrt(np.sum((gap if C is None else gap @ C.T) ** 2, axis=0) / 90)
-    np.testing.assert_allclose(lost(Z, basis, C, 90), expected)
+    np.testing.assert_allclose(truncation_loss(Z, basis, C, 90), expected)
 
 
 @pytest.mark.parametrize("rows", [40, 3])
 def test_the_leading_directions_are_those_of_the_singular_value_decomposition(rows: int) -> None:
     rng, sentences = np.random.default_rng(1), list[str]()
     P = rng.normal(size=(rows, 7)) * np.logspace(0, 1, 7)
-    U, words = leading(RegressionRows(P, P[:, :1], np.zeros(1), rows), 5, 2, sentences)
+    U, words = leading_directions(RegressionRows(P, P[:, :1], np.zeros(1), rows), 5, 2, sentences)
     exact = np.linalg.svd(P[:, :5])[2][:2].T
     np.testing.assert_allclose(U @ U.T, exact @ exact.T, atol=1e-10)
     assert "at rank 2" in words
     assert not sentences
     held = min(rows, 5)
-    U, words = leading(RegressionRows(P, P[:, :1], np.zeros(1), rows), 5, 5, sentences)
+    U, words = leading_directions(RegressionRows(P, P[:, :1], np.zeros(1), rows), 5, 5, sentences)
     assert (U.shape[1], len(sentences)) == (held, int(held < 5))

@@ -14,6 +14,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.recording import viewer as connect
+from koopmpc.recording import writer
+from koopmpc.recording.blueprint import blueprint
 from koopmpc.recording.reader import read_columns
 from koopmpc.recording.viewer import free_port, start_viewer
 from tests.recording.runs import about, make_run, steps_of
@@ -42,8 +44,9 @@ def test_steps_without_a_plan_leave_a_gap_in_the_plans(tmp_path: Path) -> None:
     assert km.load_run(tmp_path / "run.rrd") == run
 
 
-def test_predictions_that_begin_after_the_first_batch_are_drawn_as_all_others(tmp_path: Path) -> None:
-    run = make_run(T=6, N=2)
+def test_predictions_that_begin_after_the_first_batch_are_drawn_as_all_others(tmp_path: Path, monkeypatch) -> None:
+    run, horizons = make_run(T=6, N=2), []
+    monkeypatch.setattr(writer, "blueprint", lambda *a, **o: horizons.append(o["horizon"]) or blueprint(*a, **o))
     with km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
         for step in steps_of(run):
             recorder(replace(step, look_ahead=None) if step.k < 3 else step)
@@ -51,6 +54,7 @@ def test_predictions_that_begin_after_the_first_batch_are_drawn_as_all_others(tm
     log = read_columns(tmp_path / "run.rrd", ("/plots/**",))
     for j in (1, 2):
         assert log.static(f"/plots/0/ahead/{j}", "names")
+    assert horizons == [0, 2]  # the layout shows the points at the cursor alone
 
 
 def test_a_loop_of_your_own_needs_only_y_u_and_the_reference(tmp_path: Path) -> None:

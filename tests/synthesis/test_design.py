@@ -186,20 +186,55 @@ def test_measured_disturbances_reach_surrogates_and_controllers():
 
 
 @pytest.mark.parametrize(
-    ("of", "tried"),
+    "of",
     [
-        (km.Fourier(1, [0]), {0, 1}),
-        (km.Gaussian(np.array([[0.3, 0.0], [0.0, 0.0]]), width=1.0), {0}),  # its centres are states without their past
+        km.Fourier(1, [0]),
+        km.Gaussian(np.array([[0.3, 0.0], [0.0, 0.0]]), width=1.0),
+        km.Expressions(lambda x: [x[0] + x[1]], names=["s"]),
+        km.RandomFourier(2, 0.5, 0),
     ],
-    ids=["sines", "centres"],
+    ids=lambda of: type(of).__name__,
 )
-def test_a_cost_on_observables_is_designed_for_with_and_without_delays(of, tried):
+def test_a_cost_on_observables_is_of_the_present_state_with_and_without_delays(of):
     rotor = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.1 * u[0]]), count=9, steps=30)
-    cost = km.Cost(Q=[1.0, 1.0], R=0.1, of=of)
     goal = of.bind(rotor.states)(np.array([[0.3, 0.0]]))[0]
-    found = designed(rotor, cost, km.Limits(u_min=-2, u_max=2), reference=goal, angles=[0], delays=[0, 1])
+    found = designed(
+        rotor, km.Cost(Q=np.ones(len(goal)), R=0.1, of=of), km.Limits(u_min=-2, u_max=2),
+        reference=goal, angles=[0], delays=[0, 1], candidates=[PLAIN, km.State() + of],
+    )  # fmt: skip
     assert found.expected.lost == 0
-    assert {row.recipe.candidate.delays for row in found.leaderboard} == tried
+    assert {row.recipe.candidate.delays for row in found.leaderboard} == {0, 1}
+    x = np.array([0.2, -0.4])
+    for row in found.leaderboard:
+        psi = row.recipe.candidate.lifting
+        zeta = np.concatenate([x, np.full(len(psi.bound_states) - 2, 0.7)])
+        told = dict(zip(psi.names, psi(zeta), strict=True))
+        wanted = of.bind(rotor.states)
+        assert [told[name] for name in wanted.names] == pytest.approx(wanted(x), abs=1e-12)
+
+
+def test_a_design_with_the_usual_candidates_takes_a_cost_on_observables():
+    rotor = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.1 * u[0]]), count=9, steps=30)
+    cost = km.Cost(Q=[1.0, 1.0], R=0.1, of=km.Fourier(1, [0]))
+    limits = km.Limits(u_min=-2, u_max=2)
+    found = designed(rotor, cost, limits, reference=[np.sin(0.3), np.cos(0.3)], candidates=None, delays=[0, 1])
+    assert found.expected.lost == 0
+
+
+def test_a_design_without_a_candidate_is_refused():
+    with pytest.raises(
+        km.errors.DataError, match="there is no candidate; pass at least one lifting, and numbers of delays"
+    ):
+        designed(data(), candidates=None, delays=[])
+
+
+def test_a_designed_controller_begins_without_what_it_saw_of_the_surrogates():
+    found = designed(noisy(data(), 0.05), delays=[1])
+    for controller in {found.controller, found.linear}:  # the linear one may be the chosen one
+        assert controller.plan() is None
+        first = [controller([0.3, -0.1], [0.0, 0.0]).u for _ in range(3)]
+        controller.reset()
+        np.testing.assert_array_equal([controller([0.3, -0.1], [0.0, 0.0]).u for _ in range(3)], first)
 
 
 def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():

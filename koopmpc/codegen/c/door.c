@@ -1,3 +1,4 @@
+/** @file door.c @brief How Python calls a controller: stands at the end of what is compiled, and is never exported. */
 #ifdef _WIN32
 #define DOOR __declspec(dllexport)
 #else

@@ -11,7 +11,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ObservableError
-from koopmpc.identify.fits.edmd import Rank, leading, lost
+from koopmpc.identify.fits.edmd import Rank, leading_directions, truncation_loss
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.regression import FitResult, fit_report, regression_of, scale_factor
@@ -107,9 +107,9 @@ def bilinear_edmd(
     sentences, condition = doubts(given, bound.names, (*total.inputs, *names), regular=regular)
     P, C, basis, state_residual, words = given.P, regression.C, np.eye(nz), regression.state_residual, ""
     if rank is not None:
-        basis, words = leading(given, nz, rank, sentences)
+        basis, words = leading_directions(given, nz, rank, sentences)
         P, C, bound = _projected(P, basis, nu, which), C @ basis, Projected(bound, basis)
-        state_residual = np.hypot(state_residual, lost(given.P[:, :nz], basis, regression.C, given.samples))
+        state_residual = np.hypot(state_residual, truncation_loss(given.P[:, :nz], basis, regression.C, given.samples))
         which = np.arange(len(basis.T))
     r = len(basis.T)
     start = np.eye(P.shape[1], r) @ basis.T * difference  # K of the model z⁺ = z, or zero

@@ -1,4 +1,4 @@
-"""Extended dynamic mode decomposition: z⁺ = A z + B u on z = ψ(x), or on few directions of it, for noisy states too."""
+"""Extended dynamic mode decomposition z⁺ = A z + B u, z = ψ(x), the rank of a reduced one, and fits of noisy states."""
 
 from dataclasses import replace
 from typing import Literal, Unpack, cast
@@ -103,12 +103,12 @@ def _reduced(
 ) -> FitResult:
     """Return the fit on [U_rᵀψ(x) u]. Without inputs that is Ã = U_rᵀ X′ V_r Σ_r⁻¹ (Tu et al. 2014)."""
     nz = regression.lifting.nz
-    basis, words = leading(rows, nz, rank, sentences)
+    basis, words = leading_directions(rows, nz, rank, sentences)
     r = len(basis.T)
     given = rows.leading(nz)
     if method == "tls":
         given = _denoised(regression, given, r)
-        basis = leading(given, nz, r, [])[0]
+        basis = leading_directions(given, nz, r, [])[0]
     P = np.hstack([given.P[:, :nz] @ basis, given.P[:, nz:]])
     if method == "fb":
         solution = _forward_backward(RegressionRows(P, given.T @ basis, np.zeros(r), rows.samples), r)
@@ -127,7 +127,7 @@ def _reduced(
         C=C,
         lifting=Projected(regression.lifting, basis),
         residual=seen.residual(regression.x_next, np.vstack([A.T, B.T]) @ C.T),
-        state_residual=np.hypot(regression.state_residual, lost(Z, basis, regression.C, rows.samples)),
+        state_residual=np.hypot(regression.state_residual, truncation_loss(Z, basis, regression.C, rows.samples)),
         rank=r,
         condition=condition,
         rule=words if ridge == 0 else f"{words}, {rule(seen, ridge, solution.ridge)}",
@@ -136,7 +136,9 @@ def _reduced(
     )
 
 
-def leading(rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]) -> tuple[Float[np.ndarray, "nz r"], str]:
+def leading_directions(
+    rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]
+) -> tuple[Float[np.ndarray, "nz r"], str]:
     """Return U_r, the leading left singular vectors of the snapshots ψ(x), columns unscaled, and the rule in words.
 
     Parameters
@@ -158,7 +160,7 @@ def leading(rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]) -> 
         _, s, Vt = np.linalg.svd(Z, full_matrices=False)
         U = Vt.T
     held = int(np.sum(s > cutoff(rows) * s[0]))
-    r, words = kept(rank, s, rows.samples, nz)
+    r, words = kept_rank(rank, s, rows.samples, nz)
     if held < r:
         sentences.append(
             f"rank-deficient: rank {r} was asked for, the snapshots have rank {held}, which is taken; "
@@ -168,7 +170,7 @@ def leading(rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]) -> 
     return np.ascontiguousarray(U[:, :r]), f"truncated SVD of unscaled columns at rank {r}{words}"
 
 
-def kept(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple[int, str]:
+def kept_rank(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple[int, str]:
     """Return the number of singular values of (samples, nz) snapshots that a rank keeps, and the rule in words."""
     if isinstance(rank, str):
         if rank != "hard-threshold":
@@ -196,7 +198,7 @@ def kept(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple
     return whole, ""
 
 
-def lost(
+def truncation_loss(
     Z: Float[np.ndarray, "m nz"], basis: Float[np.ndarray, "nz r"], C: Float[np.ndarray, "nx nz"] | None, samples: int
 ) -> Float[np.ndarray, " nx"]:
     """Return the root-mean-square of C (I − U_r U_rᵀ) ψ(x), the part of each state that the truncation loses."""

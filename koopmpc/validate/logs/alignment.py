@@ -1,8 +1,9 @@
 """Faults between signals: one is late, has no effect or follows from others, or an actuator ends before its input.
 
-Each hypothesis undoes its fault in the log, and predicts the next row from the present one. It is judged by the
-information on all states together, −½ log det of the residuals in nats a sample: a signal that is put where it belongs
-raises it, and moving what one sensor knows to another does not.
+A signal that is late, and an actuator that ends, are found by hypotheses: each undoes its fault in the log, and
+predicts the next row from the present one. It is judged by the information on all states together, −½ log det of the
+residuals in nats a sample: a signal that is put where it belongs raises it, and moving what one sensor knows to another
+does not.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""audit: all checks of logs in one call, and their report."""
+"""audit: all checks of logs in one call, what the time stamps of rows show, and the report."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
