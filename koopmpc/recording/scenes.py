@@ -344,7 +344,7 @@ class Scenes:
         for k, X, U in plans:
             if np.isfinite(X).all() and np.isfinite(U).all():
                 later = ((X[i], U[min(i, len(U) - 1)]) for i in stages(len(U)))
-                ahead[int(k)] = [self._names.checked(scene(x, u), int(k)) for x, u in later]
+                ahead[k] = [self._names.checked(scene(x, u), k) for x, u in later]
         now: list[list[Shape]] = []
         for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
             self._u = rows.U[i] if i < len(rows.U) else self._u

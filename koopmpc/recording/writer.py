@@ -159,7 +159,7 @@ class Writer:
         self._horizon = max(self._horizon, rows.horizon)
         parts = blocks(rows)
         drawings = [  # all, because the layout is as wide as the widest
-            self._scenes.drawn(part.k, part, list(zip(part.planned, part.plan_X, part.plan_U, strict=True)))
+            self._scenes.drawn(part.k, part, list(zip(part.planned.tolist(), part.plan_X, part.plan_U, strict=True)))
             for part in parts
         ]
         if not self._opened:
