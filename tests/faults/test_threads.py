@@ -29,7 +29,7 @@ def test_threads_that_meet_in_a_controller_are_told_and_nothing_breaks(controlle
 
     def work(seed):
         rng = np.random.default_rng(seed)
-        while seen["met"] < least and seen["steps"] < 100 * least and not failures:
+        while seen["met"] < least and seen["steps"] < 5000 * least and not failures:
             try:
                 move = controller(rng.normal(size=2), [0.0, 0.0])
                 seen["steps"] += 1
