@@ -27,9 +27,8 @@ from koopmpc.plants.step_map import StepMap
 
 _STATUS, _FALLBACK = list(Status), list(Fallback)
 _PLANTS = 8  # plants whose machine code a controller keeps
-_PLANT_HEAD = (
-    "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"  # what stands above a plant in C
-)
+# What stands above a plant in C.
+_PLANT_HEAD = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
 
 
 class NoCompilerWarning(UserWarning):

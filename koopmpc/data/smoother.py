@@ -337,15 +337,20 @@ class Mender(Value):
         low, middle, high = np.quantile(both, [0.05, 0.5, 0.95], axis=0)
         scale, whole = (high - low) / 3.29, both.std(axis=0)  # normal data have their standard deviation
         scale = np.where(scale > 0, scale, np.where(whole > 0, whole, 1.0))
-        found: list[Glitch] = []
-        for _ in range(_FITS):
+
+        def made(found: list[Glitch]) -> Mender:
+            """Return the mender by a model of the data without these glitches."""
             model = _state_space(_replaced(data, found), middle, scale, products=False)
             model = model._replace(R=np.maximum(model.R, _FLOOR * np.diag(model.V)))
-            mender, before = cls(Smoother.made(model, middle, scale)), [one[:3] for one in found]
-            found = mender.glitches(data)
-            if [one[:3] for one in found] == before:
-                return mender
-        return mender  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs
+            return cls(Smoother.made(model, middle, scale))
+
+        mender, found = made([]), list[Glitch]()
+        for _ in range(_FITS - 1):
+            before, found = found, mender.glitches(data)
+            if [one[:3] for one in found] == [one[:3] for one in before]:
+                break
+            mender = made(found)
+        return mender
 
     def __call__(self, episodes: Episodes) -> Episodes:
         """Return the episodes with their glitches replaced."""

@@ -351,7 +351,7 @@ def _read_in_child(path: Path, entities: tuple[str, ...], told: Path) -> list[Co
     import pyarrow as pa
 
     command = [sys.executable, "-P", "-m", __name__, str(path), *entities]
-    places = [os.path.abspath(place) for place in sys.path if place]  # noqa: PTH100  # an entry may be a .zip
+    places = [str(Path(place).absolute()) for place in sys.path if place]
     patience = _READING + path.stat().st_size / _RATE
     try:
         done = subprocess.run(

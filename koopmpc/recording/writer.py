@@ -175,7 +175,7 @@ class Writer:
         k = rows.k + np.arange(len(rows.X))
         if self._looked != self._horizon:  # the first plan may come later than the first block
             if self._looked >= 0:
-                send_blueprint(self._rec, application_of(self._about), self._blueprint())
+                self._lay_out()
             self._looked, self._looks = self._horizon, styles(self._about, self._nr, self._horizon)
             for entity, style in self._looks.items():
                 if entity != Entity.MEASUREMENT:  # it may have no row
@@ -259,7 +259,7 @@ class Writer:
         numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
         write_page(self._rec, Entity.METRICS, text, rr.AnyValues(**numbers))
         if self._scenes.extent.ranges() != self._shown:
-            send_blueprint(self._rec, application_of(self._about), self._blueprint())
+            self._lay_out()
         self.flush()
         self._release()
         if self._file is not None:
@@ -293,14 +293,15 @@ class Writer:
         write_page(self._rec, Entity.DESCRIPTION, self._page, rr.AnyValues(json=self._json))
         write_page(self._rec, "title", f"**{title_of(self._about)}**")
         self.flush()  # a log that is cut says what it was
-        send_blueprint(self._rec, application_of(self._about), self._blueprint())
+        self._lay_out()
         if self._model is not None:
             for entity, drawing in draw_eigenvalues(self._model).items():
                 self._style(entity, drawing)
 
-    def _blueprint(self) -> Any:
+    def _lay_out(self) -> None:
+        """Send the blueprint of what is known by now."""
         self._shown = self._scenes.extent.ranges()
-        return blueprint(
+        layout = blueprint(
             self._about,
             self._nr,
             extent=self._scenes.extent if self._scenes.scene is not None else None,
@@ -309,6 +310,7 @@ class Writer:
             spans=self._spans,
             length=None if self._steps is None else self._steps * self._about.dt,
         )
+        send_blueprint(self._rec, application_of(self._about), layout)
 
     def _vectors(self, entity: str, k: np.ndarray, values: np.ndarray, alone: Sequence[int] = ()) -> None:
         """Write one vector a row; higher dimensions go flat, their last width kept beside them.

@@ -105,6 +105,21 @@ def model_of(candidate: Candidate, data: Episodes | Source, ridge: float, read: 
     return edmd(data, psi, embedding=embedding, ridge=ridge, towards=candidate.towards, **read)
 
 
+def past_steps(delays: Sequence[int]) -> list[int]:
+    """Return the numbers of past steps to try, each once, the least first.
+
+    Raises
+    ------
+    DataError
+        There is none, or one is no whole number of 0 or above.
+    """
+    checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
+    past = sorted({checks.count(d, "delays", 0) for d in delays})
+    if not past:
+        raise DataError("delays is empty; pass 0 for a model without an embedding")
+    return past
+
+
 def expanded(
     given: Sequence[Candidate | Lifting], episodes: Episodes, delays: Sequence[int], bilinear: bool
 ) -> list[Candidate]:

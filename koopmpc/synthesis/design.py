@@ -23,7 +23,7 @@ from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
 from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
-from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, usual
+from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, past_steps, usual
 from koopmpc.synthesis.candidates import angles as angular
 from koopmpc.synthesis.cross_validation import (
     LEAST,
@@ -165,8 +165,7 @@ def design(
     if smooth:
         source, held, freed, noise = smoothed(source, held)
         notes = (*notes, *freed)
-    checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
-    past = sorted({checks.count(d, "delays", 0) for d in delays})
+    past = past_steps(delays)
     models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)
     room = int(np.median([len(episode) for episode in held])) - first
@@ -264,8 +263,6 @@ def _models(
 ) -> list[Candidate]:
     """Return the models to try; each lifting also has the observables that cost and limits are of."""
     models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
-    if not models:
-        raise DataError("there is no candidate; pass at least one lifting, and numbers of delays, 0 for none")
     asking = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
     needed = [of.bind(held.states) for of in asking]
     if not needed:

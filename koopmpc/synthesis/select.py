@@ -16,13 +16,13 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, FitWarning
+from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import Progress, StageProgress, map_tasks
 from koopmpc.predict.base import eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.synthesis.candidates import Candidate, expanded, jumps, model_of, still, usual
+from koopmpc.synthesis.candidates import Candidate, expanded, jumps, model_of, past_steps, still, usual
 from koopmpc.synthesis.cross_validation import (
     EXACT,
     HALF,
@@ -288,10 +288,7 @@ def select(
     source, draw = source_of(episodes), checks.generator(rng)
     weights = RIDGES if ridges is None else ridges_of(ridges)
     folds = checks.count(folds, "folds", 2)
-    checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
-    past = sorted({checks.count(d, "delays", 0) for d in delays})
-    if not past:
-        raise DataError("delays is empty; pass 0 for a model without an embedding")
+    past = past_steps(delays)
     held, notes = sampled(source, checks.count(sample, "sample"))
     for i, count in jumps(held).items():
         warnings.warn(

@@ -221,10 +221,8 @@ def test_a_design_with_the_usual_candidates_takes_a_cost_on_observables():
     assert found.expected.lost == 0
 
 
-def test_a_design_without_a_candidate_is_refused():
-    with pytest.raises(
-        km.errors.DataError, match="there is no candidate; pass at least one lifting, and numbers of delays"
-    ):
+def test_a_design_without_a_number_of_delays_is_refused():
+    with pytest.raises(km.errors.DataError, match="delays is empty; pass 0 for a model without an embedding"):
         designed(data(), candidates=None, delays=[])
 
 
